@@ -1,0 +1,89 @@
+"""Checkpoints: a directory per step with safetensors, JSON and a sha256 manifest. Never pickle.
+
+Written to a temporary name, fsynced, renamed; at least two verified ones are kept. A checkpoint that does not verify is
+named and skipped in favour of an older one.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mudg.base import log, store
+from mudg.base.errors import IntegrityError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_PREFIX = "step_"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A verified checkpoint on disk: the step it was taken after, its folder, and the JSON state."""
+
+    step: int
+    path: Path
+    state: Mapping[str, Any]
+
+    def tensors(self, name: str) -> dict[str, Tensor]:
+        """Load one named group of tensors (writable copies)."""
+        import torch
+
+        return {
+            k: torch.from_numpy(v.copy()) for k, v in store.read_safetensors(self.path / f"{name}.safetensors").items()
+        }
+
+
+def save(
+    folder: Path, step: int, tensors: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any], keep: int = 2
+) -> Path:
+    """Write checkpoint ``step`` under ``folder`` and remove the oldest beyond ``keep`` (never fewer than two).
+
+    Args:
+        folder: holds one directory per step.
+        step: number of finished steps.
+        tensors: group name -> (tensor name -> tensor); one safetensors file per group.
+        state: JSON-serialisable facts.
+    """
+    final = folder / f"{_PREFIX}{step:08d}"
+    with store.atomic_directory(final) as partial:
+        for name, group in tensors.items():
+            store.write_safetensors(partial / f"{name}.safetensors", dict(group))
+        store.write_json(partial / "state.json", {"step": step, "state": dict(state)})
+        store.write_manifest(partial)
+    older = sorted(p for p in folder.glob(f"{_PREFIX}*") if p.is_dir() and p != final and not p.name.endswith(".part"))
+    for stale in older[: max(0, len(older) + 1 - max(2, keep))]:
+        shutil.rmtree(stale)
+    return final
+
+
+def latest(folder: Path) -> Checkpoint | None:
+    """The newest checkpoint that verifies; None if there is none at all.
+
+    Raises:
+        IntegrityError: checkpoints exist but not one verifies (nothing is deleted).
+    """
+    candidates = sorted(
+        (p for p in folder.glob(f"{_PREFIX}*") if p.is_dir() and p.name[len(_PREFIX) :].isdigit()), reverse=True
+    )
+    problems = []
+    for path in candidates:
+        try:
+            store.verify_manifest(path)
+            content = store.read_json(path / "state.json")
+            return Checkpoint(int(content["step"]), path, content["state"])
+        except IntegrityError as error:
+            problems.append(str(error))
+            log.warn(f"checkpoint {path} does not verify and is skipped:\n{error}")
+    if problems:
+        raise IntegrityError(
+            "no checkpoint verifies",
+            where=str(folder),
+            got=f"{len(problems)} damaged",
+            remedy="restore the folder from a copy, or delete it to start again",
+        )
+    return None

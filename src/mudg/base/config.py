@@ -1,0 +1,108 @@
+"""Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from mudg.base import store
+from mudg.base.errors import InputError, UsageError
+
+Config = TypeVar("Config")
+
+STRICT = ConfigDict(extra="forbid")
+"""Pass as ``@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)``."""
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A configuration as plain JSON values."""
+    return TypeAdapter(type(config)).dump_python(config, mode="json")
+
+
+def dump_yaml(config: Any) -> str:
+    """A configuration as YAML text that ``load`` reads back to an equal configuration."""
+    return yaml.safe_dump(to_dict(config), sort_keys=False)
+
+
+def load(
+    config_type: type[Config],
+    preset: Config | None = None,
+    yaml_path: Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Config:
+    """Build a configuration from a preset (default: the type's defaults), then a YAML file, then nested overrides.
+
+    Raises:
+        UsageError: unknown key (the nearest name is suggested), wrong type or value out of range.
+        InputError: the YAML file is missing or malformed.
+    """
+    values = to_dict(preset if preset is not None else config_type())
+    if yaml_path is not None:
+        content = _read_yaml(yaml_path)
+        content.pop("verb", None)
+        values = _merge(values, content, str(yaml_path), config_type)
+    if overrides:
+        values = _merge(values, dict(overrides), "flags", config_type)
+    return build(config_type, values, str(yaml_path or "configuration"))
+
+
+def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> Config:
+    """Validate plain values into ``config_type``; UsageError names the first wrong field."""
+    try:
+        return TypeAdapter(config_type).validate_python(dict(values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = ".".join(str(part) for part in first["loc"])
+        raise UsageError(
+            "a configuration value is not valid",
+            where=f"{where}: {path}",
+            expected=first["msg"],
+            got=repr(first.get("input"))[:120],
+        ) from error
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(store.read_bytes(path))
+    except yaml.YAMLError as error:
+        raise InputError("not valid YAML", where=str(path), got=str(error).replace("\n", " ")) from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise InputError("a configuration file holds keys and values", where=str(path), got=type(content).__name__)
+    return content
+
+
+def _merge(
+    base: dict[str, Any], new: Mapping[str, Any], where: str, config_type: Any, path: str = ""
+) -> dict[str, Any]:
+    known = {f.name: f for f in dataclasses.fields(config_type)} if dataclasses.is_dataclass(config_type) else {}
+    merged = dict(base)
+    for name, value in new.items():
+        if known and name not in known:
+            near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+            raise UsageError(
+                f"unknown configuration key {path}{name}",
+                where=where,
+                expected="one of " + ", ".join(known),
+                remedy=f"did you mean {path}{near[0]}?" if near else "remove it",
+            )
+        nested = getattr(base.get(name), "items", None) is not None and isinstance(value, Mapping) and known
+        if nested and dataclasses.is_dataclass(field_type(config_type, name)):
+            merged[name] = _merge(base[name], value, where, field_type(config_type, name), f"{path}{name}.")
+        else:
+            merged[name] = value
+    return merged
+
+
+def field_type(config_type: Any, name: str) -> Any:
+    """Resolved type of a field (annotations may be strings)."""
+    import typing
+
+    return typing.get_type_hints(config_type).get(name)

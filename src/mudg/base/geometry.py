@@ -1,0 +1,186 @@
+"""Rigid motions and the one pinhole projection of the package.
+
+Conventions, stated once:
+
+* Metres, seconds, radians, pixels. World: right-handed, z up. Ego and objects: x forward, y left, z up.
+* Camera axes as in OpenCV: x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5).
+* ``a_from_b`` is a 4x4 matrix that maps b-coordinates to a-coordinates. Quaternions are (w, x, y, z).
+* Poses are float64 numpy; computation on them happens elsewhere in float32 torch.
+* Depth is camera z, not the length of the ray.
+* A positive lateral shift is to the left of the direction of travel.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mudg.base.errors import InputError
+
+if TYPE_CHECKING:
+    from mudg.base.types import View
+
+Matrix = NDArray[np.float64]
+
+CAM_FROM_EGO_AXES: Matrix = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+CAM_FROM_EGO_AXES.setflags(write=False)
+
+
+def rigid_problem(transform: ArrayLike, tolerance: float = 1e-4) -> str | None:
+    """Say in words why ``transform`` is not a rigid 4x4 motion, or return None if it is one."""
+    matrix = np.asarray(transform)
+    if matrix.shape != (4, 4):
+        return f"shape {matrix.shape} instead of (4, 4)"
+    if not np.issubdtype(matrix.dtype, np.number) or np.iscomplexobj(matrix):
+        return f"dtype {matrix.dtype} instead of a real number type"
+    if not np.isfinite(matrix).all():
+        return "contains NaN or infinity"
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > tolerance:
+        return f"last row is {matrix[3].tolist()} instead of [0, 0, 0, 1]"
+    rotation = matrix[:3, :3].astype(np.float64)
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > tolerance:
+        return f"rotation part is not orthonormal (largest deviation {error:.3g})"
+    if np.linalg.det(rotation) < 0:
+        return "rotation part is a reflection (determinant -1)"
+    return None
+
+
+def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
+    """Whether ``transform`` is a finite, right-handed rigid 4x4 matrix within ``tolerance``."""
+    return rigid_problem(transform, tolerance) is None
+
+
+def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
+    """4x4 matrix from a 3x3 rotation and a translation of 3 metres-components."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def invert(transform: Matrix) -> Matrix:
+    """Inverse of rigid motions ``[..., 4, 4]``."""
+    rotation_t = np.swapaxes(transform[..., :3, :3], -1, -2)
+    inverse = np.zeros_like(transform, dtype=np.float64)
+    inverse[..., :3, :3] = rotation_t
+    inverse[..., :3, 3] = -(rotation_t @ transform[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+Floating = TypeVar("Floating", bound=np.floating)
+
+
+def transform_points(a_from_b: Matrix, xyz_b: NDArray[Floating]) -> NDArray[Floating]:
+    """Map points ``[N, 3]`` from frame b to frame a; computed in float64, returned in the dtype of the points."""
+    mapped = xyz_b.astype(np.float64) @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+    return mapped.astype(xyz_b.dtype)
+
+
+def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
+    """Rotation ``[3, 3]`` (or a rigid ``[4, 4]``) to a unit quaternion (w, x, y, z) with w >= 0."""
+    r = np.asarray(rotation, np.float64)[:3, :3]
+    four_squares = np.array(
+        [1 + r[0, 0] + r[1, 1] + r[2, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2],
+         1 - r[0, 0] + r[1, 1] - r[2, 2], 1 - r[0, 0] - r[1, 1] + r[2, 2]]
+    )  # fmt: skip
+    largest = int(four_squares.argmax())
+    products = {
+        0: (four_squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]),
+        1: (r[2, 1] - r[1, 2], four_squares[1], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]),
+        2: (r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], four_squares[2], r[1, 2] + r[2, 1]),
+        3: (r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], four_squares[3]),
+    }
+    q = np.array(products[largest])
+    q /= np.linalg.norm(q)
+    return -q if q[0] < 0 else q
+
+
+def matrix_from_quaternion(quaternion: ArrayLike) -> Matrix:
+    """Quaternion (w, x, y, z), normalised here, to a 3x3 rotation. A zero quaternion raises InputError."""
+    q = np.asarray(quaternion, np.float64)
+    norm = float(np.linalg.norm(q))
+    if not np.isfinite(norm) or norm < 1e-12:
+        raise InputError("a quaternion of length zero or not finite is no rotation", got=str(q.tolist()))
+    w, x, y, z = q / norm
+    return np.array(
+        [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+    )  # fmt: skip
+
+
+def slerp(q0: ArrayLike, q1: ArrayLike, u: float) -> Matrix:
+    """Spherical interpolation of unit quaternions along the shorter arc; u = 0 gives q0, u = 1 gives +-q1."""
+    a = np.asarray(q0, np.float64) / np.linalg.norm(q0)
+    b = np.asarray(q1, np.float64) / np.linalg.norm(q1)
+    cosine = float(a @ b)
+    if cosine < 0:
+        b, cosine = -b, -cosine
+    if cosine > 1 - 1e-9:
+        q = a + u * (b - a)
+        return q / np.linalg.norm(q)
+    angle = np.arccos(min(cosine, 1.0))
+    return (np.sin((1 - u) * angle) * a + np.sin(u * angle) * b) / np.sin(angle)
+
+
+def interpolate_pose(a_from_b0: Matrix, a_from_b1: Matrix, u: float) -> Matrix:
+    """Pose at fraction ``u`` in [0, 1] between two rigid poses: slerp of rotation, straight line of translation."""
+    rotation = matrix_from_quaternion(slerp(quaternion_from_matrix(a_from_b0), quaternion_from_matrix(a_from_b1), u))
+    return from_rotation_translation(rotation, (1 - u) * a_from_b0[:3, 3] + u * a_from_b1[:3, 3])
+
+
+def pose_at(times_s: NDArray[np.float64], poses: Matrix, time_s: float, tolerance_s: float = 1e-6) -> Matrix | None:
+    """Interpolate sorted pose keys at ``time_s``; None outside the span (never extrapolated), exact at the keys."""
+    if len(times_s) == 0 or time_s < times_s[0] - tolerance_s or time_s > times_s[-1] + tolerance_s:
+        return None
+    after = int(np.searchsorted(times_s, time_s))
+    for near in (after, after - 1):
+        if 0 <= near < len(times_s) and abs(times_s[near] - time_s) <= tolerance_s:
+            return poses[near]
+    before = after - 1
+    u = (time_s - times_s[before]) / (times_s[after] - times_s[before])
+    return interpolate_pose(poses[before], poses[after], float(u))
+
+
+def yaw_matrix(yaw_rad: float, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
+    """4x4 rotation about z (counter-clockwise seen from above) followed by a translation in metres."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return from_rotation_translation([[c, -s, 0], [s, c, 0], [0, 0, 1]], translation)
+
+
+def yaw_of(world_from_object: Matrix) -> float:
+    """Heading of the x axis in the ground plane, radians, counter-clockwise from world x."""
+    return float(np.arctan2(world_from_object[1, 0], world_from_object[0, 0]))
+
+
+def project(view: View, xyz_world: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
+    """Pinhole projection of world points.
+
+    Args:
+        view: camera and pose; lens distortion is not applied (images are rectified on import).
+        xyz_world: ``[N, 3]`` metres.
+
+    Returns:
+        ``uv`` f64[N, 2] pixels (the top-left pixel spans [0, 1) x [0, 1)) and depth ``z`` f64[N] metres. Points with
+        z <= 0 lie behind the camera; their uv is not meaningful and set to NaN.
+    """
+    camera = view.camera
+    xyz_cam = transform_points(view.cam_from_world, np.asarray(xyz_world, np.float64))
+    z = xyz_cam[:, 2]
+    in_front = z > 0
+    safe_z = np.where(in_front, z, 1.0)
+    uv = np.stack([camera.fx * xyz_cam[:, 0] / safe_z + camera.cx, camera.fy * xyz_cam[:, 1] / safe_z + camera.cy], 1)
+    uv[~in_front] = np.nan
+    return uv, z
+
+
+def unproject(view: View, uv_px: NDArray[np.floating], depth_m: NDArray[np.floating]) -> Matrix:
+    """Inverse of ``project``: pixels ``[N, 2]`` and depths ``[N]`` (camera z) to world points f64[N, 3]."""
+    camera = view.camera
+    uv, z = np.asarray(uv_px, np.float64), np.asarray(depth_m, np.float64)
+    xyz_cam = np.stack([(uv[:, 0] - camera.cx) / camera.fx * z, (uv[:, 1] - camera.cy) / camera.fy * z, z], 1)
+    return transform_points(view.world_from_cam, xyz_cam)

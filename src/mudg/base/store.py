@@ -1,0 +1,499 @@
+"""Everything that writes to disk goes through here: temporary name, fsync, rename; sha256 when read back.
+
+A reader sees an old complete file or a new complete file. A verb's output folder is finished when its manifest
+verifies and its key (verb, version, configuration, input hashes) is the one asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log
+from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MANIFEST = "manifest.json"
+_MAX_JSON_BYTES = 512 * 1024 * 1024
+_CHUNK = 1 << 20
+
+
+# single files ---------------------------------------------------------------------------------------------------------
+
+
+def _fsync_directory(path: Path) -> None:
+    with contextlib.suppress(OSError):  # some file systems refuse to sync a directory; the rename is still atomic
+        fd = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+
+
+def _make_parent(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResourceError(
+            "cannot create a folder", where=str(path.parent), got=str(error), remedy="choose another --out"
+        ) from error
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` (same suffix); on success it is fsynced and renamed to ``path``.
+
+    For writers that want a file name (images, video). On any exception the temporary file is removed.
+
+    Raises:
+        ResourceError: the folder cannot be written or the disk is full.
+    """
+    path = Path(path)
+    _make_parent(path)
+    try:
+        fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
+    except OSError as error:
+        raise ResourceError(
+            "cannot write here", where=str(path), got=str(error), remedy="choose another --out"
+        ) from error
+    os.close(fd)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with temporary.open("rb+") as handle:
+            os.fsync(handle.fileno())
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        temporary.replace(path)
+        _fsync_directory(path.parent)
+    except OSError as error:
+        raise ResourceError(
+            "writing failed", where=str(path), got=str(error), remedy="free disk space or choose another --out"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def atomic_write(path: Path, content: bytes) -> None:
+    """Write ``content`` to ``path`` completely or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text to ``path`` completely or not at all."""
+    atomic_write(path, text.encode())
+
+
+def _strict(value: Any, where: str) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError("JSON cannot hold NaN or infinity", where=where, got=str(value))
+    if isinstance(value, Mapping):
+        return {str(k): _strict(v, f"{where}.{k}") for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(v, f"{where}[{i}]") for i, v in enumerate(value)]
+    if isinstance(value, np.ndarray):
+        return _strict(value.tolist(), where)
+    if isinstance(value, np.generic):
+        return _strict(value.item(), where)
+    if isinstance(value, Path):
+        return value.as_posix()
+    return value
+
+
+def json_text(value: Any, indent: int | None = 1) -> str:
+    """Strict JSON: no NaN or infinity; numpy scalars and arrays and paths are converted."""
+    return json.dumps(_strict(value, "value"), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write strict JSON atomically."""
+    write_text(path, json_text(value) + "\n")
+
+
+def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in result:
+            raise ValueError(f"the key {name!r} occurs twice")
+        result[name] = value
+    return result
+
+
+def _no_constants(name: str) -> Any:
+    raise ValueError(f"{name} is not JSON")
+
+
+def parse_json(text: str | bytes, where: str) -> Any:
+    """Parse strict JSON (no NaN, no duplicate keys, bounded size and nesting); InputError names ``where``."""
+    if len(text) > _MAX_JSON_BYTES:
+        raise InputError(
+            "JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes", got=f"{len(text)}"
+        )
+    try:
+        return json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constants)
+    except (ValueError, RecursionError) as error:
+        raise InputError("not valid JSON", where=where, got=str(error) or type(error).__name__) from error
+
+
+def read_json(path: Path) -> Any:
+    """Read strict JSON; a missing or malformed file is an InputError that names it."""
+    return parse_json(read_bytes(path), str(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file; a missing or unreadable one is an InputError that names it."""
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise InputError("file not found", where=str(path)) from error
+    except OSError as error:
+        raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+
+
+def append_line(path: Path, text: str) -> None:
+    """Append one line to a log. A crash can lose the last line, never an earlier one."""
+    _make_parent(path)
+    with Path(path).open("a", encoding="utf-8") as handle:
+        handle.write(text.rstrip("\n") + "\n")
+
+
+def sha256_file(path: Path) -> str:
+    """Hex sha256 of a file's bytes."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as handle:
+        while block := handle.read(_CHUNK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def write_safetensors(
+    path: Path, tensors: Mapping[str, NDArray[Any] | Tensor], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically."""
+    from safetensors.numpy import save as save_numpy
+
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, value in tensors.items():
+        if not isinstance(value, np.ndarray):
+            value = value.detach().cpu().numpy()
+        arrays[name] = np.ascontiguousarray(value)
+    atomic_write(path, save_numpy(arrays, metadata=dict(metadata) if metadata else None))
+
+
+def read_safetensors(path: Path) -> dict[str, NDArray[Any]]:
+    """Read all arrays of a safetensors file; InputError if it is missing, truncated or malformed."""
+    return parse_safetensors(read_bytes(path), str(path))
+
+
+def parse_safetensors(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """Parse safetensors bytes; InputError names ``where``."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load as load_numpy
+
+    try:
+        return load_numpy(content)
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise InputError("not a valid safetensors file", where=where, got=str(error)) from error
+
+
+# directories ----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
+    """Yield a temporary sibling directory that becomes ``path`` on success (replacing an older one)."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".part")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise ResourceError(
+            "cannot create a folder", where=str(partial), got=str(error), remedy="choose another --out"
+        ) from error
+    try:
+        yield partial
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    if path.exists():
+        old = path.with_name(path.name + ".old.part")
+        shutil.rmtree(old, ignore_errors=True)
+        path.rename(old)
+        partial.rename(path)
+        shutil.rmtree(old, ignore_errors=True)
+    else:
+        partial.rename(path)
+    _fsync_directory(path.parent)
+
+
+def list_files(folder: Path) -> list[str]:
+    """Relative POSIX paths of the files below ``folder``, sorted, without temporary and bookkeeping files."""
+    names = []
+    for path in Path(folder).rglob("*"):
+        if path.is_file():
+            relative = path.relative_to(folder).as_posix()
+            if relative in (MANIFEST, "lock") or any(".part" in part for part in relative.split("/")):
+                continue
+            names.append(relative)
+    return sorted(names)
+
+
+def write_manifest(folder: Path, exclude: tuple[str, ...] = ()) -> str:
+    """Record size and sha256 of every file below ``folder``; return the digest of the record itself."""
+    files = {}
+    for name in list_files(folder):
+        if name not in exclude:
+            files[name] = {"bytes": (folder / name).stat().st_size, "sha256": sha256_file(folder / name)}
+    write_json(folder / MANIFEST, {"schema": 1, "files": files})
+    return sha256_file(folder / MANIFEST)
+
+
+def verify_manifest(folder: Path) -> str:
+    """Check every file named in the manifest; return the manifest's digest.
+
+    Raises:
+        IntegrityError: the manifest is missing or malformed, or a file is missing or altered.
+    """
+    path = folder / MANIFEST
+    try:
+        files = read_json(path)["files"]
+        items = [(str(name), str(entry["sha256"]), int(entry["bytes"])) for name, entry in files.items()]
+    except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise IntegrityError("the manifest is missing or damaged", where=str(path), got=str(error)) from error
+    for name, expected, size in items:
+        file = folder / name
+        if not file.is_file():
+            raise IntegrityError("a file is missing", where=str(file))
+        if file.stat().st_size != size or sha256_file(file) != expected:
+            raise IntegrityError(
+                "a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}..."
+            )
+    return sha256_file(path)
+
+
+def digest(path: Path) -> str:
+    """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest."""
+    path = Path(path)
+    if not path.exists():
+        raise InputError("no such file or folder", where=str(path))
+    if path.is_file():
+        return sha256_file(path)
+    if (path / MANIFEST).is_file():
+        return verify_manifest(path)
+    total = hashlib.sha256()
+    for name in list_files(path):
+        total.update(f"{name}\0{sha256_file(path / name)}\n".encode())
+    return total.hexdigest()
+
+
+# a verb's output folder -----------------------------------------------------------------------------------------------
+
+
+class RunDir:
+    """The output folder of one verb: resolved configuration, state, log, manifest, lock.
+
+    ``run.yaml`` is enough to repeat the run; ``run.json`` names verb, key, inputs and state.
+    """
+
+    def __init__(self, path: Path, verb: str, key: str, inputs: Mapping[str, str], complete: bool) -> None:
+        self.path = path
+        self.verb = verb
+        self.key = key
+        self.inputs = dict(inputs)
+        self.complete = complete
+        self._started_s = time.monotonic()
+
+    @classmethod
+    def open(
+        cls,
+        path: Path,
+        verb: str,
+        config: Mapping[str, Any],
+        inputs: Mapping[str, str],
+        version: int = 1,
+        overwrite: bool = False,
+    ) -> RunDir:
+        """Open ``path`` for this verb, configuration and inputs.
+
+        ``complete`` is True when an earlier run with the same key finished and its manifest verifies: the verb then
+        returns at once. An unfinished run with the same key is continued.
+
+        Raises:
+            UsageError: the folder holds the output of another verb or configuration, or foreign files.
+            ResourceError: it cannot be written, or another live process is working in it.
+        """
+        path = Path(path)
+        key = hashlib.sha256(json_text([verb, version, dict(config), dict(inputs)], indent=None).encode()).hexdigest()
+        if overwrite and path.exists():
+            cls._refuse_foreign(path)
+            shutil.rmtree(path)
+        state_file = path / "run.json"
+        if state_file.is_file():
+            state = read_json(state_file)
+            if state.get("key") != key:
+                cls._refuse_other(path, verb, config, inputs, state)
+            if state.get("state") == "complete":
+                cls._verify_finished(path)
+                return cls(path, verb, key, inputs, complete=True)
+        elif path.exists() and any(path.iterdir()):
+            cls._refuse_foreign(path)
+        run = cls(path, verb, key, inputs, complete=False)
+        if not path.is_dir():
+            _make_parent(path / "x")
+        run._lock()
+        import yaml
+
+        write_text(
+            path / "run.yaml", yaml.safe_dump({"verb": verb, **json.loads(json_text(dict(config)))}, sort_keys=False)
+        )
+        run._write_state("running", {})
+        return run
+
+    @staticmethod
+    def _verify_finished(path: Path) -> None:
+        try:
+            verify_manifest(path)
+        except IntegrityError as error:
+            remedy = "add --overwrite to make it again, or choose another --out"
+            raise IntegrityError(
+                error.what, where=error.where, expected=error.expected, got=error.got, remedy=remedy
+            ) from error
+
+    @staticmethod
+    def _refuse_foreign(path: Path) -> None:
+        if not (path / "run.json").is_file():
+            raise UsageError(
+                "the output folder holds files of something else", where=str(path), remedy="choose an empty --out"
+            )
+
+    @staticmethod
+    def _refuse_other(
+        path: Path, verb: str, config: Mapping[str, Any], inputs: Mapping[str, str], state: Mapping[str, Any]
+    ) -> None:
+        import yaml
+
+        differences = []
+        if state.get("verb") != verb:
+            differences.append(f"verb {state.get('verb')!r} instead of {verb!r}")
+        old_inputs = state.get("inputs", {})
+        differences += [f"input {name!r} changed" for name in inputs if old_inputs.get(name) != inputs[name]]
+        with contextlib.suppress(OSError, yaml.YAMLError):
+            old = yaml.safe_load((path / "run.yaml").read_text()) or {}
+            new = json.loads(json_text(dict(config)))
+            differences += _differences(old, {"verb": verb, **new})
+        raise UsageError(
+            "the output folder holds the result of another configuration",
+            where=str(path),
+            got="; ".join(differences[:8]) or "another program version",
+            remedy="choose another --out, or add --overwrite to replace it",
+        )
+
+    def _lock(self) -> None:
+        lock = self.path / "lock"
+        if lock.is_file():
+            try:
+                owner = read_json(lock)
+                pid, host = int(owner["pid"]), str(owner["host"])
+            except (InputError, KeyError, TypeError, ValueError):
+                pid, host = -1, ""
+            if pid != os.getpid() and host == socket.gethostname() and _alive(pid):
+                raise ResourceError(
+                    "another process is working in this folder",
+                    where=str(self.path),
+                    got=f"pid {pid} on {host}",
+                    remedy="wait for it, or choose another --out",
+                )
+        write_json(lock, {"pid": os.getpid(), "host": socket.gethostname()})
+
+    def _write_state(self, state: str, summary: Mapping[str, Any]) -> None:
+        from mudg.base.versions import environment
+
+        seconds = self.seconds_before() + time.monotonic() - self._started_s
+        write_json(
+            self.path / "run.json",
+            {
+                "schema": 1,
+                "verb": self.verb,
+                "key": self.key,
+                "inputs": self.inputs,
+                "state": state,
+                "seconds": round(seconds, 3),
+                "environment": environment(),
+                "summary": dict(summary),
+            },
+        )
+
+    def seconds_before(self) -> float:
+        """Seconds that earlier, interrupted runs of this same key have taken."""
+        if not hasattr(self, "_seconds_before"):
+            self._seconds_before = 0.0
+            state_file = self.path / "run.json"
+            if state_file.is_file():
+                state = read_json(state_file)
+                if state.get("key") == self.key:
+                    self._seconds_before = float(state.get("seconds", 0.0))
+        return self._seconds_before
+
+    def log(self, **fields: Any) -> None:
+        """Append one JSON line to log.jsonl."""
+        append_line(self.path / "log.jsonl", json_text(fields, indent=None))
+
+    def pause(self, summary: Mapping[str, Any] | None = None) -> None:
+        """Record an interruption: time spent so far is kept, the lock released; the same command continues."""
+        self._write_state("interrupted", summary or {})
+        (self.path / "lock").unlink(missing_ok=True)
+
+    def finish(self, summary: Mapping[str, Any] | None = None) -> None:
+        """Mark the folder complete: hash every file, write the manifest, release the lock."""
+        write_manifest(self.path, exclude=("log.jsonl", "run.json"))
+        self._write_state("complete", summary or {})
+        (self.path / "lock").unlink(missing_ok=True)
+        self.complete = True
+
+    def summary(self) -> dict[str, Any]:
+        """The summary that ``finish`` recorded."""
+        return read_json(self.path / "run.json").get("summary", {})
+
+    def reused(self) -> Path:
+        """Say that an earlier result is used again, and return its path."""
+        log.info(f"{self.verb}: reused {self.path} (verified)")
+        return self.path
+
+
+def _alive(pid: int) -> bool:
+    if pid <= 0:
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _differences(old: Any, new: Any, path: str = "") -> list[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        found = []
+        for name in sorted(set(old) | set(new), key=str):
+            found += _differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
+        return found
+    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]

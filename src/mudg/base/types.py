@@ -1,0 +1,510 @@
+"""The words of the package: frozen dataclasses, checked when they are made.
+
+Facts about the world are numpy and live on disk; what is computed on is torch. This module imports no torch, so that
+facts can be read without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry
+from mudg.base.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Matrix = NDArray[np.float64]
+TrajectoryOrigin = Literal["recorded", "shifted", "planned"]
+ObservationKind = Literal["recorded", "virtual"]
+
+
+def _rigid(value: Any, where: str) -> Matrix:
+    matrix = np.array(value, np.float64)
+    problem = geometry.rigid_problem(matrix)
+    if problem:
+        raise InputError("a pose is not a rigid motion", where=where, expected="finite rigid 4x4 matrix", got=problem)
+    matrix.setflags(write=False)
+    return matrix
+
+
+def _finite(value: float, where: str) -> float:
+    number = float(value)
+    if not np.isfinite(number):
+        raise InputError("a number is not finite", where=where, got=str(value))
+    return number
+
+
+def _pose_keys(times_s: Any, poses: Any, where: str) -> tuple[NDArray[np.float64], Matrix]:
+    """Check and freeze interpolation keys: increasing finite times, one rigid pose each."""
+    times = np.array(times_s, np.float64).reshape(-1)
+    matrices = np.array(poses, np.float64)
+    if matrices.shape != (len(times), 4, 4):
+        raise InputError(
+            "pose keys do not match their times", where=where, expected=f"({len(times)}, 4, 4)", got=str(matrices.shape)
+        )
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise InputError("times must be finite and strictly increasing", where=f"{where}.times_s", got=_some(times))
+    for index, matrix in enumerate(matrices):
+        _rigid(matrix, f"{where}[{index}]")
+    times.setflags(write=False)
+    matrices.setflags(write=False)
+    return times, matrices
+
+
+def _some(values: NDArray[Any]) -> str:
+    text = np.array2string(np.asarray(values), threshold=6, edgeitems=3, precision=6)
+    return text if len(text) < 200 else text[:200] + "..."
+
+
+def _check_array(value: Any, where: str, shape: tuple[int | None, ...], dtype: type[np.generic]) -> None:
+    got = getattr(value, "shape", None)
+    fits = got is not None and len(got) == len(shape) and all(w in (None, g) for g, w in zip(got, shape, strict=True))
+    if not fits or not np.issubdtype(value.dtype, dtype):
+        expected = f"{np.dtype(dtype).name if dtype is not np.integer else 'integer'} {shape}".replace("None", "N")
+        raise InputError(
+            "an array has the wrong shape or type",
+            where=where,
+            expected=expected,
+            got=f"{getattr(value, 'dtype', type(value).__name__)} {got}",
+        )
+
+
+def _check_tensor(value: Any, where: str, shape: tuple[int | None, ...]) -> None:
+    got = tuple(getattr(value, "shape", ()))
+    if len(got) != len(shape) or any(w is not None and g != w for g, w in zip(got, shape, strict=True)):
+        raise InputError(
+            "a tensor has the wrong shape", where=where, expected=str(shape).replace("None", "N"), got=str(got)
+        )
+
+
+def _freeze(mapping: Mapping[str, Any]) -> Mapping[str, Any]:
+    return MappingProxyType(dict(mapping))
+
+
+# facts ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera.
+
+    Args:
+        name: sensor name, unique in a scene.
+        width, height: image size in pixels.
+        fx, fy, cx, cy: intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5).
+        distortion: coefficients of the original lens, kept for the record; images in a scene are rectified.
+        readout_s: duration of the rolling shutter, 0 for a global shutter.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    readout_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        where = f"camera {self.name!r}"
+        if self.width < 1 or self.height < 1:
+            raise InputError("image size must be positive", where=where, got=f"{self.width}x{self.height}")
+        for name in ("fx", "fy", "cx", "cy", "readout_s"):
+            _finite(getattr(self, name), f"{where}.{name}")
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError("focal lengths must be positive", where=where, got=f"fx={self.fx}, fy={self.fy}")
+        if self.readout_s < 0:
+            raise InputError("readout time cannot be negative", where=where, got=f"{self.readout_s} s")
+        if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):
+            raise InputError("principal point is far outside the image", where=where, got=f"cx={self.cx}, cy={self.cy}")
+
+    @property
+    def matrix(self) -> Matrix:
+        """Intrinsics f64[3, 3]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same optics sampled on another pixel grid (anisotropic if the aspect differs)."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera at a place and time. ``world_from_cam`` f64[4, 4]; ``time_s`` in seconds of the scene's clock."""
+
+    camera: Camera
+    world_from_cam: Matrix
+    time_s: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "world_from_cam", _rigid(self.world_from_cam, f"view of {self.camera.name!r}"))
+        object.__setattr__(self, "time_s", _finite(self.time_s, f"view of {self.camera.name!r}: time_s"))
+
+    @property
+    def cam_from_world(self) -> Matrix:
+        """f64[4, 4]."""
+        return geometry.invert(self.world_from_cam)
+
+    @property
+    def center_world(self) -> Matrix:
+        """Optical centre f64[3], metres."""
+        return self.world_from_cam[:3, 3]
+
+    def resized(self, width: int, height: int) -> View:
+        """The same view on another pixel grid."""
+        return View(self.camera.resized(width, height), self.world_from_cam, self.time_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """An ordered path of views of one camera; ``origin`` says how it came about."""
+
+    name: str
+    views: tuple[View, ...]
+    origin: TrajectoryOrigin
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+
+@dataclass(frozen=True, slots=True)
+class Ref:
+    """A file inside a scene: a relative POSIX path. Whether it stays inside is checked by the scene reader."""
+
+    path: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One recorded image. ``labels`` maps names (depth, semantics, sky, ego, dynamic, instance, ...) to files."""
+
+    id: str
+    view: View
+    image: Ref
+    labels: Mapping[str, Ref] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", _freeze(self.labels))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """One turn of a LiDAR, its points motion-compensated to ``time_s`` in the sensor's frame."""
+
+    id: str
+    sensor: str
+    time_s: float
+    world_from_lidar: Matrix
+    points: Ref
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "world_from_lidar", _rigid(self.world_from_lidar, f"sweep {self.id!r}"))
+        object.__setattr__(self, "time_s", _finite(self.time_s, f"sweep {self.id!r}: time_s"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepPoints:
+    """Points of a sweep: ``xyz`` f32[N, 3] metres in the LiDAR frame, ``intensity`` f32[N] in [0, 1], ``dt_s`` f32[N]
+    seconds relative to the sweep's time."""
+
+    xyz: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    dt_s: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        _check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
+        _check_array(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
+        _check_array(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A tracked box.
+
+    Args:
+        id: unique in the scene.
+        label: free class name (``car``, ``pedestrian``, ...).
+        size_m: f64[3] length (x), width (y), height (z); the object frame sits in the centre of the box.
+        times_s: f64[T], strictly increasing.
+        world_from_object: f64[T, 4, 4].
+    """
+
+    id: str
+    label: str
+    size_m: NDArray[np.float64]
+    times_s: NDArray[np.float64]
+    world_from_object: Matrix
+
+    def __post_init__(self) -> None:
+        size = np.array(self.size_m, np.float64).reshape(-1)
+        if size.shape != (3,) or not np.isfinite(size).all() or (size <= 0).any():
+            raise InputError(
+                "a box needs a positive length, width and height", where=f"track {self.id!r}", got=_some(size)
+            )
+        size.setflags(write=False)
+        times, poses = _pose_keys(self.times_s, self.world_from_object, f"track {self.id!r}")
+        if len(times) == 0:
+            raise InputError("a track needs at least one box", where=f"track {self.id!r}")
+        object.__setattr__(self, "size_m", size)
+        object.__setattr__(self, "times_s", times)
+        object.__setattr__(self, "world_from_object", poses)
+
+    def pose_at(self, time_s: float) -> Matrix | None:
+        """World-from-object at ``time_s``: interpolated between both neighbouring keys; None outside the span."""
+        return geometry.pose_at(self.times_s, self.world_from_object, time_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EgoPath:
+    """Poses of the recording vehicle: ``times_s`` f64[T], ``world_from_ego`` f64[T, 4, 4]."""
+
+    times_s: NDArray[np.float64]
+    world_from_ego: Matrix
+
+    def __post_init__(self) -> None:
+        times, poses = _pose_keys(self.times_s, self.world_from_ego, "ego path")
+        object.__setattr__(self, "times_s", times)
+        object.__setattr__(self, "world_from_ego", poses)
+
+    def pose_at(self, time_s: float) -> Matrix | None:
+        """World-from-ego at ``time_s``; None outside the recording."""
+        return geometry.pose_at(self.times_s, self.world_from_ego, time_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """Where a scene comes from. ``recipe`` holds what a generated scene needs to rebuild its exact truth; ``notes``
+    are sentences a reader of results should know (assumed timestamps, derived poses)."""
+
+    dataset: str
+    licence: str
+    recipe: Mapping[str, Any] | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointCloud:
+    """Coloured points: ``xyz`` f32[N, 3] metres in ``frame``, ``rgb`` u8[N, 3], ``semantics`` u8[N] ids or None."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    frame: Literal["world", "object"]
+    semantics: NDArray[np.uint8] | None = None
+
+    def __post_init__(self) -> None:
+        _check_array(self.xyz, "point cloud: xyz", (None, 3), np.float32)
+        _check_array(self.rgb, "point cloud: rgb", (len(self.xyz), 3), np.uint8)
+        if self.semantics is not None:
+            _check_array(self.semantics, "point cloud: semantics", (len(self.xyz),), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusedCloud:
+    """The static world and one cloud per moving object (track id -> cloud in its box frame)."""
+
+    static: PointCloud
+    objects: Mapping[str, PointCloud]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "objects", _freeze(self.objects))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """A prepared driving log. Files are referenced, not loaded; ``root`` is a directory or a stored zip."""
+
+    id: str
+    root: str
+    cameras: Mapping[str, Camera]
+    frames: tuple[Frame, ...]
+    sweeps: tuple[Sweep, ...]
+    tracks: tuple[Track, ...]
+    ego: EgoPath
+    split: Mapping[str, Literal["train", "test"]]
+    source: Source
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cameras", _freeze(self.cameras))
+        object.__setattr__(self, "split", _freeze(self.split))
+
+    def frames_of(self, camera: str) -> tuple[Frame, ...]:
+        """Frames of one camera in time order. An unknown camera raises InputError with the names there are."""
+        if camera not in self.cameras:
+            raise InputError(
+                "the scene has no such camera", where=self.root, expected=", ".join(self.cameras), got=camera
+            )
+        return tuple(f for f in self.frames if f.view.camera.name == camera)
+
+    def frames_in(self, split: Literal["train", "test"]) -> tuple[Frame, ...]:
+        """Frames of one split; frames not named in ``split`` are training frames."""
+        return tuple(f for f in self.frames if self.split.get(f.id, "train") == split)
+
+    def track(self, track_id: str) -> Track:
+        """The track with this id."""
+        for track in self.tracks:
+            if track.id == track_id:
+                return track
+        raise InputError("the scene has no such track", where=self.root, got=track_id)
+
+
+# tensors --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Condition:
+    """What the diffusion model is given for T views.
+
+    Args:
+        views: T views, all of one size H x W.
+        color: f32[T, 3, H, W] in [0, 1]; meaningless where not valid.
+        depth: f32[T, 1, H, W] metres; meaningless where not valid.
+        valid: bool[T, 1, H, W]: a fused point was seen here.
+        reference: f32[3, H, W], the dense recorded image near views[0].
+    """
+
+    views: tuple[View, ...]
+    color: Tensor
+    depth: Tensor
+    valid: Tensor
+    reference: Tensor
+
+    def __post_init__(self) -> None:
+        t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
+        _check_tensor(self.color, "condition.color", (t, 3, h, w))
+        _check_tensor(self.depth, "condition.depth", (t, 1, h, w))
+        _check_tensor(self.valid, "condition.valid", (t, 1, h, w))
+        _check_tensor(self.reference, "condition.reference", (3, h, w))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clip:
+    """A training example: a condition and the truth for its T views.
+
+    Args:
+        rgb: f32[T, 3, H, W] in [0, 1].
+        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W].
+        semantics: i64[T, H, W] train ids, 255 = unlabelled.
+    """
+
+    condition: Condition
+    rgb: Tensor
+    depth: Tensor
+    depth_valid: Tensor
+    semantics: Tensor
+
+    def __post_init__(self) -> None:
+        t, _, h, w = self.condition.color.shape
+        _check_tensor(self.rgb, "clip.rgb", (t, 3, h, w))
+        _check_tensor(self.depth, "clip.depth", (t, 1, h, w))
+        _check_tensor(self.depth_valid, "clip.depth_valid", (t, 1, h, w))
+        _check_tensor(self.semantics, "clip.semantics", (t, h, w))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What is known, or believed, about one view. Recorded and generated frames are this same type.
+
+    Args:
+        rgb: f32[3, H, W] in [0, 1].
+        depth: f32[1, H, W] metres, or None if not produced; not finite or <= 0 = no depth (sky).
+        semantics: i64[H, W] train ids (255 = unlabelled), or None if not produced.
+        confidence: f32[1, H, W] in [0, 1].
+        mask: bool[1, H, W]: pixels that may be used at all.
+        kind: recorded by a sensor, or virtual (generated or rendered).
+        source: who made it, e.g. ``camera`` or ``mudg_r``.
+    """
+
+    view: View
+    rgb: Tensor
+    depth: Tensor | None
+    semantics: Tensor | None
+    confidence: Tensor
+    mask: Tensor
+    kind: ObservationKind
+    source: str
+
+    def __post_init__(self) -> None:
+        h, w = self.view.camera.height, self.view.camera.width
+        _check_tensor(self.rgb, "observation.rgb", (3, h, w))
+        if self.depth is not None:
+            _check_tensor(self.depth, "observation.depth", (1, h, w))
+        if self.semantics is not None:
+            _check_tensor(self.semantics, "observation.semantics", (h, w))
+        _check_tensor(self.confidence, "observation.confidence", (1, h, w))
+        _check_tensor(self.mask, "observation.mask", (1, h, w))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaussians:
+    """Gaussians in the world, activated (scales in metres, never their logarithm; opacity in [0, 1]).
+
+    Args:
+        means: f32[N, 3] metres. quats: f32[N, 4] (w, x, y, z), need not be normalised. scales: f32[N, 3] metres.
+        opacity: f32[N]. sh: f32[N, K, 3] spherical harmonics, K = (degree + 1)^2.
+        extra: f32[N, C] feature channels rendered like colours, or None. node: i32[N] index of the scene node.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacity: Tensor
+    sh: Tensor
+    extra: Tensor | None
+    node: Tensor
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        _check_tensor(self.means, "gaussians.means", (n, 3))
+        _check_tensor(self.quats, "gaussians.quats", (n, 4))
+        _check_tensor(self.scales, "gaussians.scales", (n, 3))
+        _check_tensor(self.opacity, "gaussians.opacity", (n,))
+        _check_tensor(self.sh, "gaussians.sh", (n, None, 3))
+        if self.extra is not None:
+            _check_tensor(self.extra, "gaussians.extra", (n, None))
+        _check_tensor(self.node, "gaussians.node", (n,))
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+
+@dataclass(slots=True, eq=False)
+class RasterTrace:
+    """What densification needs to know about a render.
+
+    Args:
+        means2d: f32[N, 2] pixels; its gradient is kept after backward.
+        radii: i32[N, 2] half extent in pixels, 0 = not drawn.
+        visible: bool[N].
+        abs_grad2d: f32[N, 2], sum over pixels of absolute gradients; filled by backward if asked for.
+    """
+
+    means2d: Tensor
+    radii: Tensor
+    visible: Tensor
+    abs_grad2d: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Render:
+    """A rendered view: ``rgb`` f32[3, H, W]; ``depth`` f32[1, H, W] metres, expected z (accumulated / alpha);
+    ``alpha`` f32[1, H, W]; ``extra`` f32[C, H, W] or None (accumulated, not divided by alpha)."""
+
+    rgb: Tensor
+    depth: Tensor
+    alpha: Tensor
+    extra: Tensor | None
+    trace: RasterTrace

@@ -1,0 +1,34 @@
+"""What a result was made with. Read from package metadata, so that nothing heavy is imported."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib import metadata
+from typing import Any
+
+
+def version() -> str:
+    """Version of this package, or ``0+unknown`` when it runs uninstalled."""
+    try:
+        return metadata.version("mudg")
+    except metadata.PackageNotFoundError:
+        return "0+unknown"
+
+
+def environment() -> dict[str, Any]:
+    """Versions and machine facts that results may depend on. Holds no host name, user name or path."""
+    packages = {}
+    for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av"):
+        try:
+            packages[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            packages[name] = "missing"
+    return {
+        "mudg": version(),
+        "python": platform.python_version(),
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "cpu_count": os.cpu_count(),
+        "packages": packages,
+    }

@@ -1,0 +1,1 @@
+"""Floor 2: pure tensor functions. No files, no configuration loading, no parameters."""

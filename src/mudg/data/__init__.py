@@ -1,0 +1,1 @@
+"""Floor 3: bytes to types and back. Knows no model."""

@@ -1,0 +1,249 @@
+"""Folders of observations: what synthesize and render write, and fit, score and the report read.
+
+observations.json    schema, trajectory, source, kind; one record per view (camera, pose, time, file names)
+rgb/000000.png       8-bit colour, for people and programs
+data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled), confidence f16, mask u8
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from mudg.base import palette, store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Observation, ObservationKind, View
+
+_INDEX = "observations.json"
+_SCHEMA = 1
+
+
+def camera_record(camera: Camera) -> dict[str, Any]:
+    """A camera as JSON values."""
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "distortion": list(camera.distortion),
+        "readout_s": camera.readout_s,
+    }
+
+
+def camera_from_record(record: Any, where: str) -> Camera:
+    """Inverse of ``camera_record``; InputError names ``where`` and the field."""
+    try:
+        return Camera(
+            name=str(record["name"]),
+            width=int(record["width"]),
+            height=int(record["height"]),
+            fx=float(record["fx"]),
+            fy=float(record["fy"]),
+            cx=float(record["cx"]),
+            cy=float(record["cy"]),
+            distortion=tuple(float(x) for x in record.get("distortion", ())),
+            readout_s=float(record.get("readout_s", 0.0)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError("a camera record is incomplete or malformed", where=where, got=repr(error)) from error
+
+
+class ObservationWriter:
+    """Write observations of one trajectory, in order, resumably.
+
+    Observations written by an interrupted run are kept: ``done`` says how many. The index appears when the writer is
+    closed without an exception, so an unfinished folder is not readable as a finished one.
+    """
+
+    def __init__(self, out: Path, trajectory: str, source: str, kind: ObservationKind = "virtual") -> None:
+        self._out = Path(out)
+        self._trajectory = trajectory
+        self._source = source
+        self._kind = kind
+        self._records: list[dict[str, Any]] = []
+        self.done = 0
+        while (self._out / "data" / f"{self.done:06d}.safetensors").is_file():
+            self.done += 1
+
+    def __enter__(self) -> ObservationWriter:
+        return self
+
+    def skip(self, view: View) -> None:
+        """Record a view whose files an earlier run has written."""
+        self._record(view)
+
+    def add(self, observation: Observation) -> None:
+        """Write one observation and record its view."""
+        name = f"{len(self._records):06d}"
+        rgb = (observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+        with store.atomic_path(self._out / "rgb" / f"{name}.png") as temporary:
+            Image.fromarray(rgb).save(temporary, compress_level=1)
+        h, w = rgb.shape[:2]
+        depth = (
+            np.full((h, w), np.nan, np.float32)
+            if observation.depth is None
+            else _numpy(observation.depth[0], np.float32)
+        )
+        semantics = (
+            np.full((h, w), palette.UNLABELLED, np.uint8)
+            if observation.semantics is None
+            else _numpy(observation.semantics, np.uint8)
+        )
+        store.write_safetensors(
+            self._out / "data" / f"{name}.safetensors",
+            {
+                "depth": depth,
+                "semantics": semantics,
+                "confidence": _numpy(observation.confidence[0], np.float16),
+                "mask": _numpy(observation.mask[0], np.uint8),
+            },
+            metadata={
+                "depth": "no" if observation.depth is None else "yes",
+                "semantics": "no" if observation.semantics is None else "yes",
+            },
+        )
+        self._record(observation.view, observation.depth is not None, observation.semantics is not None)
+
+    def _record(self, view: View, has_depth: bool = True, has_semantics: bool = True) -> None:
+        self._records.append(
+            {
+                "camera": camera_record(view.camera),
+                "world_from_cam": view.world_from_cam.tolist(),
+                "time_s": view.time_s,
+                "depth": has_depth,
+                "semantics": has_semantics,
+            }
+        )
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            store.write_json(
+                self._out / _INDEX,
+                {
+                    "schema": _SCHEMA,
+                    "trajectory": self._trajectory,
+                    "source": self._source,
+                    "kind": self._kind,
+                    "observations": self._records,
+                },
+            )
+
+
+def _numpy(tensor: torch.Tensor, dtype: type[np.generic]) -> NDArray[Any]:
+    return tensor.detach().cpu().numpy().astype(dtype)
+
+
+@dataclass(frozen=True)
+class ObservationSet:
+    """Observations of one trajectory on disk; indexing loads one."""
+
+    path: Path
+    trajectory: str
+    source: str
+    kind: ObservationKind
+    views: tuple[View, ...]
+    has_depth: tuple[bool, ...]
+    has_semantics: tuple[bool, ...]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def rgb_u8(self, index: int) -> NDArray[np.uint8]:
+        """Colour u8[H, W, 3] of one observation."""
+        return read_image_file(self.path / "rgb" / f"{index:06d}.png", self.views[index].camera)
+
+    def __getitem__(self, index: int) -> Observation:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        view = self.views[index]
+        path = self.path / "data" / f"{index:06d}.safetensors"
+        arrays = store.read_safetensors(path)
+        shape = (view.camera.height, view.camera.width)
+        for name in ("depth", "semantics", "confidence", "mask"):
+            if name not in arrays or arrays[name].shape != shape:
+                got = "missing" if name not in arrays else str(arrays[name].shape)
+                raise InputError(
+                    "an observation file does not fit its view", where=f"{path}: {name}", expected=str(shape), got=got
+                )
+        return Observation(
+            view=view,
+            rgb=torch.from_numpy(self.rgb_u8(index).copy()).permute(2, 0, 1).float() / 255,
+            depth=torch.from_numpy(arrays["depth"].copy())[None] if self.has_depth[index] else None,
+            semantics=torch.from_numpy(arrays["semantics"].astype(np.int64)) if self.has_semantics[index] else None,
+            confidence=torch.from_numpy(arrays["confidence"].astype(np.float32))[None],
+            mask=torch.from_numpy(arrays["mask"].astype(bool))[None],
+            kind=self.kind,
+            source=self.source,
+        )
+
+
+def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """Read an 8-bit colour image u8[H, W, 3]; InputError if it is missing, truncated or of another size."""
+    content = store.read_bytes(path)
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            if image.size != (camera.width, camera.height):
+                raise InputError(
+                    "an image has another size than its camera",
+                    where=str(path),
+                    expected=f"{camera.width}x{camera.height}",
+                    got=f"{image.size[0]}x{image.size[1]}",
+                )
+            return np.asarray(image.convert("RGB"))
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
+
+
+def read_observations(path: Path) -> ObservationSet:
+    """Open a folder of observations; nothing but the index is read.
+
+    Raises:
+        InputError: the folder has no index (unfinished or not an observation folder) or a record is malformed.
+    """
+    index = Path(path) / _INDEX
+    if not index.is_file():
+        raise InputError("not a finished folder of observations", where=str(path), expected=f"a file {_INDEX}")
+    content = store.read_json(index)
+    try:
+        if content["schema"] != _SCHEMA:
+            raise InputError(
+                "unknown schema version", where=str(index), expected=str(_SCHEMA), got=str(content["schema"])
+            )
+        records = content["observations"]
+        views = tuple(
+            View(
+                camera_from_record(r["camera"], f"{index}: observations[{i}].camera"),
+                np.asarray(r["world_from_cam"], np.float64),
+                float(r["time_s"]),
+            )
+            for i, r in enumerate(records)
+        )
+        return ObservationSet(
+            Path(path),
+            str(content["trajectory"]),
+            str(content["source"]),
+            "recorded" if content["kind"] == "recorded" else "virtual",
+            views,
+            tuple(bool(r["depth"]) for r in records),
+            tuple(bool(r["semantics"]) for r in records),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
+
+
+def list_observation_sets(path: Path) -> dict[str, Path]:
+    """Trajectory folders below ``path``, by name."""
+    return {p.name: p for p in sorted(Path(path).iterdir()) if (p / _INDEX).is_file()} if Path(path).is_dir() else {}

@@ -1,0 +1,1 @@
+"""Floor 3: everything that holds parameters. Knows no file."""

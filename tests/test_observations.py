@@ -1,0 +1,94 @@
+"""Observation folders: round trip, resume, and refusal of what does not fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Observation, View
+from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
+
+CAMERA = Camera("front", 8, 6, 5.0, 5.0, 4.0, 3.0)
+
+
+def _observation(index: int) -> Observation:
+    g = torch.Generator().manual_seed(index)
+    pose = np.eye(4)
+    pose[0, 3] = index
+    depth = torch.rand(1, 6, 8, generator=g) * 50
+    depth[0, 0, 0] = float("nan")
+    return Observation(
+        View(CAMERA, pose, index / 10),
+        (torch.rand(3, 6, 8, generator=g) * 255).round() / 255,
+        depth,
+        torch.randint(0, 19, (6, 8), generator=g),
+        (torch.rand(1, 6, 8, generator=g) * 1024).round() / 1024,
+        torch.rand(1, 6, 8, generator=g) > 0.5,
+        "virtual",
+        "mudg_r",
+    )
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    with ObservationWriter(tmp_path / "front_shift+2.0", "front_shift+2.0", "mudg_r") as writer:
+        for i in range(3):
+            writer.add(_observation(i))
+    found = read_observations(list_observation_sets(tmp_path)["front_shift+2.0"])
+    assert (found.trajectory, found.source, len(found)) == ("front_shift+2.0", "mudg_r", 3)
+    for i in range(3):
+        want, got = _observation(i), found[i]
+        torch.testing.assert_close(got.rgb, want.rgb, atol=1e-6, rtol=0)
+        torch.testing.assert_close(got.depth, want.depth, equal_nan=True, atol=0, rtol=0)
+        assert torch.equal(got.semantics, want.semantics)
+        torch.testing.assert_close(got.confidence, want.confidence, atol=1e-3, rtol=0)
+        assert torch.equal(got.mask, want.mask)
+        np.testing.assert_array_equal(got.view.world_from_cam, want.view.world_from_cam)
+        assert got.view.time_s == want.view.time_s
+    with pytest.raises(IndexError):
+        found[3]
+
+
+def test_modalities_not_produced_stay_none(tmp_path: Path) -> None:
+    bare = _observation(0)
+    with ObservationWriter(tmp_path / "t", "t", "x") as writer:
+        writer.add(Observation(bare.view, bare.rgb, None, None, bare.confidence, bare.mask, "virtual", "x"))
+    got = read_observations(tmp_path / "t")[0]
+    assert got.depth is None
+    assert got.semantics is None
+
+
+def test_an_interrupted_folder_is_not_readable_but_its_files_are_kept(tmp_path: Path) -> None:
+
+    def interrupted() -> None:
+        with ObservationWriter(tmp_path / "t", "t", "x") as writer:
+            writer.add(_observation(0))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    with pytest.raises(InputError, match="finished"):
+        read_observations(tmp_path / "t")
+    with ObservationWriter(tmp_path / "t", "t", "x") as writer:
+        assert writer.done == 1
+        writer.skip(_observation(0).view)
+        writer.add(_observation(1))
+    assert len(read_observations(tmp_path / "t")) == 2
+
+
+def test_damaged_files_are_named(tmp_path: Path) -> None:
+    with ObservationWriter(tmp_path / "t", "t", "x") as writer:
+        writer.add(_observation(0))
+    png = tmp_path / "t" / "rgb" / "000000.png"
+    content = png.read_bytes()
+    png.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match=r"000000\.png"):
+        read_observations(tmp_path / "t")[0]
+    png.write_bytes(content)
+    store.write_safetensors(tmp_path / "t" / "data" / "000000.safetensors", {"depth": np.zeros((2, 2), np.float32)})
+    with pytest.raises(InputError, match=r"000000\.safetensors"):
+        read_observations(tmp_path / "t")[0]

@@ -1,0 +1,188 @@
+"""Nothing half-written, nothing silently wrong: files, manifests, run folders, checkpoints."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mudg.base import checkpoint, errors, store
+from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+
+
+def test_atomic_path_leaves_the_old_file_when_the_writer_fails(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    store.write_text(target, "old")
+
+    def fail() -> None:
+        with store.atomic_path(target) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_written_files_follow_the_umask(tmp_path: Path) -> None:
+    store.write_safetensors(tmp_path / "a.safetensors", {"x": np.zeros(3)})
+    mask = os.umask(0)
+    os.umask(mask)
+    assert (tmp_path / "a.safetensors").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+def test_unwritable_folder_is_a_resource_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ResourceError, match="--out"):
+        store.write_text(tmp_path / "file" / "b.txt", "x")
+
+
+@pytest.mark.parametrize("text", ['{"a": NaN}', '{"a": 1, "a": 2}', "{", "[" * 100_000])
+def test_json_is_strict(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError, match=r"a\.json"):
+        store.read_json(tmp_path / "a.json")
+
+
+def test_json_refuses_to_write_nan_and_names_the_field(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"x\.y\[1\]"):
+        store.write_json(tmp_path / "a.json", {"x": {"y": [1.0, float("nan")]}})
+    assert not (tmp_path / "a.json").exists()
+
+
+def test_safetensors_round_trip_and_truncation(tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    store.write_safetensors(path, {"n": np.arange(6).reshape(2, 3), "t": torch.ones(2, 2).t()})
+    back = store.read_safetensors(path)
+    np.testing.assert_array_equal(back["n"], np.arange(6).reshape(2, 3))
+    content = path.read_bytes()
+    for keep in (0, 4, 12, len(content) - 1):
+        path.write_bytes(content[:keep])
+        with pytest.raises(InputError, match=r"a\.safetensors"):
+            store.read_safetensors(path)
+
+
+def test_manifest_detects_every_single_bit_flip(tmp_path: Path) -> None:
+    store.write_safetensors(tmp_path / "a.safetensors", {"x": np.arange(32, dtype=np.float32)})
+    store.write_manifest(tmp_path)
+    content = (tmp_path / "a.safetensors").read_bytes()
+    for position in range(0, len(content), 17):
+        flipped = bytearray(content)
+        flipped[position] ^= 1 << (position % 8)
+        (tmp_path / "a.safetensors").write_bytes(bytes(flipped))
+        with pytest.raises(IntegrityError, match=r"a\.safetensors"):
+            store.verify_manifest(tmp_path)
+    (tmp_path / "a.safetensors").write_bytes(content)
+    store.verify_manifest(tmp_path)
+    (tmp_path / "a.safetensors").unlink()
+    with pytest.raises(IntegrityError, match="missing"):
+        store.verify_manifest(tmp_path)
+
+
+def _run(path: Path, value: int = 1, **kwargs: object) -> store.RunDir:
+    return store.RunDir.open(path, "fit", {"value": value, "nested": {"x": 0.5}}, {"scene": "abc"}, **kwargs)  # type: ignore[arg-type]
+
+
+def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
+    run = _run(tmp_path / "r")
+    assert not run.complete
+    store.write_text(run.path / "out.txt", "result")
+    run.log(step=1, loss=0.5)
+    run.finish({"psnr": 30.0})
+    again = _run(tmp_path / "r")
+    assert again.complete
+    assert again.summary() == {"psnr": 30.0}
+    (run.path / "out.txt").write_text("altered")
+    with pytest.raises(IntegrityError, match="--overwrite"):
+        _run(tmp_path / "r")
+    assert not _run(tmp_path / "r", overwrite=True).complete
+
+
+def test_run_folder_refuses_another_configuration_and_names_the_difference(tmp_path: Path) -> None:
+    _run(tmp_path / "r").finish()
+    with pytest.raises(UsageError, match="value: 1 there, 2 asked"):
+        _run(tmp_path / "r", value=2)
+    with pytest.raises(UsageError, match="scene"):
+        store.RunDir.open(tmp_path / "r", "fit", {"value": 1, "nested": {"x": 0.5}}, {"scene": "xyz"})
+
+
+def test_run_folder_never_touches_foreign_files(tmp_path: Path) -> None:
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "thesis.tex").write_text("precious")
+    for overwrite in (False, True):
+        with pytest.raises(UsageError, match="something else"):
+            _run(tmp_path / "r", overwrite=overwrite)
+    assert (tmp_path / "r" / "thesis.tex").read_text() == "precious"
+
+
+def test_interrupted_run_continues_and_a_crash_before_the_state_is_not_complete(tmp_path: Path) -> None:
+    run = _run(tmp_path / "r")
+    store.write_text(run.path / "out.txt", "half")
+    run.pause()
+    assert json.loads((tmp_path / "r" / "run.json").read_text())["state"] == "interrupted"
+    again = _run(tmp_path / "r")
+    assert not again.complete
+    store.write_manifest(again.path)  # a crash between manifest and state
+    assert not _run(tmp_path / "r").complete
+
+
+def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_path: Path) -> None:
+    import socket
+
+    run = _run(tmp_path / "r")
+    store.write_json(run.path / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
+    with pytest.raises(ResourceError, match=str(os.getppid())):
+        _run(tmp_path / "r")
+    store.write_json(run.path / "lock", {"pid": 2**22 + 1, "host": socket.gethostname()})
+    assert not _run(tmp_path / "r").complete
+
+
+def test_checkpoints_keep_two_and_fall_back_past_a_damaged_one(tmp_path: Path) -> None:
+    for step in (10, 20, 30):
+        checkpoint.save(tmp_path, step, {"model": {"w": torch.full((4,), float(step))}}, {"loss": 1 / step})
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["step_00000020", "step_00000030"]
+    newest = checkpoint.latest(tmp_path)
+    assert newest is not None
+    assert newest.step == 30
+    assert torch.equal(newest.tensors("model")["w"], torch.full((4,), 30.0))
+    damaged = tmp_path / "step_00000030" / "model.safetensors"
+    content = bytearray(damaged.read_bytes())
+    content[-1] ^= 1
+    damaged.write_bytes(bytes(content))
+    older = checkpoint.latest(tmp_path)
+    assert older is not None
+    assert older.step == 20
+    (tmp_path / "step_00000020" / store.MANIFEST).unlink()
+    with pytest.raises(IntegrityError, match="no checkpoint verifies"):
+        checkpoint.latest(tmp_path)
+    assert damaged.exists()
+
+
+def test_half_written_and_foreign_folders_are_not_checkpoints(tmp_path: Path) -> None:
+    assert checkpoint.latest(tmp_path) is None
+    (tmp_path / "step_00000005.part").mkdir()
+    (tmp_path / "step_latest").mkdir()
+    assert checkpoint.latest(tmp_path) is None
+
+
+def test_a_failed_checkpoint_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        checkpoint.save(tmp_path, 1, {"model": {"w": torch.zeros(1)}}, {"loss": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_carry_all_fields_and_cross_process_boundaries() -> None:
+    error = InputError("bad", where="a.json: x", expected="1", got="2", remedy="fix it")
+    text = str(error)
+    assert all(part in text for part in ("bad", "a.json: x", "expected: 1", "got: 2", "fix it"))
+    again = pickle.loads(pickle.dumps(error))
+    assert isinstance(again, InputError)
+    assert str(again) == text
+    codes = [errors.UsageError, errors.InputError, errors.IntegrityError, errors.ResourceError, errors.NumericsError]
+    assert [c.exit_code for c in codes] == [2, 3, 4, 5, 6]
