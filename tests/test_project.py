@@ -1,0 +1,142 @@
+"""The point z-buffer: agreement with the one projection, nearest wins, both back-ends give the same bits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mudg import native
+from mudg.base import geometry
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Camera, FusedCloud, PointCloud, View
+from mudg.core import project
+from mudg.core.project import ProjectConfig, project_cloud, project_points
+
+CAMERA = Camera("front", 96, 64, 70.0, 71.0, 47.3, 31.1)
+VIEW = View(CAMERA, geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
+FACING = geometry.invert(geometry.CAM_FROM_EGO_AXES)
+
+
+def _cloud(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    xyz = np.stack([rng.uniform(-5, 80, count), rng.uniform(-30, 30, count), rng.uniform(-3, 12, count)], 1)
+    return xyz.astype(np.float32), rng.integers(0, 256, (count, 3), dtype=np.uint8)
+
+
+def test_every_seen_point_lands_on_its_projected_pixel_and_nothing_nearer_was_lost() -> None:
+    xyz, rgb = _cloud(20_000)
+    got = project_points(xyz, rgb, VIEW, near_m=0.5, far_m=60.0)
+    uv, z = geometry.project(VIEW, xyz)
+    with np.errstate(invalid="ignore"):
+        pixel = np.floor(uv)
+    inside = (z >= 0.5) & (z <= 60) & (pixel[:, 0] >= 0) & (pixel[:, 1] >= 0) & (pixel[:, 0] < 96) & (pixel[:, 1] < 64)
+    nearest = np.full((64, 96), np.inf)
+    np.minimum.at(nearest, (pixel[inside, 1].astype(int), pixel[inside, 0].astype(int)), z[inside])
+    valid = got.valid[0].numpy()
+    # float32 may move a point that lies on a pixel's very edge: at most a few in 20,000
+    assert (valid != np.isfinite(nearest)).mean() < 1e-3
+    both = valid & np.isfinite(nearest)
+    assert (np.abs(got.depth[0].numpy()[both] - nearest[both]) < 1e-3).mean() > 0.999
+    index = got.index.numpy()
+    np.testing.assert_array_equal(
+        (got.color.permute(1, 2, 0).numpy()[valid] * 255).round().astype(np.uint8), rgb[index[valid]]
+    )
+    assert (index[~valid] == -1).all()
+    assert (got.depth[0].numpy()[~valid] == 0).all()
+
+
+@pytest.mark.parametrize("splat", [1.0, 2.5, 4.0])
+@pytest.mark.parametrize("occluder", [0.0, 0.4])
+def test_native_and_numpy_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, splat: float, occluder: float) -> None:
+    if native.library() is None:
+        pytest.skip("the native library is not installed")
+    xyz, rgb = _cloud(5000, seed=1)
+    xyz[:3] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]]
+    cloud = FusedCloud(PointCloud(xyz, rgb, "world"), {"a": PointCloud(xyz[:500] * 0.1, rgb[:500], "object")})
+    config = ProjectConfig(static_splat_px=splat, object_splat_px=splat + 1, occluder_m=occluder)
+    pose = {"a": geometry.yaw_matrix(0.3, (12, 1, 0))}
+    want = project_cloud(cloud, pose, VIEW, config)
+    monkeypatch.setattr(project.native, "library", lambda: None)
+    got = project_cloud(cloud, pose, VIEW, config)
+    for name in ("color", "depth", "valid", "index"):
+        assert torch.equal(getattr(want, name), getattr(got, name)), name
+
+
+def test_result_does_not_depend_on_the_thread_count() -> None:
+    if native.library() is None:
+        pytest.skip("the native library is not installed")
+    xyz, rgb = _cloud(200_000, seed=2)
+    before = native.threads()
+    try:
+        native.set_threads(1)
+        one = project_points(xyz, rgb, VIEW, splat_px=2.5)
+        native.set_threads(4)
+        four = project_points(xyz, rgb, VIEW, splat_px=2.5)
+    finally:
+        native.set_threads(before)
+    assert torch.equal(one.index, four.index)
+    assert torch.equal(one.depth, four.depth)
+
+
+def test_equal_depths_go_to_the_lower_index() -> None:
+    xyz = np.array([[10, 0, 0], [10, 0, 0]], np.float32)
+    got = project_points(xyz, np.array([[255, 0, 0], [0, 255, 0]], np.uint8), VIEW)
+    assert int(got.index.max()) == 0
+    assert int(got.valid.sum()) == 1
+
+
+def test_splat_of_one_pixel_covers_one_pixel_and_of_three_nine() -> None:
+    xyz = np.array([[10, 0, 0]], np.float32)
+    for side, pixels in ((1.0, 1), (2.0, 4), (3.0, 9)):
+        assert int(project_points(xyz, None, VIEW, splat_px=side).valid.sum()) == pixels
+
+
+def test_objects_are_composed_by_depth_not_painted_over() -> None:
+    wall = np.stack(np.meshgrid([10.0], np.linspace(-5, 5, 400), np.linspace(-4, 4, 400)), -1).reshape(-1, 3)
+    car = np.array([[0.0, y, 0] for y in np.linspace(-1, 1, 200)])
+    red, blue = np.array([255, 0, 0], np.uint8), np.array([0, 0, 255], np.uint8)
+    cloud = FusedCloud(
+        PointCloud(wall.astype(np.float32), np.tile(red, (len(wall), 1)), "world"),
+        {"car": PointCloud(car.astype(np.float32), np.tile(blue, (len(car), 1)), "object")},
+    )
+    behind = project_cloud(cloud, {"car": geometry.yaw_matrix(0, (15, 0, 0))}, VIEW)
+    assert not (behind.color[2] > 0).any()
+    before = project_cloud(cloud, {"car": geometry.yaw_matrix(0, (5, 0, 0))}, VIEW)
+    assert (before.color[2] > 0).any()
+    assert not (project_cloud(cloud, {}, VIEW).color[2] > 0).any()
+
+
+def test_occluder_removes_what_shines_through_gaps_and_keeps_the_road() -> None:
+    rng = np.random.default_rng(3)
+    near = np.stack([np.full(4000, 6.0), rng.uniform(-4, 4, 4000), rng.uniform(-3, 3, 4000)], 1)
+    far = np.stack([np.full(60_000, 30.0), rng.uniform(-19, 19, 60_000), rng.uniform(-14, 14, 60_000)], 1)
+    xyz = np.concatenate([near, far]).astype(np.float32)
+    uv, z = geometry.project(VIEW, xyz)
+    plain = project_points(xyz, None, VIEW)
+    cloud = FusedCloud(PointCloud(xyz, np.zeros((len(xyz), 3), np.uint8), "world"), {})
+    filtered = project_cloud(cloud, {}, VIEW, ProjectConfig(occluder_m=0.4))
+    central = (slice(None), slice(8, 56), slice(8, 88))
+    assert (plain.depth[central] > 20).float().mean() > 0.2
+    assert (filtered.depth[central] > 20).float().mean() < 0.02
+    assert torch.equal(filtered.depth[filtered.valid], plain.depth[filtered.valid])
+    # a road seen at a grazing angle hides nothing of itself
+    road = np.stack([rng.uniform(2, 60, 200_000), rng.uniform(-10, 10, 200_000), np.full(200_000, -1.6)], 1).astype(
+        np.float32
+    )
+    road_cloud = FusedCloud(PointCloud(road, np.zeros((len(road), 3), np.uint8), "world"), {})
+    kept = project_cloud(road_cloud, {}, VIEW, ProjectConfig(occluder_m=0.2)).valid.sum()
+    assert kept > 0.97 * project_points(road, None, VIEW).valid.sum()
+
+
+def test_empty_and_bad_input() -> None:
+    nothing = project_points(np.zeros((0, 3), np.float32), None, VIEW)
+    assert not nothing.valid.any()
+    behind = project_points(np.array([[-5, 0, 0]], np.float32), None, VIEW)
+    assert not behind.valid.any()
+    with pytest.raises(InputError, match=r"\[N, 3\]"):
+        project_points(np.zeros((3, 2), np.float32), None, VIEW)
+    with pytest.raises(UsageError, match="near_m"):
+        ProjectConfig(near_m=5.0, far_m=1.0)
+    with pytest.raises(UsageError, match="static_splat_px"):
+        ProjectConfig(static_splat_px=0.0)
