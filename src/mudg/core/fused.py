@@ -1,0 +1,119 @@
+"""Training steps that touch much memory, done in one native pass: the photometric loss with its gradient, and Adam.
+
+Both have a plain-torch twin (``core.losses.photometric``, ``core.table.torch_adam``), which is used, and named once, where
+the native library is missing or the tensors are not float32 on the CPU.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mudg import native
+from mudg.base import log
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.core import losses
+from mudg.core.table import BETA1, BETA2, EPSILON, torch_adam
+
+
+def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[C, H, W]`` in [0, 1].
+
+    Differentiable in the prediction (once); the target is data. The value does not depend on the number of threads.
+    SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding.
+
+    Raises:
+        InputError: shapes differ or are not [C, H, W].
+        UsageError: the weight is outside [0, 1].
+    """
+    if prediction.shape != target.shape or prediction.ndim != 3:
+        raise InputError("photometric: images must be [C, H, W] of one shape", expected=str(tuple(prediction.shape)),
+                         got=str(tuple(target.shape)))  # fmt: skip
+    if not 0 <= ssim_weight <= 1:
+        raise UsageError("the weight of SSIM must lie in [0, 1]", got=str(ssim_weight))
+    library = _library_for((prediction, target))
+    if library is None or prediction.numel() == 0:
+        return losses.photometric(prediction, target, ssim_weight)
+    return _Photometric.apply(prediction, target.detach(), ssim_weight, library)
+
+
+def adam(
+    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int,
+    visible: Tensor | None = None,
+) -> None:  # fmt: skip
+    """One Adam step in place: betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
+
+    Args:
+        parameter, gradient, moment1, moment2: one shape ``[N, ...]``; contiguous for the native path.
+        visible: bool[N]: only these rows move, parameters and moments; None = all.
+
+    Raises:
+        InputError: shapes differ, or ``visible`` is not bool[N].
+        UsageError: ``step`` below 1.
+    """
+    tensors = (parameter, gradient, moment1, moment2)
+    if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0:
+        raise InputError("adam: parameter, gradient and moments must share one shape [N, ...]",
+                         got=str([tuple(t.shape) for t in tensors]))  # fmt: skip
+    if visible is not None and (visible.shape != parameter.shape[:1] or visible.dtype != torch.bool):
+        raise InputError("adam: visible must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
+                         got=f"{visible.dtype}{list(visible.shape)}")  # fmt: skip
+    if step < 1:
+        raise UsageError("Adam steps count from 1", got=str(step))
+    library = _library_for(tensors)
+    in_place = (parameter, moment1, moment2)
+    if library is None or not all(t.is_contiguous() for t in in_place):
+        with torch.no_grad():
+            torch_adam(parameter, gradient, moment1, moment2, rate, step, visible)
+        return
+    rows = parameter.shape[0]
+    columns = parameter.numel() // rows if rows else 0
+    source = gradient.detach().contiguous()
+    mask = None if visible is None else visible.contiguous()
+    pointer, integer, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    library.mudg_adam(
+        pointer(parameter.data_ptr()), pointer(source.data_ptr()), pointer(moment1.data_ptr()),
+        pointer(moment2.data_ptr()), integer(rows), integer(columns),
+        pointer(None if mask is None else mask.data_ptr()), real(rate), real(BETA1), real(BETA2), real(EPSILON),
+        integer(step),
+    )  # fmt: skip
+    # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
+    torch.autograd.graph.increment_version(in_place)
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float, library: ctypes.CDLL) -> Tensor:
+        image, wanted = prediction.detach().contiguous(), target.contiguous()
+        gradient, status = torch.empty_like(image), ctypes.c_int(0)
+        library.mudg_photometric.restype = ctypes.c_double
+        value = library.mudg_photometric(
+            ctypes.c_void_p(image.data_ptr()), ctypes.c_void_p(wanted.data_ptr()), *map(ctypes.c_int, image.shape),
+            ctypes.c_float(ssim_weight), ctypes.c_void_p(gradient.data_ptr()), ctypes.byref(status),
+        )  # fmt: skip
+        if status.value != 0:
+            raise ResourceError("not enough memory for the photometric loss", where=f"image {tuple(image.shape)}")
+        ctx.save_for_backward(gradient)
+        return prediction.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream, None, None, None
+
+
+def _library_for(tensors: tuple[Tensor, ...]) -> ctypes.CDLL | None:
+    """The library where it can work on these tensors; says once why not."""
+    library = native.library()
+    if library is None:
+        log.info_once(f"photometric loss and Adam: plain torch, slower ({native.status()})")
+        return None
+    fits = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
+    if not fits:
+        log.info_once(f"photometric loss and Adam: plain torch for {tensors[0].dtype} on {tensors[0].device}")
+    return library if fits else None

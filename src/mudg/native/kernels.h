@@ -1,0 +1,59 @@
+// The kernels that exist once per instruction set, as a table of function pointers.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "raster_types.h"
+
+namespace mudg {
+
+// The photometric loss (loss.h) on planar images [planes][height][width].
+constexpr int kPhotometricApron = 16;  // zeros left and right of a row of a derivative map
+constexpr int kPhotometricStrip = 32;  // rows per piece of work
+struct PhotometricJob {
+  const float *x, *y;
+  int planes, height, width;
+  float ssim_weight;
+  float* gradient;         // like x
+  int padded_width;        // multiple of 16
+  int row_stride;          // padded_width + two aprons
+  float* maps;             // [3][planes][height][row_stride]
+  float* worker_scratch;   // [workers][worker_stride]
+  std::size_t worker_stride;
+  int workers;
+  double* partial;         // [planes * strips]
+};
+
+// One Adam step (adam.h) on a table [rows][columns].
+struct AdamJob {
+  float* parameter;
+  const float* gradient;
+  float *moment1, *moment2;
+  std::int64_t rows;
+  std::size_t columns;
+  const std::uint8_t* visible;  // [rows], null: all
+  float beta1, beta2, epsilon;
+  float step_size;        // rate / (1 - beta1^step)
+  float inv_root_bias2;   // 1 / sqrt(1 - beta2^step)
+};
+
+struct Kernels {
+  void (*project_forward)(RasterState&, RasterImage&);
+  void (*blend_forward)(RasterState&, RasterImage&);
+  void (*blend_backward)(RasterState&, const RasterImageGradient&);
+  void (*project_backward)(RasterState&, RasterGradient&);
+  double (*photometric)(const PhotometricJob&);
+  void (*adam)(const AdamJob&);
+};
+
+const Kernels& kernels_portable();
+#if defined(__x86_64__)
+const Kernels& kernels_avx2();
+const Kernels& kernels_avx512();
+#endif
+
+// The table for the instruction set in force (cpu.h).
+const Kernels& kernels();
+
+}  // namespace mudg

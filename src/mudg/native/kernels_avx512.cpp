@@ -1,0 +1,7 @@
+#include "kernels_impl.h"
+
+namespace mudg {
+
+const Kernels& kernels_avx512() { return isa_avx512::kTable; }
+
+}  // namespace mudg

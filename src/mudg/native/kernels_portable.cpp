@@ -1,0 +1,7 @@
+#include "kernels_impl.h"
+
+namespace mudg {
+
+const Kernels& kernels_portable() { return isa_portable::kTable; }
+
+}  // namespace mudg

@@ -1,0 +1,126 @@
+// Front-to-back blending of one tile. The accumulators of a block stay in registers for a chunk of the list.
+#pragma once
+
+#include "raster_blend.h"
+
+namespace mudg::MUDG_ISA_NAMESPACE {
+namespace {
+
+template <int kChannels>
+struct ForwardTile {
+  alignas(64) float color[kBlocksPerTile][kChannels][kPixelsPerBlock];
+  alignas(64) float running[kBlocksPerTile][kPixelsPerBlock];  // transmittance, 0 once the pixel is finished
+  alignas(64) float final[kBlocksPerTile][kPixelsPerBlock];    // transmittance after the last contribution
+  alignas(64) int last[kBlocksPerTile][kPixelsPerBlock];       // its list position, -1 if there was none
+  Chunk<kChannels> chunk;
+
+  // Returns the blocks that lie in the image at least in part.
+  MUDG_INLINE unsigned start(const TilePlace& place) {
+    unsigned blocks = 0;
+    std::memset(color, 0, sizeof color);
+    for (int b = 0; b < kBlocksPerTile; ++b) {
+      const int x0 = place.block_x(b), y0 = place.block_y(b);
+      if (x0 < place.width && y0 < place.height) blocks |= 1u << b;
+      for (int l = 0; l < kPixelsPerBlock; ++l) {
+        const bool inside = x0 + (l & 3) < place.width && y0 + (l >> 2) < place.height;
+        running[b][l] = inside ? 1.0f : 0.0f;
+        final[b][l] = 1.0f;
+        last[b][l] = -1;
+      }
+    }
+    return blocks;
+  }
+
+  // Blends the gathered chunk, whose first entry is at list position `base`, into one block. Returns false when the block is finished.
+  MUDG_INLINE bool blend_block(int b, int base, const TilePlace& place, Floats cap) {
+    const Floats pixel_x = place.pixel_x(b), pixel_y = place.pixel_y(b), stop = splat(kStopTransmittance);
+    Floats transmittance = load(running[b]), after = load(final[b]);
+    Ints last_position = load_int(last[b]);
+    Floats sums[kChannels];
+    for (int c = 0; c < kChannels; ++c) sums[c] = load(color[b][c]);
+    bool alive = true;
+    for (int j = 0; j < chunk.counts[b]; ++j) {
+      const int entry = chunk.entries[b][j];
+      const float* row = chunk.row(entry);
+      const Alpha alpha = alpha_of(row, pixel_x, pixel_y, cap);
+      // The transmittance of finished pixels is 0, so they fail the test by themselves: no separate mask on the critical path.
+      const Floats effective = keep(alpha.counts, alpha.value);
+      const Floats next = neg_mul_add(effective, transmittance, transmittance);
+      const Mask goes_on = next > stop;
+      const Floats weight = keep(goes_on, effective * transmittance);
+      after = select(goes_on, next, after);
+      last_position = select_int(alpha.counts & goes_on, splat_int(base + entry), last_position);
+      transmittance = keep(goes_on, next);
+      for (int c = 0; c < kChannels; ++c) sums[c] = mul_add(splat(row[kFirstChannel + c]), weight, sums[c]);
+      if (__builtin_expect(bits(goes_on) == 0, 0)) {
+        alive = false;
+        break;
+      }
+    }
+    store(running[b], transmittance);
+    store(final[b], after);
+    store_int(last[b], last_position);
+    for (int c = 0; c < kChannels; ++c) store(color[b][c], sums[c]);
+    return alive;
+  }
+
+  MUDG_INLINE void add_background(const float* background) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
+      const Floats left = load(final[b]);
+      for (int c = 0; c < 3; ++c) store(color[b][c], mul_add(splat(background[c]), left, load(color[b][c])));
+    }
+  }
+
+  MUDG_INLINE void write(const TilePlace& place, int channels, float* const* planes, float* alpha) const {
+    const std::size_t stride = static_cast<std::size_t>(place.width);
+    if (place.whole()) {  // rows of 64 bytes
+      for (int y = 0; y < kTileSize; ++y) {
+        const std::size_t at = (place.y + y) * stride + place.x;
+        const int b = (y >> 2) * 4, l = (y & 3) * 4;
+        for (int c = 0; c < channels; ++c) {
+          for (int q = 0; q < 4; ++q) std::memcpy(planes[c] + at + 4 * q, &color[b + q][c][l], 16);
+        }
+        for (int x = 0; x < kTileSize; ++x) alpha[at + x] = 1.0f - final[b + (x >> 2)][l + (x & 3)];
+      }
+      return;
+    }
+    for (int b = 0; b < kBlocksPerTile; ++b) {
+      for (int l = 0; l < kPixelsPerBlock; ++l) {
+        const int x = place.block_x(b) + (l & 3), y = place.block_y(b) + (l >> 2);
+        if (x >= place.width || y >= place.height) continue;
+        for (int c = 0; c < channels; ++c) planes[c][y * stride + x] = color[b][c][l];
+        alpha[y * stride + x] = 1.0f - final[b][l];
+      }
+    }
+  }
+};
+
+template <int kChannels>
+void blend_tile(RasterState& state, int tile, float* const* planes, float* alpha) {
+  const TilePlace place(state, tile);
+  const TileItem* items = state.items + state.tile_start[tile];
+  const int count = state.tile_start[tile + 1] - state.tile_start[tile];
+  ForwardTile<kChannels> work;
+  unsigned blocks = work.start(place);
+  const int rows = smaller(kTileSize, place.height - place.y);
+  for (int y = 0; y < rows; ++y) {  // the output is written at the end: fetch its lines meanwhile
+    const std::size_t at = static_cast<std::size_t>(place.y + y) * place.width + place.x;
+    for (int c = 0; c < state.channels; ++c) __builtin_prefetch(planes[c] + at, 1, 2);
+    __builtin_prefetch(alpha + at, 1, 2);
+  }
+  const Floats cap = splat(state.scene.alpha_max);
+  for (int base = 0; base < count && blocks != 0; base += kChunk) {
+    work.chunk.gather(state, items + base, smaller(kChunk, count - base), blocks);
+    for (unsigned left = blocks; left != 0; left &= left - 1) {
+      const int b = __builtin_ctz(left);
+      if (work.chunk.counts[b] > 0 && !work.blend_block(b, base, place, cap)) blocks &= ~(1u << b);
+    }
+  }
+  work.add_background(state.scene.background);
+  std::memcpy(state.final_transmittance + static_cast<std::size_t>(tile) * kPixelsPerTile, work.final, sizeof work.final);
+  std::memcpy(state.last_item + static_cast<std::size_t>(tile) * kPixelsPerTile, work.last, sizeof work.last);
+  work.write(place, state.channels, planes, alpha);
+}
+
+}  // namespace
+}  // namespace mudg::MUDG_ISA_NAMESPACE

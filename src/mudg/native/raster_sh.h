@@ -1,0 +1,109 @@
+// Real spherical harmonics up to degree 3 in the order and with the signs that Gaussian splatting uses, and their derivative.
+#pragma once
+
+#include "simd.h"
+
+namespace mudg::MUDG_ISA_NAMESPACE {
+namespace {
+
+constexpr int kMaxSh = 16;
+
+MUDG_INLINE void constant(float value, float& out) { out = value; }
+MUDG_INLINE void constant(float value, Floats& out) { out = splat(value); }
+template <class V>
+MUDG_INLINE V lift(float value) {
+  V out;
+  constant(value, out);
+  return out;
+}
+
+// basis[(degree + 1)^2] at the unit direction (x, y, z); V is float or Floats.
+template <class V>
+MUDG_INLINE void sh_basis(int degree, V x, V y, V z, V* basis) {
+  basis[0] = lift<V>(0.2820947917738781f);
+  if (degree < 1) return;
+  basis[1] = lift<V>(-0.48860251190292f) * y;
+  basis[2] = lift<V>(0.48860251190292f) * z;
+  basis[3] = lift<V>(-0.48860251190292f) * x;
+  if (degree < 2) return;
+  const V zz = z * z, cos2 = x * x - y * y, sin2 = lift<V>(2.0f) * x * y;
+  const V slope = lift<V>(-1.092548430592079f) * z;
+  const V a = lift<V>(0.5462742152960395f);
+  basis[4] = a * sin2;
+  basis[5] = slope * y;
+  basis[6] = lift<V>(0.9461746957575601f) * zz - lift<V>(0.3153915652525201f);
+  basis[7] = slope * x;
+  basis[8] = a * cos2;
+  if (degree < 3) return;
+  const V c = lift<V>(0.4570457994644658f) - lift<V>(2.285228997322329f) * zz;
+  const V d = lift<V>(1.445305721320277f) * z;
+  const V e = lift<V>(-0.5900435899266435f);
+  const V cos3 = x * cos2 - y * sin2, sin3 = x * sin2 + y * cos2;
+  basis[9] = e * sin3;
+  basis[10] = d * sin2;
+  basis[11] = c * y;
+  basis[12] = z * (lift<V>(1.865881662950577f) * zz - lift<V>(1.119528997770346f));
+  basis[13] = c * x;
+  basis[14] = d * cos2;
+  basis[15] = e * cos3;
+}
+
+// Gradient of sum_k weight[k] * basis_k with respect to the direction, before the projection onto the unit sphere.
+MUDG_INLINE void sh_basis_backward(int degree, float x, float y, float z, const float* weight, float* direction) {
+  direction[0] = direction[1] = direction[2] = 0.0f;
+  if (degree < 1) return;
+  direction[0] -= 0.48860251190292f * weight[3];
+  direction[1] -= 0.48860251190292f * weight[1];
+  direction[2] += 0.48860251190292f * weight[2];
+  if (degree < 2) return;
+  const float cos2 = x * x - y * y, sin2 = 2.0f * x * y;
+  const float slope = -1.092548430592079f, a = 0.5462742152960395f;
+  direction[0] += slope * z * weight[7] + a * (2.0f * x * weight[8] + 2.0f * y * weight[4]);
+  direction[1] += slope * z * weight[5] + a * (2.0f * x * weight[4] - 2.0f * y * weight[8]);
+  direction[2] += 2.0f * 0.9461746957575601f * z * weight[6] + slope * (x * weight[7] + y * weight[5]);
+  if (degree < 3) return;
+  const float c = 0.4570457994644658f - 2.285228997322329f * z * z, c_dz = -2.0f * 2.285228997322329f * z;
+  const float d = 1.445305721320277f, e = -0.5900435899266435f;
+  direction[0] += c * weight[13] + d * z * (2.0f * x * weight[14] + 2.0f * y * weight[10]) +
+                  e * (3.0f * cos2 * weight[15] + 3.0f * sin2 * weight[9]);
+  direction[1] += c * weight[11] + d * z * (2.0f * x * weight[10] - 2.0f * y * weight[14]) +
+                  e * (3.0f * cos2 * weight[9] - 3.0f * sin2 * weight[15]);
+  direction[2] += (3.0f * 1.865881662950577f * z * z - 1.119528997770346f) * weight[12] +
+                  c_dz * (x * weight[13] + y * weight[11]) + d * (cos2 * weight[14] + sin2 * weight[10]);
+}
+
+// color[3] = 0.5 + sum_k basis[k * stride] * sh[k], sh as rows of three.
+#if defined(__AVX2__)
+MUDG_INLINE void sh_color(const float* sh, const float* basis, int stride, int count, float* color) {
+  // Four rows at a time, each loaded with one float too many: the last row is left to the scalar loop.
+  __m128 sums[4] = {_mm_set1_ps(0.5f), _mm_setzero_ps(), _mm_setzero_ps(), _mm_setzero_ps()};
+  int k = 0;
+  for (; k + 5 <= count; k += 4) {
+    for (int j = 0; j < 4; ++j) {
+      sums[j] = _mm_fmadd_ps(_mm_set1_ps(basis[(k + j) * stride]), _mm_loadu_ps(sh + 3 * (k + j)), sums[j]);
+    }
+  }
+  alignas(16) float total[4];
+  _mm_store_ps(total, _mm_add_ps(_mm_add_ps(sums[0], sums[1]), _mm_add_ps(sums[2], sums[3])));
+  for (; k < count; ++k) {
+    for (int c = 0; c < 3; ++c) total[c] += basis[k * stride] * sh[3 * k + c];
+  }
+  for (int c = 0; c < 3; ++c) color[c] = total[c];
+}
+#else
+MUDG_INLINE void sh_color(const float* sh, const float* basis, int stride, int count, float* color) {
+  float red = 0.5f, green = 0.5f, blue = 0.5f;
+  for (int k = 0; k < count; ++k) {
+    const float weight = basis[k * stride];
+    red += weight * sh[3 * k];
+    green += weight * sh[3 * k + 1];
+    blue += weight * sh[3 * k + 2];
+  }
+  color[0] = red;
+  color[1] = green;
+  color[2] = blue;
+}
+#endif
+
+}  // namespace
+}  // namespace mudg::MUDG_ISA_NAMESPACE
