@@ -1,0 +1,65 @@
+"""Sensors of the recording vehicle: three cameras and a spinning LiDAR on the roof."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, seeds
+from mudg.base.types import Camera
+from mudg.data.city.config import CityConfig
+
+SIDE_YAW_DEG = 50.0
+
+
+def cameras(config: CityConfig) -> dict[str, Camera]:
+    """All three cameras, whether recorded or not."""
+    rng = seeds.numpy_rng(config.seed, 0, "city rig")
+    hfov = config.hfov_deg + config.rig_variation * rng.uniform(-12, 18)
+    focal = config.width / 2 / math.tan(math.radians(min(hfov, 120.0)) / 2)
+    names = ("front", "front_left", "front_right")
+    return {n: Camera(n, config.width, config.height, focal, focal, config.width / 2, config.height / 2) for n in names}
+
+
+def ego_from_camera(config: CityConfig) -> dict[str, NDArray[np.float64]]:
+    """Mounting poses f64[4, 4]; the ego frame lies on the ground below the vehicle."""
+    rng = seeds.numpy_rng(config.seed, 1, "city rig")
+    height = 1.6 + config.rig_variation * rng.uniform(-0.25, 0.45)
+    pitch = math.radians(0.5 + config.rig_variation * rng.uniform(-2.0, 3.0))
+    x = 1.4
+    places = {"front": (0.0, 0.0), "front_left": (SIDE_YAW_DEG, 0.35), "front_right": (-SIDE_YAW_DEG, -0.35)}
+    # camera axes in a body frame that looks along x: right = -y, down = -z, forward = x
+    body_from_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    c, s = math.cos(pitch), math.sin(pitch)
+    nod = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])  # positive pitch looks down
+    poses = {}
+    for name, (yaw_deg, y) in places.items():
+        pose = geometry.yaw_matrix(math.radians(yaw_deg), (x - (0.15 if y else 0.0), y, height))
+        pose[:3, :3] = pose[:3, :3] @ nod @ body_from_camera
+        poses[name] = pose
+    return poses
+
+
+def ego_from_lidar() -> NDArray[np.float64]:
+    """The LiDAR sits on the roof, its x axis forward."""
+    pose = np.eye(4)
+    pose[:3, 3] = (0.9, 0.0, 1.95)
+    return pose
+
+
+def lidar_elevations(config: CityConfig) -> NDArray[np.float64]:
+    """Elevation of every beam in radians, denser around the horizon as in common 64-beam sensors."""
+    u = np.linspace(-1.0, 1.0, config.lidar_beams)
+    middle, half = (
+        0.5 * (config.lidar_lower_deg + config.lidar_upper_deg),
+        0.5 * (config.lidar_upper_deg - config.lidar_lower_deg),
+    )
+    return np.deg2rad(middle + half * (0.75 * u + 0.25 * u**3))
+
+
+def lidar_azimuths(config: CityConfig) -> NDArray[np.float64]:
+    """Azimuth of every column in radians, in firing order: clockwise, backwards to backwards, forwards at half time."""
+    columns = max(4, round(360.0 / config.lidar_azimuth_step_deg))
+    return np.pi - (np.arange(columns) + 0.5) * (2 * np.pi / columns)

@@ -1,0 +1,356 @@
+"""A generated city with exact truth at any view and time of its log.
+
+Needs the native library: without it, building a world raises ResourceError naming the remedy (there is no slow twin).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, seeds
+from mudg.base.config import build, to_dict
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Camera, EgoPath, Observation, Source, SweepPoints, Track, View
+from mudg.data.city import records as rec
+from mudg.data.city import rig
+from mudg.data.city.config import CityConfig
+from mudg.data.city.furnish import furnish
+from mudg.data.city.layout import StreetPlan, plan_streets
+from mudg.data.city.light import light_numbers
+from mudg.data.city.native import CityHandle
+from mudg.data.city.traffic import Mover, ego_keys, key_times, plan_traffic
+
+DATASET = "mudg procedural city"
+GENERATOR_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CityTruth:
+    """Exact truth at a view. Depth, semantics and instance belong to the ray through the pixel's centre; rgb is averaged
+    over the pixel.
+
+    Args:
+        rgb: f32[H, W, 3], display values in [0, 1].
+        depth: f32[H, W], camera z in metres, +inf in the sky.
+        semantics: u8[H, W], Cityscapes train ids.
+        instance: i32[H, W], id of a vehicle or person (see ``CityWorld.tracks``), 0 = none.
+    """
+
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    semantics: NDArray[np.uint8]
+    instance: NDArray[np.int32]
+
+    @property
+    def rgb_u8(self) -> NDArray[np.uint8]:
+        """u8[H, W, 3]."""
+        return (self.rgb * 255.0 + 0.5).astype(np.uint8)
+
+    @property
+    def sky(self) -> NDArray[np.bool_]:
+        """bool[H, W]: no depth here."""
+        return ~np.isfinite(self.depth)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CitySweep:
+    """One turn of the LiDAR with its truth. ``points`` are in the LiDAR frame at ``time_s``, compensated for the motion of
+    the recording vehicle (each point was measured at ``time_s + dt_s``; moving objects are where they were then).
+    ``semantics`` u8[N] and ``instance`` i32[N] belong to the points."""
+
+    time_s: float
+    world_from_lidar: NDArray[np.float64]
+    points: SweepPoints
+    semantics: NDArray[np.uint8]
+    instance: NDArray[np.int32]
+
+
+class CityWorld:
+    """The world of one configuration. Immutable; ``render`` may be called from several threads.
+
+    Raises:
+        ResourceError: the native library is missing.
+    """
+
+    def __init__(self, config: CityConfig) -> None:
+        self.config = config
+        self.plan: StreetPlan = plan_streets(config)
+        self.light_name, light = light_numbers(config)
+        self._ego_times, self._ego_poses = ego_keys(config, self.plan)
+        self.movers: tuple[Mover, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
+        self._key_times = key_times(config)
+        rows = furnish(config, self.plan) + [m.row for m in self.movers]
+        self._keys = (
+            np.stack([m.keys for m in self.movers], 1) if self.movers else np.zeros((len(self._key_times), 0, 4))
+        )
+        self._gaits = np.array([m.gait_rad_per_s for m in self.movers], np.float64)
+        self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.movers))
+        self._handle = CityHandle(
+            rec.to_array(rows), self.plan, _road_numbers(config, self.plan), light, _seed31(config, "city surfaces")
+        )
+        self._cameras = rig.cameras(config)
+        self._mounts = rig.ego_from_camera(config)
+        self._ego_path = EgoPath(self._ego_times, self._ego_poses)
+
+    @classmethod
+    def from_source(cls, source: Source) -> CityWorld:
+        """Rebuild the world a scene was recorded in, bit for bit, from the recipe in its ``source``.
+
+        Raises:
+            InputError: the source holds no recipe of this generator.
+        """
+        recipe = source.recipe
+        if recipe is None or "city" not in recipe:
+            raise InputError(
+                "the scene was not generated, so there is no exact truth", where="source.recipe", got=source.dataset
+            )
+        if recipe.get("generator_version") != GENERATOR_VERSION:
+            raise InputError(
+                "the scene was made by another version of the generator",
+                where="source.recipe.generator_version",
+                expected=str(GENERATOR_VERSION),
+                got=str(recipe.get("generator_version")),
+                remedy="generate it again",
+            )
+        return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
+
+    def source(self) -> Source:
+        """What a scene of this world records about its origin."""
+        recipe: Mapping[str, Any] = {"city": to_dict(self.config), "generator_version": GENERATOR_VERSION}
+        return Source(DATASET, "CC0-1.0", recipe, (f"generated city, light: {self.light_name}",))
+
+    # --- facts ------------------------------------------------------------------------------------------------------
+
+    def describe(self) -> str:
+        """One line about what was drawn."""
+        plan = self.plan
+        lanes = f"{len(plan.forward_lanes)}+{len(plan.backward_lanes)} lanes"
+        quarter = "urban" if plan.urban else "suburban"
+        crossing = "a crossing" if plan.crossing is not None else "no crossing"
+        moving = sum(m.moving for m in self.movers)
+        return (
+            f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving and "
+            f"{len(self.movers) - moving} standing objects, {self.shape_count} shapes"
+        )
+
+    @property
+    def shape_count(self) -> int:
+        """Number of primitive shapes in the world."""
+        return self._handle.shape_count
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last time that can be rendered."""
+        return float(self._key_times[0]), float(self._key_times[-1])
+
+    def frame_time(self, index: int) -> float:
+        """Time of a frame in seconds."""
+        return index / self.config.rate_hz
+
+    def cameras(self) -> dict[str, Camera]:
+        """The recorded cameras."""
+        return {name: self._cameras[name] for name in self.config.cameras}
+
+    def ego_path(self) -> EgoPath:
+        """Poses of the vehicle, four keys per frame and half a frame beyond both ends; what ``pose_at`` interpolates is
+        the truth the LiDAR was simulated with."""
+        return self._ego_path
+
+    def tracks(self) -> tuple[Track, ...]:
+        """Boxes of all vehicles and people, parked ones with a constant pose. The number in the id is the instance id.
+        Truth between keys is exactly ``Track.pose_at``."""
+        tracks = []
+        for index, mover in enumerate(self.movers):
+            label = rec.LABELS[int(mover.row[0])]
+            poses = np.stack(
+                [geometry.yaw_matrix(float(k[3]), (k[0], k[1], k[2] + mover.size[2] / 2)) for k in mover.keys]
+            )
+            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(mover.size), self._key_times, poses))
+        return tuple(tracks)
+
+    def instance_of(self, track_id: str) -> int:
+        """Instance id of a track."""
+        return int(track_id.rsplit("-", 1)[1])
+
+    def frame_views(self, camera: str) -> tuple[View, ...]:
+        """The recorded views of a camera, one per frame."""
+        if camera not in self._cameras:
+            raise UsageError("the city has no such camera", expected=", ".join(self._cameras), got=camera)
+        views = []
+        for index in range(self.config.n_frames):
+            time_s = self.frame_time(index)
+            views.append(View(self._cameras[camera], self._world_from_ego(time_s) @ self._mounts[camera], time_s))
+        return tuple(views)
+
+    def _world_from_ego(self, time_s: float) -> NDArray[np.float64]:
+        pose = self._ego_path.pose_at(time_s)
+        if pose is None:
+            raise UsageError(
+                "time lies outside the log",
+                expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s",
+                got=f"{time_s} s",
+            )
+        return pose
+
+    def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates."""
+        times, keys = self._key_times, self._keys
+        first, last = self.span_s
+        if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
+            raise UsageError(
+                "time lies outside the log",
+                expected=f"{first:.3f}..{last:.3f} s",
+                got=f"{times_s.min()}..{times_s.max()} s",
+            )
+        at = np.clip((times_s - first) * self.config.rate_hz, 0, len(times) - 1)
+        nearest = np.rint(at)
+        at = np.where(np.abs(at - nearest) < 1e-6 * self.config.rate_hz, nearest, at)
+        before = np.minimum(at.astype(int), len(times) - 2)
+        u = (at - before)[:, None, None]
+        return keys[before] + u * (keys[before + 1] - keys[before])
+
+    def _phases(self, time_s: float) -> NDArray[np.float64]:
+        return self._gait_starts + self._gaits * time_s
+
+    # --- truth ------------------------------------------------------------------------------------------------------
+
+    def render(self, view: View, *, supersample: int | None = None, sensor_noise: bool = False) -> CityTruth:
+        """Truth at any view whose time lies in ``span_s``.
+
+        Args:
+            view: any pinhole camera (distortion and rolling shutter are refused) at any pose.
+            supersample: rays per pixel and axis; None = the configuration's.
+            sensor_noise: add the camera noise of a recorded image; the same view gives the same noise.
+
+        Raises:
+            UsageError: time outside the log, or a camera model that is not simulated.
+        """
+        camera = view.camera
+        if camera.readout_s != 0 or any(camera.distortion):
+            raise UsageError("the city renders undistorted global-shutter cameras", where=f"camera {camera.name!r}")
+        poses = self._object_keys_at(np.array([view.time_s]))[0]
+        noise_key = 0
+        if sensor_noise:
+            noise_key = seeds.key(self.config.seed, round(view.time_s * 1e4), f"city noise {camera.name}") | 1
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        per_axis = self.config.supersample if supersample is None else supersample
+        if not 1 <= per_axis <= 8:
+            raise UsageError("supersample must lie in 1..8", got=str(per_axis))
+        return CityTruth(*self._handle.render(poses, self._phases(view.time_s), intrinsics, camera.width, camera.height,
+                                              view.world_from_cam, per_axis, noise_key))  # fmt: skip
+
+    def observation(self, view: View) -> Observation:
+        """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used."""
+        import torch
+
+        truth = self.render(view)
+        rgb = torch.from_numpy(truth.rgb).permute(2, 0, 1).contiguous()
+        depth = torch.from_numpy(np.where(truth.sky, np.float32(0), truth.depth))[None]
+        semantics = torch.from_numpy(truth.semantics.astype(np.int64))
+        ones = torch.ones((1, *semantics.shape))
+        return Observation(view, rgb, depth, semantics, ones, ones.bool(), "recorded", "city truth")
+
+    def lidar_sweep(self, index: int) -> CitySweep:
+        """The sweep around the time of frame ``index``: it starts and ends half a turn away from it, looking backwards.
+        Vehicle and objects move during the turn; the limbs of people keep their pose of the middle."""
+        config = self.config
+        if not 0 <= index < config.n_frames:
+            raise UsageError("there is no such sweep", expected=f"0..{config.n_frames - 1}", got=str(index))
+        time_s = self.frame_time(index)
+        period = 1.0 / config.rate_hz
+        azimuths = rig.lidar_azimuths(config)
+        offsets = (np.arange(len(azimuths)) + 0.5) / len(azimuths) * period - period / 2
+        knots = np.array([time_s - period / 2, time_s, time_s + period / 2])
+        mount = rig.ego_from_lidar()
+        world_from_lidar = self._world_from_ego(time_s) @ mount
+        columns = _interpolated_poses(self._ego_times, self._ego_poses, time_s + offsets) @ mount
+        settings = (config.lidar_range_m, config.lidar_noise_m, config.lidar_dropout, 0.55)
+        xyz, intensity, semantics, instance = self._handle.sweep(
+            self._object_keys_at(knots), self._phases(time_s), rig.lidar_elevations(config), azimuths, columns[:, :3],
+            (offsets + period / 2) / period, settings, seeds.key(config.seed, index, "city lidar"),
+        )  # fmt: skip
+        hit = intensity >= 0
+        lidar_from_world = geometry.invert(world_from_lidar)
+        world = xyz[hit].astype(np.float64)
+        local = np.einsum("ij,nj->ni", lidar_from_world[:3, :3], world) + lidar_from_world[:3, 3]
+        dt_s = np.broadcast_to(offsets[:, None], hit.shape)[hit]
+        points = SweepPoints(local.astype(np.float32), intensity[hit], dt_s.astype(np.float32))
+        return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
+
+    def kerb_distance(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance [N] of world points [N, 2] to the kerb line in metres, negative on the road."""
+        return self._handle.street(xy)[:, 2]
+
+
+def _interpolated_poses(
+    times: NDArray[np.float64], poses: NDArray[np.float64], at: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """``geometry.pose_at`` for many times f64[N, 4, 4]: slerp and straight line between neighbouring keys."""
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+    out = np.empty((len(at), 4, 4))
+    for i in np.unique(before):
+        rows = before == i
+        u = (at[rows] - times[i]) / (times[i + 1] - times[i])
+        q0, q1 = geometry.quaternion_from_matrix(poses[i]), geometry.quaternion_from_matrix(poses[i + 1])
+        q1 = q1 if float(q0 @ q1) >= 0 else -q1
+        angle = math.acos(min(1.0, float(q0 @ q1)))
+        if angle < 1e-6:
+            q = q0 + u[:, None] * (q1 - q0)
+        else:
+            q = (np.sin((1 - u) * angle)[:, None] * q0 + np.sin(u * angle)[:, None] * q1) / math.sin(angle)
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        w, x, y, z = q.T
+        out[rows, :3, :3] = np.stack(
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+             2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1).reshape(-1, 3, 3)  # fmt: skip
+        out[rows, :3, 3] = (1 - u)[:, None] * poses[i][:3, 3] + u[:, None] * poses[i + 1][:3, 3]
+        out[rows, 3] = (0, 0, 0, 1)
+    return out
+
+
+def _seed31(config: CityConfig, purpose: str) -> int:
+    return seeds.key(config.seed, 0, purpose) & 0x7FFFFFFF
+
+
+def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
+    """Numbers of the road in the order of ``RoadNumber`` in native/city.cpp."""
+    rng = seeds.numpy_rng(config.seed, 0, "city ground")
+    crossing = plan.crossing
+    cross = [0.0] * 10
+    if crossing is not None:
+        cross = [
+            1.0,
+            crossing.s,
+            crossing.x,
+            crossing.y,
+            crossing.yaw,
+            crossing.half_width,
+            crossing.corner,
+            crossing.start,
+            crossing.end,
+            crossing.sidewalk,
+        ]
+    grey = rng.uniform(0.045, 0.11)
+    warm = rng.uniform(-0.06, 0.06)
+    asphalt = grey * np.array([1 + warm, 1.0, 1 - warm])
+    stone = rng.uniform(0.17, 0.32)
+    pale = rng.uniform(-0.04, 0.10)
+    sidewalk = stone * np.array([1 + pale, 1.0, 1 - pale])
+    terrain = np.array([[0.075, 0.12, 0.03], [0.10, 0.135, 0.035], [0.15, 0.145, 0.05], [0.06, 0.10, 0.03]])[
+        rng.integers(4)
+    ] * rng.uniform(0.85, 1.2)
+    line = plan.line
+    pad = 75.0
+    bounds = [line.x.min() - pad, line.y.min() - pad, line.x.max() + pad, line.y.max() + pad]
+    return np.array(
+        [plan.left, plan.right, plan.sidewalk_left, plan.sidewalk_right, plan.paved_left, plan.paved_right, plan.park_left,
+         plan.park_right, *cross, plan.lane_width, float(_seed31(config, "city ground texture") % 1_000_000), *asphalt, *sidewalk,
+         *(sidewalk * rng.uniform(0.9, 1.2)), *terrain, rng.uniform(0.5, 1.6), rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0),
+         float(rng.random() < 0.3), *np.floor(bounds)], np.float64,
+    )  # fmt: skip
