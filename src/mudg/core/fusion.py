@@ -1,0 +1,576 @@
+"""Fusing LiDAR sweeps and images into one static coloured cloud and one cloud per moving object.
+
+Pure functions on arrays: no files, no global state. ``fuse_sweeps`` takes any iterable of sweeps with the images taken
+beside them, one sweep in memory at a time, and is what both the ``fuse`` stage and the training-data generator call.
+
+The rules, stated once:
+
+* **Movers.** A tracked box moves if its centre gets far from where it started, or travels a path (both measured with a
+  dead band, so that annotation jitter does not count; going out and coming back does), or if a long box turns.
+  Everything else, parked cars included, belongs to the static world.
+* **Separation.** At a sweep's time the points inside a moving box (slightly grown, and only above a margin over its
+  floor, so that the road stays road) belong to the object and are kept in its frame. In overlapping boxes the smaller wins.
+* **Colour.** A point takes the pixel (nearest, no interpolation) of an image taken at about the sweep's time, the object's
+  motion between sweep and image taken into account. If several cameras see it, the one whose optical axis points
+  closest to it wins. Points that no camera sees have no colour and are left out.
+* **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects included,
+  the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
+* **Semantics.** The cameras that see a point vote, weighted by the cosine to their axes; in a voxel the samples vote.
+* **Small objects.** A mover with too few coloured points over the whole log is left out, and so are its points: they would
+  smear the static world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import palette
+from mudg.base.errors import InputError
+from mudg.base.geometry import invert, yaw_of
+from mudg.base.types import FusedCloud, PointCloud, SweepPoints, Track, View
+
+Matrix = NDArray[np.float64]
+STATIC: Final = -1
+
+
+@dataclass(frozen=True, slots=True)
+class FusionRules:
+    """The numbers in the rules above.
+
+    Args:
+        voxel_m: keep one point per voxel of this side, the one seen from nearest by; 0 keeps all.
+        occlusion_test: leave out colours from behind nearer surfaces.
+        occlusion_relative, occlusion_m: a surface hides a point if nearer by more than relative * depth + this.
+        beam_gap_deg: vertical angle between LiDAR beams; a point covers 0.6 of it above and below (beams are not quite
+            evenly spread). 0 = measured per sweep.
+        beam_half_deg_horizontal: what a point covers to either side.
+        near_m, far_m: camera depth limits of colouring, metres.
+        box_growth_m: moving boxes are grown by this on each side and on top.
+        floor_margin_m: points this close above the box's floor stay static.
+        moving_distance_m: dead-banded displacement or path length from which a track moves.
+        moving_turn_deg: turn from which a long box moves (half turns, a habit of annotators, do not count).
+        min_object_points: movers with fewer coloured points are left out.
+        point_times: take the object's motion during the sweep (``dt_s``) into account.
+    """
+
+    voxel_m: float = 0.0
+    occlusion_test: bool = True
+    occlusion_relative: float = 0.05
+    occlusion_m: float = 0.2
+    beam_gap_deg: float = 0.0
+    beam_half_deg_horizontal: float = 0.1
+    near_m: float = 0.5
+    far_m: float = 200.0
+    box_growth_m: float = 0.1
+    floor_margin_m: float = 0.1
+    moving_distance_m: float = 0.5
+    moving_turn_deg: float = 15.0
+    min_object_points: int = 100
+    point_times: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """An image beside a sweep: ``rgb`` u8[H, W, 3] of ``view``, and ``semantics`` u8[H, W] train ids or None."""
+
+    view: View
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepShots:
+    """A sweep (points in the LiDAR frame at ``time_s``) and the images that may colour it."""
+
+    time_s: float
+    world_from_lidar: Matrix
+    points: SweepPoints
+    shots: Sequence[Shot]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackVerdict:
+    """Why a track counts as moving or static."""
+
+    moving: bool
+    displacement_m: float
+    path_m: float
+    turn_deg: float
+    words: str
+
+
+@dataclass(slots=True)
+class FusionReport:
+    """What happened: counts of points, and a verdict and count per track."""
+
+    sweeps: int = 0
+    points_in: int = 0
+    points_static_in: int = 0
+    points_moving_in: int = 0
+    points_coloured: int = 0
+    points_unseen: int = 0
+    points_hidden: int = 0
+    points_static: int = 0
+    verdicts: dict[str, TrackVerdict] = field(default_factory=dict)
+    object_points: dict[str, int] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+# --- movers ---------------------------------------------------------------------------------------------------------
+
+
+def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
+    """Decide whether a track moves; see the module text for the rule."""
+    centers = track.world_from_object[:, :3, 3]
+    displacement = float(np.linalg.norm(centers - np.median(centers[: min(3, len(centers))], axis=0), axis=1).max())
+    path = _dead_banded_path(centers, rules.moving_distance_m / 2)
+    long_box = track.size_m[0] >= 1.3 * track.size_m[1]
+    yaws = np.array([yaw_of(pose) for pose in track.world_from_object])
+    turn = np.rad2deg(_largest_turn(yaws)) if long_box else 0.0
+    reasons = []
+    if displacement > rules.moving_distance_m:
+        reasons.append(f"centre moved {displacement:.2f} m away from its start")
+    if path > rules.moving_distance_m:
+        reasons.append(f"centre travelled {path:.2f} m")
+    if turn > rules.moving_turn_deg:
+        reasons.append(f"heading turned {turn:.0f} degrees")
+    words = (
+        "; ".join(reasons) or f"static: displacement {displacement:.2f} m, path {path:.2f} m, turn {turn:.0f} degrees"
+    )
+    return TrackVerdict(bool(reasons), displacement, path, float(turn), words)
+
+
+def _dead_banded_path(centers: Matrix, band_m: float) -> float:
+    """Length of the path through the centres, counting only steps that leave a ball of ``band_m`` around the last anchor."""
+    anchor, length = centers[0], 0.0
+    for center in centers[1:]:
+        step = float(np.linalg.norm(center - anchor))
+        if step > band_m:
+            anchor, length = center, length + step
+    return length
+
+
+def _largest_turn(yaws_rad: Matrix) -> float:
+    """Largest change of heading from the first, radians, modulo half turns and after a median over three keys."""
+    turns = (yaws_rad - yaws_rad[0] + np.pi / 2) % np.pi - np.pi / 2
+    if len(turns) >= 3:
+        turns = np.median(np.stack([turns[:-2], turns[1:-1], turns[2:]]), axis=0)
+    return float(np.abs(turns).max())
+
+
+def points_in_box(
+    xyz_object: NDArray[np.floating], size_m: Matrix, growth_m: float, floor_margin_m: float
+) -> NDArray[np.bool_]:
+    """Which points ``[N, 3]`` (object frame, origin in the box centre) lie in the grown box above its floor margin; bool[N]."""
+    half = np.asarray(size_m) / 2
+    return (
+        (np.abs(xyz_object[:, 0]) <= half[0] + growth_m)
+        & (np.abs(xyz_object[:, 1]) <= half[1] + growth_m)
+        & (xyz_object[:, 2] >= floor_margin_m - half[2])
+        & (xyz_object[:, 2] <= half[2] + growth_m)
+    )
+
+
+def separate(
+    sweep: SweepShots, movers: Sequence[Track], rules: FusionRules
+) -> tuple[NDArray[np.int32], dict[int, NDArray[np.float32]]]:
+    """Assign each point of a sweep to a mover or to the static world.
+
+    Returns:
+        ``owner`` i32[N], index into ``movers`` or STATIC; and for each mover present the points it owns in its own
+        frame, f32[n, 3], in the order of ``np.flatnonzero(owner == index)``.
+    """
+    xyz = sweep.points.xyz
+    owner = np.full(len(xyz), STATIC, np.int32)
+    owned: dict[int, NDArray[np.float32]] = {}
+    if len(xyz) == 0:
+        return owner, owned
+    dt_s = sweep.points.dt_s if rules.point_times and np.any(sweep.points.dt_s) else None
+    reach_s = float(np.abs(dt_s).max()) if dt_s is not None else 0.0
+    for index in sorted(range(len(movers)), key=lambda i: float(np.prod(movers[i].size_m))):
+        track = movers[index]
+        pose = track.pose_at(sweep.time_s)
+        if pose is None:
+            continue
+        object_from_lidar = invert(pose) @ sweep.world_from_lidar
+        velocity = _velocity_in_lidar(track, sweep) if dt_s is not None else np.zeros(3)
+        radius = (
+            float(np.linalg.norm(track.size_m / 2 + rules.box_growth_m)) + float(np.linalg.norm(velocity)) * reach_s
+        )
+        center = invert(object_from_lidar)[:3, 3].astype(np.float32)
+        near = np.flatnonzero((np.abs(xyz[:, 0] - center[0]) <= radius) & (np.abs(xyz[:, 1] - center[1]) <= radius))
+        near = near[owner[near] == STATIC]
+        if len(near) == 0:
+            continue
+        candidates = xyz[near]
+        if dt_s is not None:
+            candidates = candidates - dt_s[near, None] * velocity.astype(np.float32)
+        xyz_object = _apply(object_from_lidar, candidates)
+        inside = points_in_box(xyz_object, track.size_m, rules.box_growth_m, rules.floor_margin_m)
+        if inside.any():
+            owner[near[inside]] = index
+            owned[index] = xyz_object[inside]
+    return owner, owned
+
+
+def _velocity_in_lidar(track: Track, sweep: SweepShots, step_s: float = 0.05) -> Matrix:
+    """Velocity of the box centre at the sweep's time in the LiDAR's axes, f64[3] m/s; zero where it cannot be told."""
+    before, after = track.pose_at(sweep.time_s - step_s), track.pose_at(sweep.time_s + step_s)
+    now = track.pose_at(sweep.time_s)
+    if now is None or (before is None and after is None):
+        return np.zeros(3)
+    span = step_s * ((before is not None) + (after is not None))
+    last, first = (after if after is not None else now), (before if before is not None else now)
+    return sweep.world_from_lidar[:3, :3].T @ (last[:3, 3] - first[:3, 3]) / span
+
+
+# --- colours --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Colours:
+    """Colours of a sweep's points: ``seen`` bool[N]; ``rgb`` u8[N, 3], ``semantics`` u8[N] and ``depth_m`` f32[N] (to the
+    camera that gave the colour) where seen; ``hidden`` bool[N]: in an image, but behind a nearer surface in all of them."""
+
+    seen: NDArray[np.bool_]
+    hidden: NDArray[np.bool_]
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+
+
+def colour_points(
+    sweep: SweepShots,
+    owner: NDArray[np.int32],
+    owned: dict[int, NDArray[np.float32]],
+    movers: Sequence[Track],
+    rules: FusionRules,
+) -> Colours:
+    """Colours (and semantics) of a sweep's points from the images beside it; see the module text for the rules."""
+    count = len(owner)
+    best = np.full(count, -1.0, np.float32)
+    rgb = np.zeros((count, 3), np.uint8)
+    depth_m = np.zeros(count, np.float32)
+    in_image = np.zeros(count, bool)
+    votes: list[tuple[NDArray[np.intp], NDArray[np.uint8], NDArray[np.float32]]] = []
+    members = {index: np.flatnonzero(owner == index) for index in owned}
+    gap_deg = rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz)
+    stands = standing_points(_apply(_turn_only(sweep.world_from_lidar), sweep.points.xyz))
+    for shot in sweep.shots:
+        xyz_cam, known = _points_in_camera(sweep, shot.view, members, owned, movers)
+        ids, column, row, z = _pixels(xyz_cam, known, shot.view, rules)
+        in_image[ids] = True
+        if rules.occlusion_test and len(ids):
+            visible = ~hidden_points(xyz_cam[ids], stands[ids], shot.view, gap_deg, rules)
+            ids, column, row, z = ids[visible], column[visible], row[visible], z[visible]
+        cosine = z / np.linalg.norm(xyz_cam[ids], axis=1)
+        better = cosine > best[ids]
+        chosen = ids[better]
+        best[chosen] = cosine[better]
+        depth_m[chosen] = z[better]
+        rgb[chosen] = shot.rgb[row[better], column[better]]
+        if shot.semantics is not None:
+            votes.append((ids, shot.semantics[row, column], cosine))
+    seen = best > 0
+    return Colours(seen, in_image & ~seen, rgb, _count_votes(votes, count), depth_m)
+
+
+def _points_in_camera(
+    sweep: SweepShots,
+    view: View,
+    members: dict[int, NDArray[np.intp]],
+    owned: dict[int, NDArray[np.float32]],
+    movers: Sequence[Track],
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """All points in camera coordinates at the image's time f32[N, 3]; movers whose pose then is not known are flagged."""
+    xyz_cam = _apply(view.cam_from_world @ sweep.world_from_lidar, sweep.points.xyz)
+    known = np.ones(len(xyz_cam), bool)
+    for index, ids in members.items():
+        pose = movers[index].pose_at(view.time_s)
+        if pose is None:
+            pose = movers[index].pose_at(sweep.time_s) if abs(view.time_s - sweep.time_s) < 0.02 else None
+        if pose is None:
+            known[ids] = False
+        else:
+            xyz_cam[ids] = _apply(view.cam_from_world @ pose, owned[index])
+    return xyz_cam, known
+
+
+def _pixels(
+    xyz_cam: NDArray[np.float32], known: NDArray[np.bool_], view: View, rules: FusionRules
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """Points that fall into the image: indices, column, row (integers) and depth."""
+    camera = view.camera
+    ids = np.flatnonzero((xyz_cam[:, 2] > rules.near_m) & (xyz_cam[:, 2] < rules.far_m) & known)
+    x, y, z = xyz_cam[ids].T
+    column = np.floor(camera.fx * x / z + camera.cx)
+    row = np.floor(camera.fy * y / z + camera.cy)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return ids[inside], column[inside].astype(np.intp), row[inside].astype(np.intp), z[inside]
+
+
+def standing_points(xyz: NDArray[np.floating], cell_m: float = 2.0, margin_m: float = 0.35) -> NDArray[np.bool_]:
+    """Which points ``[N, 3]`` (z up) rise by more than ``margin_m`` above the lowest point of their cell; bool[N]."""
+    if len(xyz) == 0:
+        return np.zeros(0, bool)
+    cell = np.floor(xyz[:, :2] / cell_m).astype(np.int64)
+    cell -= cell.min(0)
+    key = cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1]
+    if int(key.max()) > 50_000_000:  # a stray point far away: number the cells instead of laying them out
+        key = np.unique(key, return_inverse=True)[1]
+    lowest = np.full(int(key.max()) + 1, np.inf, np.float32)
+    np.minimum.at(lowest, key, xyz[:, 2].astype(np.float32))
+    return xyz[:, 2] > lowest[key] + margin_m
+
+
+def hidden_points(
+    xyz_cam: NDArray[np.float32], stands: NDArray[np.bool_], view: View, gap_deg: float, rules: FusionRules
+) -> NDArray[np.bool_]:
+    """Which points ``[N, 3]`` (camera frame, inside the image) lie behind a clearly nearer standing point; bool[N].
+
+    A z-buffer of the points that stand (``standing_points``), with cells of the horizontal half gap (at least a pixel),
+    each point covering its half gaps. The ground hides nothing: seen at a grazing angle its rings overlap each other.
+    """
+    camera = view.camera
+    gap_u = np.deg2rad(rules.beam_half_deg_horizontal) * camera.fx
+    gap_v = np.deg2rad(0.6 * gap_deg) * camera.fy
+    cell = max(1.0, float(gap_u))
+    reach_u, reach_v = round(gap_u / cell), round(gap_v / cell)
+    width, height = int(camera.width / cell) + 1, int(camera.height / cell) + 1
+    z = xyz_cam[:, 2]
+    column = ((camera.fx * xyz_cam[:, 0] / z + camera.cx) / cell).astype(np.intp).clip(0, width - 1)
+    row = ((camera.fy * xyz_cam[:, 1] / z + camera.cy) / cell).astype(np.intp).clip(0, height - 1)
+    index = row * width + column
+    nearest = np.full(height * width, np.inf, np.float32)
+    np.minimum.at(nearest, index[stands], z[stands])
+    covered = _spread_minimum(_spread_minimum(nearest.reshape(height, width), reach_v, 0), reach_u, 1)
+    return covered.reshape(-1)[index] < z * (1 - rules.occlusion_relative) - rules.occlusion_m
+
+
+def measure_beam_gap(xyz_lidar: NDArray[np.floating], default_deg: float = 0.4) -> float:
+    """Vertical angle between neighbouring beams of a turning LiDAR, degrees: the median step of elevation in thin wedges.
+
+    Steps below 0.08 degrees lie within a beam. Too few points to tell give ``default_deg``; the result is in 0.1..2.5.
+    """
+    azimuth = np.rad2deg(np.arctan2(xyz_lidar[:, 1], xyz_lidar[:, 0]))
+    sector = np.floor(azimuth / 15)
+    thin = np.flatnonzero(azimuth - 15 * sector < 0.4)
+    xyz, sector = xyz_lidar[thin], sector[thin]
+    elevation = np.rad2deg(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    order = np.lexsort((elevation, sector))
+    steps = np.diff(elevation[order])[np.diff(sector[order]) == 0]
+    steps = steps[steps > 0.08]
+    return float(np.clip(np.median(steps), 0.1, 2.5)) if len(steps) >= 30 else default_deg
+
+
+def _spread_minimum(values: NDArray[np.float32], reach: int, axis: int) -> NDArray[np.float32]:
+    """Running minimum over ``2 * reach + 1`` cells along ``axis``."""
+    spread = values.copy()
+    for step in range(1, reach + 1):
+        low, high = [slice(None), slice(None)], [slice(None), slice(None)]
+        low[axis], high[axis] = slice(None, -step), slice(step, None)
+        np.minimum(spread[tuple(low)], values[tuple(high)], out=spread[tuple(low)])
+        np.minimum(spread[tuple(high)], values[tuple(low)], out=spread[tuple(high)])
+    return spread
+
+
+def _count_votes(
+    votes: list[tuple[NDArray[np.intp], NDArray[np.uint8], NDArray[np.float32]]], count: int
+) -> NDArray[np.uint8]:
+    """Winner of the weighted votes per point u8[count]; 255 where nobody voted for a class."""
+    if not votes:
+        return np.full(count, palette.UNLABELLED, np.uint8)
+    if len(votes) == 1:
+        winner = np.full(count, palette.UNLABELLED, np.uint8)
+        winner[votes[0][0]] = votes[0][1]
+        return winner
+    classes = len(palette.CLASSES)
+    tally = np.zeros((count, classes), np.float32)
+    for ids, labels, weight in votes:
+        valid = labels < classes
+        tally[ids[valid], labels[valid]] += weight[valid]
+    winner = tally.argmax(1).astype(np.uint8)
+    winner[tally.max(1, initial=0.0) <= 0] = palette.UNLABELLED
+    return winner
+
+
+def _turn_only(a_from_b: Matrix) -> Matrix:
+    turn = a_from_b.copy()
+    turn[:3, 3] = 0
+    return turn
+
+
+def _apply(a_from_b: Matrix, xyz_b: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Rigid motion of points in float32; the matrix was composed in float64."""
+    return xyz_b.astype(np.float32, copy=False) @ a_from_b[:3, :3].T.astype(np.float32) + a_from_b[:3, 3].astype(
+        np.float32
+    )
+
+
+# --- accumulation ---------------------------------------------------------------------------------------------------
+
+
+class CloudAccumulator:
+    """Collects coloured points sweep by sweep.
+
+    With ``voxel_m`` > 0 one point per voxel is kept: the one seen from the smallest depth, with the class that the voxel's
+    samples agree on (pairwise cancellation vote). Memory then follows the number of voxels, not of points.
+    """
+
+    def __init__(self, voxel_m: float) -> None:
+        self._voxel_m = voxel_m
+        self._parts: list[
+            tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int32]]
+        ] = []
+        self._pending = 0
+        self._kept = 0
+
+    def add(
+        self,
+        xyz: NDArray[np.float32],
+        rgb: NDArray[np.uint8],
+        semantics: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+    ) -> None:
+        """Add points: f32[n, 3] metres, u8[n, 3], u8[n], f32[n]."""
+        if len(xyz) == 0:
+            return
+        self._parts.append((xyz, rgb, semantics, depth_m, (semantics != palette.UNLABELLED).astype(np.int32)))
+        self._pending += len(xyz)
+        if self._voxel_m > 0 and self._pending > max(500_000, self._kept // 2):
+            self._merge()
+
+    def _merge(self) -> None:
+        if not self._parts:
+            return
+        xyz, rgb, semantics, depth, weight = (np.concatenate(column) for column in zip(*self._parts, strict=True))
+        if self._voxel_m > 0:
+            key = voxel_keys(xyz, self._voxel_m)
+            order = np.lexsort((depth, key))
+            key = key[order]
+            first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+            winner, margin = _majority(semantics[order], weight[order], first)
+            chosen = order[first]
+            xyz, rgb, depth, semantics, weight = xyz[chosen], rgb[chosen], depth[chosen], winner, margin
+        self._parts = [(xyz, rgb, semantics, depth, weight)]
+        self._kept, self._pending = len(xyz), 0
+
+    def cloud(self, frame: Literal["world", "object"], with_semantics: bool) -> PointCloud:
+        """All kept points as one cloud; the accumulator is empty afterwards."""
+        self._merge()
+        if not self._parts:
+            none = np.zeros((0, 3))
+            return PointCloud(
+                none.astype(np.float32), none.astype(np.uint8), frame, np.zeros(0, np.uint8) if with_semantics else None
+            )
+        xyz, rgb, semantics, _, _ = self._parts.pop()
+        return PointCloud(xyz, rgb, frame, semantics if with_semantics else None)
+
+
+def voxel_keys(xyz: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
+    """One integer per voxel of side ``voxel_m`` for points ``[N, 3]``; 21 bits per axis.
+
+    Raises:
+        InputError: a coordinate is more than a million voxels from the origin.
+    """
+    cells = np.floor(np.asarray(xyz, np.float64) / voxel_m).astype(np.int64)
+    limit = 1 << 20
+    if len(cells) and (np.abs(cells) >= limit).any():
+        raise InputError(
+            "points lie too far away for this voxel size",
+            where="voxel filter",
+            expected=f"within {limit * voxel_m:g} m",
+            got=f"{float(np.abs(xyz).max()):g} m",
+            remedy="use larger voxels, or check the poses",
+        )
+    cells += limit
+    return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+
+
+def _majority(
+    labels: NDArray[np.uint8], weights: NDArray[np.int32], first: NDArray[np.intp]
+) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    """Most voted label of each group (groups start at ``first``) and its margin over all other votes, at least 1."""
+    group = np.zeros(len(labels), np.int64)
+    group[first[1:]] = 1
+    group = np.cumsum(group)
+    combined = group * 256 + labels
+    order = np.argsort(combined, kind="stable")
+    sorted_key = combined[order]
+    starts = np.flatnonzero(np.r_[True, sorted_key[1:] != sorted_key[:-1]])
+    tally = np.add.reduceat(weights[order], starts).astype(np.int64)
+    tally_group, tally_label = sorted_key[starts] // 256, (sorted_key[starts] % 256).astype(np.uint8)
+    tally[tally_label == palette.UNLABELLED] = 0
+    ranked = np.lexsort((-tally, tally_group))
+    winner_at = ranked[np.flatnonzero(np.r_[True, tally_group[ranked][1:] != tally_group[ranked][:-1]])]
+    total = np.add.reduceat(weights, first).astype(np.int64)
+    margin = np.maximum(2 * tally[winner_at] - total, 1)
+    winner = np.where(tally[winner_at] > 0, tally_label[winner_at], palette.UNLABELLED).astype(np.uint8)
+    return winner, np.where(winner == palette.UNLABELLED, 0, margin).astype(np.int32)
+
+
+# --- the whole ------------------------------------------------------------------------------------------------------
+
+
+DEFAULT_RULES: Final = FusionRules()
+
+
+def fuse_sweeps(
+    sweeps: Iterable[SweepShots], tracks: Sequence[Track], rules: FusionRules = DEFAULT_RULES
+) -> tuple[FusedCloud, FusionReport]:
+    """Fuse sweeps and images; one sweep is held in memory at a time.
+
+    Args:
+        sweeps: sweeps with the images that may colour them, in any order.
+        tracks: all tracked boxes; which of them move is decided here.
+        rules: see ``FusionRules``.
+
+    Returns:
+        The fused cloud (static: world frame; objects: box frame, by track id) and a report. ``semantics`` are None
+        when no image carried labels. A log without points gives an empty static cloud.
+    """
+    report = FusionReport()
+    report.verdicts = {track.id: judge_track(track, rules) for track in tracks}
+    movers = [track for track in tracks if report.verdicts[track.id].moving]
+    static = CloudAccumulator(rules.voxel_m)
+    objects = [CloudAccumulator(rules.voxel_m) for _ in movers]
+    labelled = False
+    for sweep in sweeps:
+        labelled |= any(shot.semantics is not None for shot in sweep.shots)
+        owner, owned = separate(sweep, movers, rules)
+        colours = colour_points(sweep, owner, owned, movers, rules)
+        keep = colours.seen & (owner == STATIC)
+        static.add(
+            _apply(sweep.world_from_lidar, sweep.points.xyz[keep]),
+            colours.rgb[keep],
+            colours.semantics[keep],
+            colours.depth_m[keep],
+        )
+        for index, xyz_object in owned.items():
+            ids = np.flatnonzero(owner == index)
+            seen = colours.seen[ids]
+            ids = ids[seen]
+            objects[index].add(xyz_object[seen], colours.rgb[ids], colours.semantics[ids], colours.depth_m[ids])
+        report.sweeps += 1
+        report.points_in += len(owner)
+        report.points_moving_in += int((owner != STATIC).sum())
+        report.points_coloured += int(colours.seen.sum())
+        report.points_hidden += int(colours.hidden.sum())
+    report.points_static_in = report.points_in - report.points_moving_in
+    report.points_unseen = report.points_in - report.points_coloured - report.points_hidden
+    static_cloud = static.cloud("world", labelled)
+    report.points_static = len(static_cloud)
+    clouds: dict[str, PointCloud] = {}
+    for track, accumulator in zip(movers, objects, strict=True):
+        cloud = accumulator.cloud("object", labelled)
+        report.object_points[track.id] = len(cloud)
+        if len(cloud) < max(rules.min_object_points, 1):
+            report.left_out[track.id] = f"{len(cloud)} coloured points, fewer than {rules.min_object_points}"
+        else:
+            clouds[track.id] = cloud
+    return FusedCloud(static_cloud, clouds), report

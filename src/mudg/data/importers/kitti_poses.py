@@ -1,0 +1,179 @@
+"""KITTI vehicle poses: GPS/IMU packets (``oxts``), odometry pose files, velodyne pose files; and the clocks beside them."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.geometry import from_rotation_translation, rigid_problem, yaw_matrix, yaw_of
+
+Matrix = NDArray[np.float64]
+EARTH_RADIUS_M = 6378137.0
+_POSE_TOLERANCE = 1e-3
+_OXTS_VALUES = 30
+
+
+def read_lines(path: Path) -> list[str]:
+    """Non-empty lines of a text file."""
+    try:
+        return [line for line in store.read_bytes(path).decode("utf-8").splitlines() if line.strip()]
+    except UnicodeDecodeError as error:
+        raise InputError("file is not text", where=str(path), got=str(error)) from error
+
+
+def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDArray[np.float64]:
+    """The numbers of one line; their count must be one of ``counts``."""
+    words = line.split()
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
+    if len(numbers) not in counts:
+        raise InputError(
+            f"{what}: wrong number of values",
+            where=where,
+            expected=" or ".join(str(c) for c in counts),
+            got=str(len(numbers)),
+            remedy="is the file cut off, or of another format?",
+        )
+    if not np.isfinite(numbers).all():
+        raise InputError(
+            f"{what}: a value is not finite", where=where, got=line.strip()[:80], expected="finite numbers"
+        )
+    return numbers
+
+
+def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, Matrix], str]:
+    """Poses by frame number, and which sensor they are of.
+
+    Two forms are told apart by the numbers in a line: 12 = KITTI odometry, row-major 3x4 of rectified camera 0, line k
+    for the k-th frame (or, when the file covers more than our frames, for frame number k); 13 = frame number, then
+    row-major 3x4 of the velodyne in a z-up world.
+
+    Returns:
+        Poses f64[4, 4] by frame number, and ``"cam0"`` or ``"velo"``.
+    """
+    lines = read_lines(path)
+    if not lines:
+        raise InputError("pose file is empty", where=str(path), expected="one pose a line")
+    rows = [line_numbers(line, (12, 13), f"{path}: line {index + 1}", "pose") for index, line in enumerate(lines)]
+    widths = {len(row) for row in rows}
+    if len(widths) != 1:
+        raise InputError("pose file mixes two forms", where=str(path), expected="12 or 13 numbers in every line")
+    if widths == {13}:
+        numbers = [int(row[0]) for row in rows]
+        if any(number != row[0] for number, row in zip(numbers, rows, strict=True)) or len(set(numbers)) != len(
+            numbers
+        ):
+            raise InputError("first column is not a list of distinct frame numbers", where=str(path))
+        poses = {n: row[1:] for n, row in zip(numbers, rows, strict=True)}
+        sensor = "velo"
+    else:
+        sensor = "cam0"
+        if len(rows) == len(frame_numbers):
+            poses = dict(zip(frame_numbers, rows, strict=True))
+        elif len(rows) > max(frame_numbers):
+            poses = dict(enumerate(rows))
+        else:
+            raise InputError(
+                "pose file does not cover the frames",
+                where=str(path),
+                got=f"{len(rows)} lines",
+                expected=f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)",
+            )
+    return {number: _pose(row, f"{path}: pose of frame {number}") for number, row in poses.items()}, sensor
+
+
+def _pose(row: NDArray[np.float64], where: str) -> Matrix:
+    matrix = np.vstack([row.reshape(3, 4), [0, 0, 0, 1]])
+    problem = rigid_problem(matrix, _POSE_TOLERANCE)
+    if problem is not None:
+        raise InputError(
+            "pose is not a rigid motion",
+            where=where,
+            got=problem,
+            expected="a rotation and a translation in metres",
+            remedy="check that the file is row-major 3x4, metres, not scaled or mirrored",
+        )
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    return from_rotation_translation(u @ vt, matrix[:3, 3])
+
+
+def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
+    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``.
+
+    Args:
+        path: a folder with one file per frame (raw data), or one file with a line per frame (tracking).
+        frames: frame numbers that must be there.
+    """
+    if path.is_dir():
+        found = {int(file.stem): file for file in path.iterdir() if file.stem.isdigit() and file.suffix == ".txt"}
+        wheres = {n: str(file) for n, file in sorted(found.items()) if frames[0] <= n <= frames[-1]}
+        lines = {n: (read_lines(found[n]) or [""])[0] for n in wheres}
+    else:
+        rows = dict(enumerate(read_lines(path)))
+        lines = {n: line for n, line in rows.items() if frames[0] <= n <= frames[-1]}
+        wheres = {n: f"{path}: line {n + 1}" for n in lines}
+    missing = [n for n in frames if n not in lines]
+    if missing:
+        raise InputError(
+            "GPS/IMU packets are missing",
+            where=str(path),
+            got=f"no packet for frames {', '.join(str(n) for n in missing[:8])} ({len(missing)} in all)",
+            remedy="copy them, or choose frames with --frames FIRST:END",
+        )
+    return {n: line_numbers(line, (_OXTS_VALUES,), wheres[n], "GPS/IMU packet") for n, line in lines.items()}
+
+
+def poses_from_packets(packets: NDArray[np.float64], where: str) -> Matrix:
+    """World-from-IMU poses f64[n, 4, 4] of GPS/IMU packets f64[n, 30].
+
+    Latitude and longitude are projected as Mercator, scaled at the first packet's latitude, so that distances near the
+    start are true; roll, pitch and yaw turn about x, y and z in that order. World: the first position is the origin, x
+    along the first heading, z against gravity.
+    """
+    if (np.abs(packets[:, 0]) > 89).any() or (np.abs(packets[:, 1]) > 180).any():
+        raise InputError("latitude or longitude is out of range", where=where, expected="degrees")
+    latitude, longitude = np.deg2rad(packets[:, 0]), np.deg2rad(packets[:, 1])
+    scale = np.cos(latitude[0])
+    east = scale * EARTH_RADIUS_M * longitude
+    north = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + latitude / 2))
+    positions = np.stack([east, north, packets[:, 2]], 1)
+    poses = np.stack(
+        [
+            from_rotation_translation(_roll_pitch_yaw(*packet[3:6]), position - positions[0])
+            for packet, position in zip(packets, positions, strict=True)
+        ]
+    )
+    return yaw_matrix(-yaw_of(poses[0])) @ poses
+
+
+def _roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    return yaw_matrix(yaw)[:3, :3] @ about_y @ about_x
+
+
+def read_timestamps(path: Path) -> list[float]:
+    """Seconds per line: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch)."""
+    times = []
+    for index, line in enumerate(read_lines(path)):
+        where = f"{path}: line {index + 1}"
+        match = re.fullmatch(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,12})?", line.strip())
+        if match is None:
+            times.append(float(line_numbers(line, (1,), where, "timestamp")[0]))
+            continue
+        try:
+            whole = datetime.datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S").replace(tzinfo=datetime.UTC)
+        except ValueError as error:
+            raise InputError("timestamp is no date", where=where, got=line.strip()) from error
+        times.append(whole.timestamp() + float(match[2] or 0))
+    return times

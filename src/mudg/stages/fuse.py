@@ -1,0 +1,160 @@
+"""``mudg fuse``: scene -> one static coloured cloud and one cloud per moving object. The rules are in ``core/fusion.py``.
+
+Images of held-out frames give no colours, so that nothing of what is scored later leaks into the clouds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from mudg.base import log, store
+from mudg.base.config import to_dict
+from mudg.base.types import Frame, FusedCloud, Scene
+from mudg.core.fusion import FusionReport, FusionRules, Shot, SweepShots, fuse_sweeps
+from mudg.data.cloudfile import write_fused
+from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+from mudg.stages.config import FuseConfig
+
+_VERSION = 1
+_TOP_VIEW_PX = 1400
+_MOVER_COLOUR = (255, 90, 60)
+_PATH_COLOUR = (60, 200, 255)
+
+
+def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) -> Path:
+    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png`` to ``out``.
+
+    Args:
+        config: see ``FuseConfig``.
+        scene: scene directory or stored zip.
+        out: output folder; a finished result of the same configuration and scene is verified and reused.
+
+    Raises:
+        InputError: the scene is malformed. UsageError: ``out`` holds something else.
+    """
+    folder = store.RunDir.open(out, "fuse", to_dict(config), {"scene": store.digest(scene)}, _VERSION, overwrite)
+    if folder.complete:
+        return folder.reused()
+    loaded = read_scene(scene)
+    rules = rules_of(config)
+    cloud, report = fuse_sweeps(scene_sweeps(loaded, config), loaded.tracks, rules)
+    if report.sweeps and not len(cloud.static):
+        log.warn(
+            "fuse: no point of the static world falls into an image; check calibration and clocks with `mudg doctor`"
+        )
+    for words in describe(report):
+        log.info(f"fuse: {words}")
+    write_fused(folder.path, cloud, report_record(report, rules))
+    with store.atomic_path(folder.path / "top.png") as temporary:
+        draw_top_view(loaded, cloud, report).save(temporary)
+    folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
+    return folder.path
+
+
+def rules_of(config: FuseConfig) -> FusionRules:
+    """The fusion rules that a configuration asks for."""
+    names = {field.name for field in dataclasses.fields(FusionRules)}
+    return FusionRules(**{name: value for name, value in to_dict(config).items() if name in names})
+
+
+def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
+    """The sweeps of a scene, one at a time, each with the images that may colour it."""
+    frames = [f for f in scene.frames if config.colour_from_held_out or scene.split.get(f.id, "train") == "train"]
+    by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
+    for sweep in log.progress(scene.sweeps, len(scene.sweeps), "fusing sweeps"):
+        chosen = [_nearest(found, sweep.time_s) for found in by_camera.values() if found]
+        shots = [_shot(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= config.max_image_gap_s]
+        points = read_points(scene, sweep)
+        yield SweepShots(sweep.time_s, sweep.world_from_lidar, points, shots)
+
+
+def _nearest(frames: list[Frame], time_s: float) -> Frame:
+    return min(frames, key=lambda frame: abs(frame.view.time_s - time_s))
+
+
+def _shot(scene: Scene, frame: Frame) -> Shot:
+    semantics = read_label(scene, frame, "semantics") if "semantics" in frame.labels else None
+    return Shot(frame.view, read_image(scene, frame), semantics)
+
+
+def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
+    """The report as JSON values for ``fuse.json``."""
+    values = dataclasses.asdict(report)
+    tracks = {
+        track_id: {
+            **verdict,
+            "points": report.object_points.get(track_id),
+            "left_out": report.left_out.get(track_id),
+        }
+        for track_id, verdict in values.pop("verdicts").items()
+    }
+    values.pop("object_points")
+    values.pop("left_out")
+    return {"counts": values, "rules": dataclasses.asdict(rules), "tracks": tracks}
+
+
+def describe(report: FusionReport) -> list[str]:
+    """What happened, in sentences."""
+    movers = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
+    total = max(report.points_in, 1)
+    lines = [
+        f"{report.sweeps} sweeps, {report.points_in} points: {report.points_coloured / total:.0%} coloured, "
+        f"{report.points_hidden / total:.1%} hidden behind nearer surfaces, {report.points_unseen / total:.0%} in no image",
+        f"{len(movers)} of {len(report.verdicts)} tracked boxes move; {report.points_static} points in the static cloud",
+    ]
+    lines += [f"mover {track_id} left out: {words}" for track_id, words in report.left_out.items()]
+    return lines
+
+
+def draw_top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Image.Image:
+    """The clouds from above (x right, y up), movers at the middle of their tracks, the vehicle's path as a line."""
+    xyz, rgb = _placed(scene, cloud)
+    path = scene.ego.world_from_ego[:, :2, 3]
+    around = np.concatenate([xyz[:, :2], path]) if len(xyz) else path
+    low, high = np.percentile(around, 1, axis=0) - 5, np.percentile(around, 99, axis=0) + 5
+    low, high = np.minimum(low, path.min(0) - 5), np.maximum(high, path.max(0) + 5)
+    scale = _TOP_VIEW_PX / float((high - low).max())
+    width, height = (np.ceil((high - low) * scale).astype(int) + 1).tolist()
+    canvas = np.full((height, width, 3), 18, np.uint8)
+    pixel = ((xyz[:, :2] - low) * scale).astype(int)
+    inside = ((pixel >= 0) & (pixel < [width, height])).all(1)
+    order = np.flatnonzero(inside)[np.argsort(xyz[inside, 2], kind="stable")]  # higher points on top
+    canvas[height - 1 - pixel[order, 1], pixel[order, 0]] = rgb[order]
+    image = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(image)
+
+    def at(points: NDArray[np.floating]) -> list[tuple[float, float]]:
+        return [(float(x), float(height - 1 - y)) for x, y in (points - low) * scale]
+
+    if len(path) > 1:
+        draw.line(at(path), fill=_PATH_COLOUR, width=2)
+    for track in scene.tracks:
+        if report.verdicts[track.id].moving:
+            draw.line(at(track.world_from_object[:, :2, 3]), fill=_MOVER_COLOUR, width=1)
+            draw.polygon(at(_footprint(track.size_m, _middle(track))), outline=_MOVER_COLOUR)
+    return image
+
+
+def _middle(track: Any) -> NDArray[np.float64]:
+    return track.world_from_object[len(track.times_s) // 2]
+
+
+def _placed(scene: Scene, cloud: FusedCloud) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    xyz, rgb = [cloud.static.xyz.astype(np.float64)], [cloud.static.rgb]
+    for track_id, points in cloud.objects.items():
+        pose = _middle(scene.track(track_id))
+        xyz.append(points.xyz.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
+        rgb.append(points.rgb)
+    return np.concatenate(xyz), np.concatenate(rgb)
+
+
+def _footprint(size_m: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2 * size_m[:2]
+    return corners @ pose[:2, :2].T + pose[:2, 3]

@@ -1,0 +1,166 @@
+"""``mudg ingest``: a dataset log, or the built-in procedural city -> a scene directory."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mudg.base import log, store
+from mudg.base.config import to_dict
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Frame, Scene
+from mudg.data.importers import IMPORTERS
+from mudg.data.importers.options import ImportOptions, parse_frame_range
+from mudg.data.scene_files import open_files
+from mudg.data.scenefile import SceneWriter, read_label, read_points, read_scene
+from mudg.stages.config import IngestConfig
+
+CITY = "city"
+_VERSION = 1
+
+
+def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> Path:
+    """Make a scene directory from ``source``.
+
+    Args:
+        config: see ``IngestConfig``.
+        source: the word ``city``, the folder of a dataset log (its format is recognised), or a scene (directory or
+            stored zip), which is checked and copied.
+        out: output folder; a finished result of the same configuration and source is verified and reused.
+
+    Raises:
+        InputError: the log is missing, malformed or contradictory. UsageError: ``out`` holds something else.
+    """
+    source = str(source)
+    make = _city if source == CITY else _maker(config, Path(source))
+    inputs = {} if source == CITY else {"source": source_digest(Path(source))}
+    settings = {name: value for name, value in to_dict(config).items() if source == CITY or name != "city"}
+    folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite)
+    if folder.complete:
+        return folder.reused()
+    if (folder.path / "scene.json").is_file():
+        scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
+    else:
+        scene = make(config, Path(source), folder.path)
+    held_out = sum(split == "test" for split in scene.split.values())
+    log.info(
+        f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "
+        f"tracked boxes; {held_out} images held out"
+    )
+    folder.finish(
+        {"frames": len(scene.frames), "sweeps": len(scene.sweeps), "tracks": len(scene.tracks), "held_out": held_out}
+    )
+    return folder.path
+
+
+Maker = Callable[[IngestConfig, Path, Path], Scene]
+
+
+def _maker(config: IngestConfig, source: Path) -> Maker:
+    """Who can read ``source``."""
+    if not source.exists():
+        raise InputError(
+            "driving log does not exist", where=str(source), expected=f"a folder, a scene zip, or the word {CITY}"
+        )
+    if config.format != "auto":
+        return _importer(config.format)
+    if source.is_file() or (source / "scene.json").is_file():
+        return _copy_scene
+    for name, looks_like in RECOGNISERS.items():
+        if looks_like(source):
+            log.info(f"ingest: {source} looks like {name}")
+            return _importer(name)
+    inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
+    raise InputError(
+        "the folder's format was not recognised",
+        where=str(source),
+        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
+        got=inside,
+        remedy="give the folder of one drive or sequence, or name the format with --format",
+    )
+
+
+def _looks_like_kitti(source: Path) -> bool:
+    if any((source / name).is_dir() for name in ("image_02", "image_2", "image_00", "velodyne_points")):
+        return True
+    return (source / "info.json").is_file() and any(path.suffix == ".bin" for path in source.iterdir())
+
+
+RECOGNISERS: Mapping[str, Callable[[Path], bool]] = {"kitti": _looks_like_kitti}
+"""Format name -> whether a folder looks like it."""
+
+
+def _importer(name: str) -> Maker:
+    def make(config: IngestConfig, source: Path, out: Path) -> Scene:
+        return IMPORTERS[name](source, out, import_options(config))
+
+    return make
+
+
+def import_options(config: IngestConfig) -> ImportOptions:
+    """The importer's options that a configuration asks for."""
+    return ImportOptions(
+        frames=parse_frame_range(config.frames),
+        cameras=config.cameras,
+        sequence=config.sequence,
+        poses=Path(config.poses) if config.poses else None,
+        boxes=Path(config.boxes) if config.boxes else None,
+        skip_missing=config.skip_missing,
+        untwist=config.untwist,
+        test_every=config.test_every,
+    )
+
+
+def source_digest(source: Path) -> str:
+    """What identifies a log without reading all of it: names, sizes and modification times of its files; a scene's own digest."""
+    if source.is_file() or (source / "scene.json").is_file():
+        return store.digest(source)
+    total = hashlib.sha256()
+    for folder, names, files in os.walk(source):
+        names.sort()
+        for name in sorted(files):
+            path = Path(folder) / name
+            state = path.stat()
+            total.update(f"{path.relative_to(source).as_posix()}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
+    return total.hexdigest()
+
+
+def _city(config: IngestConfig, _source: Path, out: Path) -> Scene:
+    from mudg.data.city import write_city
+
+    return write_city(config.city, out, test_every=config.test_every)
+
+
+def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
+    """Check a scene by reading everything, and write it anew; held-out frames are kept as the scene has them."""
+    if config.frames or config.sequence or config.poses or config.boxes:
+        raise UsageError(
+            "a scene is taken as it is", where="--frames, --sequence, --poses, --boxes", remedy="leave these out"
+        )
+    scene = read_scene(source)
+    with SceneWriter(out, scene.id, scene.source) as writer:
+        add_rest(writer, scene)
+        for frame in log.progress(scene.frames, len(scene.frames), "copying frames"):
+            add_frame_copy(writer, scene, frame)
+        return writer.finish()
+
+
+def add_rest(writer: SceneWriter, scene: Scene) -> None:
+    """Copy everything of a scene but its frames: cameras, sweeps, tracks, ego path, split."""
+    for camera in scene.cameras.values():
+        writer.add_camera(camera)
+    for sweep in log.progress(scene.sweeps, len(scene.sweeps), "copying sweeps"):
+        writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, read_points(scene, sweep))
+    for track in scene.tracks:
+        writer.add_track(track)
+    writer.set_ego(scene.ego)
+    writer.set_split(scene.split)
+
+
+def add_frame_copy(writer: SceneWriter, scene: Scene, frame: Frame, labels: Mapping[str, Any] | None = None) -> None:
+    """Copy a frame, its image's bytes as they are and its labels; ``labels`` (name -> array) fill in what it lacks."""
+    own = {name: read_label(scene, frame, name) for name in frame.labels}
+    writer.add_frame(frame.id, frame.view, open_files(scene.root).read(frame.image.path), {**(labels or {}), **own})

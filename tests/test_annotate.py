@@ -1,0 +1,241 @@
+"""Labels from geometry: exact on made-up streets up to stated shares, honest about what cannot be told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_scene import CAR_SIZE_M, ToyStreet
+
+from mudg.base import geometry
+from mudg.base.geometry import yaw_matrix
+from mudg.base.palette import ID, UNLABELLED
+from mudg.base.types import EgoPath, Source, View
+from mudg.data.scenefile import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
+from mudg.models.labellers import (
+    LABELLERS,
+    TRAIN_ID_OF,
+    LabelInput,
+    box_outline,
+    distance_to_path,
+    find_sky,
+    fit_ground,
+    label_by_geometry,
+    ray_elevation,
+)  # fmt: skip
+from mudg.stages import annotate
+from mudg.stages.config import AnnotateConfig
+
+STREET = ToyStreet(car_start=(11, 1.0), car_velocity=(2, 0))
+
+
+def given_at(
+    street: ToyStreet, time_s: float = 0.0, *, lidar: bool = True, boxes: bool = True
+) -> tuple[LabelInput, np.ndarray]:
+    """What the labeller sees, and the true classes."""
+    view = street.view(time_s)
+    rgb, ids, _ = street.image(view)
+    pose, points, _ = street.sweep(time_s)
+    world = geometry.transform_points(pose, points.xyz) if lidar else np.zeros((0, 3), np.float32)
+    path = np.stack([street.world_from_ego(t)[:3, 3] for t in street.times])
+    tracks = [street.track()] if boxes and street.car_start is not None else []
+    return LabelInput(view, rgb, world, tracks, path), ids
+
+
+def overlap(found: np.ndarray, truth: np.ndarray, *names: str) -> float:
+    """Intersection over union of a group of classes where something was said."""
+    ids = [ID[name] for name in names]
+    a, b = np.isin(found, ids), np.isin(truth, ids)
+    said = found != UNLABELLED
+    return float((a & b & said).sum() / ((a | b) & said).sum())
+
+
+def test_labels_of_a_street_agree_with_the_truth() -> None:
+    given, truth = given_at(STREET)
+    labels = label_by_geometry(given)
+    assert overlap(labels.semantics, truth, "road") > 0.93
+    assert overlap(labels.semantics, truth, "car") > 0.75
+    assert overlap(labels.semantics, truth, "sky") > 0.95
+    assert overlap(labels.semantics, truth, "building", "vegetation", "wall") > 0.8
+    assert (labels.semantics != UNLABELLED).mean() > 0.95
+    assert set(np.unique(labels.semantics)) <= {ID[n] for n in ("road", "building", "vegetation", "sky", "car")} | {
+        UNLABELLED
+    }
+
+
+def test_confidence_tells_right_from_wrong() -> None:
+    given, truth = given_at(STREET)
+    labels = label_by_geometry(given)
+    assert labels.confidence.dtype == np.float32
+    assert ((labels.confidence >= 0) & (labels.confidence <= 1)).all()
+    assert (labels.confidence[labels.semantics == UNLABELLED] == 0).all()
+    right = labels.semantics == truth
+    sure = labels.confidence > 0.7
+    assert right[sure].mean() > 0.97
+    assert labels.confidence[right].mean() > labels.confidence[~right & (labels.semantics != UNLABELLED)].mean() + 0.1
+
+
+def test_depth_is_measured_where_it_says_it_is_sure() -> None:
+    given, _ = given_at(STREET)
+    labels = label_by_geometry(given)
+    _, _, truth = STREET.image(given.view)
+    sure = labels.depth_confidence > 0.6
+    assert sure.mean() > 0.3
+    assert np.isfinite(truth[sure]).mean() > 0.99
+    sure &= np.isfinite(truth)
+    error = np.abs(labels.depth[sure] - truth[sure]) / truth[sure]
+    assert np.median(error) < 0.01
+    assert np.isnan(labels.depth[labels.sky]).all()
+    assert (labels.depth_confidence[np.isnan(labels.depth)] == 0).all()
+
+
+def test_without_lidar_it_says_less_and_without_boxes_it_invents_no_car() -> None:
+    given, truth = given_at(STREET, lidar=False)
+    blind = label_by_geometry(given)
+    assert overlap(blind.semantics, truth, "sky") > 0.9
+    assert not (blind.semantics == ID["road"]).any()
+    assert np.isnan(blind.depth).all()
+    assert blind.confidence[blind.semantics == ID["car"]].max(initial=0) <= 0.5
+    given, _ = given_at(STREET, boxes=False)
+    assert not (label_by_geometry(given).semantics == ID["car"]).any()
+
+
+def test_a_box_hidden_behind_the_wall_is_not_painted() -> None:
+    street = replace(STREET, car_start=(40.0, 0.0))
+    given, truth = given_at(street)
+    assert not (truth == ID["car"]).any()
+    assert not (label_by_geometry(given).semantics == ID["car"]).any()
+
+
+def test_all_black_and_all_white_images_do_not_break_it() -> None:
+    given, _ = given_at(STREET)
+    for level, sky in ((0, False), (255, True)):
+        labels = label_by_geometry(replace(given, rgb=np.full_like(given.rgb, level)))
+        high = ray_elevation(given.view) > 0.2
+        assert (labels.semantics[high] == ID["sky"]).mean() == pytest.approx(float(sky), abs=0.02)
+
+
+def test_labels_of_boxes_are_train_ids() -> None:
+    assert set(LABELLERS) == {"geometry"}
+    assert TRAIN_ID_OF["van"] == ID["car"]
+    assert TRAIN_ID_OF["cyclist"] == ID["rider"]
+    unknown = replace(STREET.track(), label="shopping trolley")
+    given, _ = given_at(STREET)
+    assert not (label_by_geometry(replace(given, tracks=[unknown])).semantics == ID["car"]).any()
+
+
+# --- parts ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slope", [(0.0, 0.0, -1.7), (0.05, -0.03, 0.4), (-0.12, 0.02, 2.0)])
+def test_ground_plane_is_found_among_walls_and_noise(slope: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-30, 30, (6000, 2))
+    ground = np.c_[flat, flat @ slope[:2] + slope[2] + rng.normal(0, 0.02, 6000)]
+    wall = np.c_[np.full(3000, 12.0), rng.uniform(-20, 20, 3000), rng.uniform(0, 8, 3000) + 12 * slope[0] + slope[2]]
+    plane = fit_ground(np.concatenate([ground, wall]).astype(np.float32), np.zeros((3, 3)))
+    assert plane is not None
+    assert np.abs(plane - slope).max() < 0.02
+
+
+def test_no_ground_is_no_plane() -> None:
+    assert fit_ground(np.zeros((0, 3), np.float32), np.zeros((1, 3))) is None
+    cliff = np.random.default_rng(0).uniform(0, 30, (4000, 3))
+    cliff[:, 2] = 1.5 * cliff[:, 0]
+    assert fit_ground(cliff, np.array([[15.0, 15, 0]])) is None
+
+
+def test_distance_to_path_goes_on_beyond_its_ends() -> None:
+    path = np.c_[np.arange(0, 10, 0.5), np.zeros(20), np.zeros(20)]
+    points = np.array([[5.0, 3, 9], [40, -4, 0], [-30, 2, 0]])
+    assert np.abs(distance_to_path(points, path) - [3, 4, 2]).max() < 0.3
+    assert distance_to_path(points, path[:1])[1] == pytest.approx(np.hypot(40, 4))
+
+
+def test_box_outline_covers_the_projected_box_exactly() -> None:
+    view = STREET.view(0.0)
+    for x, y, yaw in (
+        (12, 1, 0.4),
+        (3.5, -1.5, 0.0),
+        (30, 6, 2.0),
+    ):  # the second reaches behind the camera's near plane
+        pose = yaw_matrix(yaw, (x, y, 0.8))
+        outline = box_outline(view, pose, CAR_SIZE_M)
+        street = ToyStreet(car_start=(x, y), wall_x=1e6)
+        object.__setattr__(street, "world_from_car", lambda _t, p=pose: p)
+        assert outline is not None
+        _, ids, _ = street.image(view)
+        assert (outline == (ids == ID["car"])).mean() > 0.999
+    assert box_outline(view, yaw_matrix(0, (-9, 0, 0.8)), CAR_SIZE_M) is None
+    assert box_outline(view, yaw_matrix(0, (5, 80, 0.8)), CAR_SIZE_M) is None
+
+
+def test_elevation_of_rays() -> None:
+    view = STREET.view(0.0)
+    elevation = ray_elevation(view)
+    middle = view.camera.height // 2
+    assert elevation[middle - 1].min() > 0 > elevation[middle].max()
+    pitched = View(view.camera, view.world_from_cam @ geometry.from_rotation_translation(
+        [[1, 0, 0], [0, np.cos(0.1), -np.sin(0.1)], [0, np.sin(0.1), np.cos(0.1)]], [0, 0, 0]), 0.0)  # fmt: skip
+    column = view.camera.width // 2
+    assert ray_elevation(pitched)[middle, column] == pytest.approx(elevation[middle, column] + 0.1, abs=1e-3)
+
+
+def test_sky_is_not_found_where_returns_are_or_below_the_horizon() -> None:
+    rgb = np.full((60, 80, 3), 220, np.uint8)
+    elevation = np.repeat(np.linspace(0.5, -0.5, 60)[:, None], 80, 1).astype(np.float32)
+    empty = np.ones((60, 80), bool)
+    empty[:, 50:] = False
+    sky = find_sky(rgb, elevation, empty)
+    assert sky[2:28, 2:48].all()
+    assert not sky[:, 50:].any()
+    assert not sky[31:].any()
+
+
+# --- the stage ------------------------------------------------------------------------------------------------------
+
+
+def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: Path) -> None:
+    plain = STREET.write(tmp_path / "plain", labels=False)
+    files = {p: p.read_bytes() for p in (tmp_path / "plain").rglob("*") if p.is_file()}
+    out = annotate.run(AnnotateConfig(depth=True), tmp_path / "plain", tmp_path / "labelled")
+    scene = read_scene(out)
+    assert files == {p: p.read_bytes() for p in (tmp_path / "plain").rglob("*") if p.is_file()}
+    assert [f.id for f in scene.frames] == [f.id for f in plain.frames]
+    for frame, before in zip(scene.frames, plain.frames, strict=True):
+        assert (read_image(scene, frame) == read_image(plain, before)).all()
+        assert set(frame.labels) == {"semantics", "sky", "semantics_confidence", "depth", "depth_confidence"}
+        _, truth, _ = STREET.image(frame.view)
+        assert overlap(read_label(scene, frame, "semantics"), truth, "road") > 0.9
+    assert (read_points(scene, scene.sweeps[1]).xyz == read_points(plain, plain.sweeps[1]).xyz).all()
+    assert dict(scene.split) == dict(plain.split)
+    assert any("not truth" in note for note in scene.source.notes)
+    assert not [f for f in check_scene(out) if f.level == "error"]
+    assert list((out / "pictures").glob("*.png"))
+    before_ns = (out / "scene.json").stat().st_mtime_ns
+    assert annotate.run(AnnotateConfig(depth=True), tmp_path / "plain", out) == out
+    assert (out / "scene.json").stat().st_mtime_ns == before_ns
+
+
+def test_a_scene_with_labels_passes_through_unchanged(tmp_path: Path) -> None:
+    given = STREET.write(tmp_path / "given")
+    scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "given", tmp_path / "out"))
+    for frame, before in zip(scene.frames, given.frames, strict=True):
+        assert set(frame.labels) == set(before.labels)
+        assert (read_label(scene, frame, "semantics") == read_label(given, before, "semantics")).all()
+        assert np.array_equal(read_label(scene, frame, "depth"), read_label(given, before, "depth"), equal_nan=True)
+    assert not any("not truth" in note for note in scene.source.notes)
+
+
+def test_a_scene_with_images_only_can_be_labelled(tmp_path: Path) -> None:
+    street = ToyStreet(times=(0.0,))
+    with SceneWriter(tmp_path / "s", "one image", Source("toy", "none")) as writer:
+        view = street.view(0.0)
+        writer.add_camera(view.camera)
+        writer.add_frame("front/000000", view, street.image(view)[0])
+        writer.set_ego(EgoPath(np.zeros(1), np.eye(4)[None]))
+        writer.finish()
+    scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "s", tmp_path / "out"))
+    assert overlap(read_label(scene, scene.frames[0], "semantics"), street.image(view)[1], "sky") > 0.9

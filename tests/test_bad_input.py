@@ -1,0 +1,387 @@
+"""Broken logs and scenes: a clear error with its exit code or a stated fallback, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import kitti_folders as made
+import numpy as np
+import pytest
+from PIL import Image
+from toy_scene import ToyStreet
+
+from mudg.base import store
+from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
+from mudg.data.cloudfile import read_fused
+from mudg.data.importers import IMPORTERS
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scenefile import check_scene, read_image, read_points, read_scene
+from mudg.stages import annotate, fuse, ingest
+from mudg.stages.config import AnnotateConfig, FuseConfig, IngestConfig
+
+IMAGE = "image_02/data/0000000003.png"
+SCAN = "velodyne_points/data/0000000003.bin"
+
+
+def rewrite(path: Path, change: Callable[[str], str]) -> None:
+    text = path.read_text()
+    changed = change(text)
+    assert changed != text, "the test did not break anything"
+    path.write_text(changed)
+
+
+def cut(path: Path, share: float = 0.6) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+
+
+def nan_row(root: Path) -> None:
+    rows = np.fromfile(root / SCAN, "<f4").reshape(-1, 4)
+    rows[5, 1] = np.nan
+    rows.tofile(root / SCAN)
+
+
+def pose_line(root: Path, n: int, change: Callable[[list[str]], list[str]]) -> None:
+    path = root / "derived" / "poses_velo.txt"
+    lines = path.read_text().splitlines()
+    lines[n] = " ".join(change(lines[n].split()))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def scale(words: list[str]) -> list[str]:
+    return [words[0], *[str(1.02 * float(w)) if i % 4 < 3 else w for i, w in enumerate(words[1:])]]
+
+
+def mirror(words: list[str]) -> list[str]:
+    return [words[0], *[str(-float(w)) if i % 4 == 1 else w for i, w in enumerate(words[1:])]]
+
+
+def swap_images(root: Path) -> None:
+    (root / IMAGE).write_bytes((root / SCAN).read_bytes())
+
+
+def resize_image(root: Path) -> None:
+    Image.new("RGB", (50, 20)).save(root / IMAGE)
+
+
+def sixteen_bit(root: Path) -> None:
+    Image.fromarray(np.zeros((made.HEIGHT, made.WIDTH), np.uint16)).save(root / IMAGE)
+
+
+def rotated(root: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(made.image(3)).save(root / IMAGE, exif=exif)
+
+
+def label(root: Path, change: Callable[[list[str]], list[str]]) -> None:
+    path = root / "derived" / "label_02.txt"
+    lines = path.read_text().splitlines()
+    lines[2] = " ".join(change(lines[2].split()))
+    path.write_text("\n".join(lines) + "\n")
+
+
+KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
+    # what is broken: (words of the error, where it points, how it is broken)
+    "missing image": ("do not pair up", "", lambda r: (r / IMAGE).unlink()),
+    "missing scan": ("do not pair up", "", lambda r: (r / SCAN).unlink()),
+    "truncated image": ("cannot be decoded", IMAGE, lambda r: cut(r / IMAGE)),
+    "empty image": ("not a PNG or JPEG", IMAGE, lambda r: (r / IMAGE).write_bytes(b"")),
+    "scan called image": ("not a PNG or JPEG", IMAGE, swap_images),
+    "image of another size": ("camera's size", IMAGE, resize_image),
+    "16-bit image": ("not 8-bit", IMAGE, sixteen_bit),
+    "EXIF-rotated image": ("rotated", IMAGE, rotated),
+    "truncated scan": ("cut off", SCAN, lambda r: (r / SCAN).write_bytes((r / SCAN).read_bytes()[:-7])),
+    "NaN in scan": ("not finite", SCAN, nan_row),
+    "truncated pose file": (
+        "wrong number of values",
+        "poses_velo.txt",
+        lambda r: cut(r / "derived/poses_velo.txt", 0.57),
+    ),
+    "pose file without a frame": (
+        "lacks frames",
+        "poses_velo.txt",
+        lambda r: rewrite(r / "derived/poses_velo.txt", lambda t: "\n".join(t.splitlines()[:-1])),
+    ),
+    "empty pose file": ("empty", "poses_velo.txt", lambda r: (r / "derived/poses_velo.txt").write_text("")),
+    "no pose file": ("no vehicle poses", "", lambda r: (r / "derived/poses_velo.txt").unlink()),
+    "NaN pose": ("not finite", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "nan", *w[5:]])),
+    "text in pose": ("not a number", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "1,5", *w[5:]])),
+    "scaled pose": ("not a rigid motion", "frame 2", lambda r: pose_line(r, 2, scale)),
+    "mirrored pose": ("not a rigid motion", "frame 2", lambda r: pose_line(r, 2, mirror)),
+    "binary pose file": (
+        "not text",
+        "poses_velo.txt",
+        lambda r: (r / "derived/poses_velo.txt").write_bytes(b"\xff\xfe\x00" * 9),
+    ),
+    "no calibration": ("no calibration", "", lambda r: (r / "calib.txt").unlink()),
+    "calibration cut off": (
+        "lacks Tr_velo_to_cam",
+        "calib.txt",
+        lambda r: rewrite(r / "calib.txt", lambda t: t[: t.index("Tr_velo")]),
+    ),
+    "zero focal length": (
+        "focal length",
+        "P2",
+        lambda r: rewrite(
+            r / "calib.txt",
+            lambda t: t.replace(
+                made.numbers(made.projection(2)), "0 " + made.numbers(made.projection(2)).split(" ", 1)[1]
+            ),
+        ),
+    ),
+    "calibration scaled": (
+        "not a rotation",
+        "R0_rect",
+        lambda r: rewrite(r / "calib.txt", lambda t: t.replace(made.numbers(np.eye(3)), made.numbers(2 * np.eye(3)))),
+    ),
+    "label columns": ("number of columns", "label_02.txt: line 3", lambda r: label(r, lambda w: w[:-3])),
+    "label text": ("not a number", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "left"])),
+    "label NaN": ("not finite", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "nan"])),
+    "flat box": ("not positive", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:10], "0", *w[11:]])),
+    "two boxes of one track": (
+        "two boxes",
+        "label_02.txt",
+        lambda r: rewrite(r / "derived/label_02.txt", lambda t: t + t.splitlines()[1] + "\n"),
+    ),
+}
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    (tmp_path / "drive").mkdir()
+    return made.write_derived(tmp_path / "drive")
+
+
+@pytest.mark.parametrize("case", KITTI)
+def test_broken_kitti_log(case: str, drive: Path, tmp_path: Path) -> None:
+    words, where, spoil = KITTI[case]
+    spoil(drive)
+    with pytest.raises(InputError) as caught:
+        IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions())
+    error = caught.value
+    assert words in error.what
+    assert where in error.where
+    assert error.exit_code == 3
+    assert str(drive) in error.where or str(drive) in error.got
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["drive"], "something half-written is left"
+
+
+RAW: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "missing packet": ("packets are missing", lambda r: (r / "oxts/data/0000000002.txt").unlink()),
+    "packet cut off": ("wrong number of values", lambda r: cut(r / "oxts/data/0000000002.txt", 0.5)),
+    "packet empty": ("wrong number of values", lambda r: (r / "oxts/data/0000000002.txt").write_text("")),
+    "latitude": ("out of range", lambda r: rewrite(r / "oxts/data/0000000002.txt", lambda t: "149" + t[2:])),
+    "timestamps cut off": ("do not cover", lambda r: cut(r / "image_02/timestamps.txt", 0.5)),
+    "timestamps unsorted": (
+        "do not increase",
+        lambda r: rewrite(r / "velodyne_points/timestamps.txt", lambda t: "\n".join(reversed(t.splitlines()))),
+    ),
+    "no such day": (
+        "no date",
+        lambda r: rewrite(r / "image_02/timestamps.txt", lambda t: t.replace("2011-09-26", "2011-09-31", 1)),
+    ),
+    "tracklets cut off": ("not valid XML", lambda r: cut(r / "tracklet_labels.xml", 0.7)),
+    "tracklets with entities": (
+        "entities",
+        lambda r: rewrite(
+            r / "tracklet_labels.xml",
+            lambda t: t.replace("<!DOCTYPE boost_serialization>", '<!DOCTYPE b [<!ENTITY a "b">]>'),
+        ),
+    ),
+    "tracklet without place": (
+        "'tx'",
+        lambda r: rewrite(
+            r / "tracklet_labels.xml", lambda t: t.replace("<tx>", "<xx>", 1).replace("</tx>", "</xx>", 1)
+        ),
+    ),
+    "no IMU calibration": ("where the IMU is", lambda r: (r.parent / "calib_imu_to_velo.txt").unlink()),
+}
+
+
+@pytest.mark.parametrize("case", RAW)
+def test_broken_raw_drive(case: str, tmp_path: Path) -> None:
+    words, spoil = RAW[case]
+    folder = made.write_raw_drive(tmp_path / "day")
+    spoil(folder)
+    with pytest.raises(InputError) as caught:
+        IMPORTERS["kitti"](folder, tmp_path / "out", ImportOptions())
+    assert words in caught.value.what
+    assert caught.value.where
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["day"]
+
+
+def test_incomplete_frames_can_be_left_out_on_request(drive: Path, tmp_path: Path) -> None:
+    (drive / IMAGE).unlink()
+    (drive / "velodyne_points/data/0000000005.bin").unlink()
+    scene = IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions(skip_missing=True))
+    assert len(scene.frames) == len(scene.sweeps) == 4
+    assert [round(f.view.time_s, 3) for f in scene.frames] == [0.0, 0.1, 0.2, 0.4]
+
+
+def test_unknown_camera_and_missing_files_named_by_flags(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such camera") as caught:
+        IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions(cameras=("rear",)))
+    assert "front" in caught.value.expected
+    for option in ("poses", "boxes"):
+        with pytest.raises(InputError, match=f"{option[:-1]} file does not exist|box file does not exist"):
+            IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions(**{option: tmp_path / "none.txt"}))
+
+
+# --- odd but usable: the whole way to fused clouds --------------------------------------------------------------------
+
+
+def through(source: Path, tmp_path: Path) -> tuple[Any, Any]:
+    scene_path = ingest.run(IngestConfig(), source, tmp_path / "scene")
+    labelled = annotate.run(AnnotateConfig(), scene_path, tmp_path / "labelled")
+    return read_scene(labelled), read_fused(fuse.run(FuseConfig(min_object_points=1), labelled, tmp_path / "fuse"))
+
+
+def test_no_tracks(drive: Path, tmp_path: Path) -> None:
+    (drive / "derived/label_02.txt").unlink()
+    scene, cloud = through(drive, tmp_path)
+    assert scene.tracks == ()
+    assert dict(cloud.objects) == {}
+    assert any("no boxes found" in note for note in scene.source.notes)
+
+
+def test_one_frame(tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    source = made.write_derived(tmp_path / "drive", made.Drive((0,)))
+    (source / "derived/poses_velo.txt").unlink()
+    scene, cloud = through(source, tmp_path)
+    assert len(scene.frames) == 1
+    assert len(cloud.static) > 0
+
+
+def test_no_lidar(drive: Path, tmp_path: Path) -> None:
+    shutil.rmtree(drive / "velodyne_points")
+    scene, cloud = through(drive, tmp_path)
+    assert scene.sweeps == ()
+    assert len(cloud.static) == 0
+
+
+def test_scan_with_zero_points(drive: Path, tmp_path: Path) -> None:
+    (drive / SCAN).write_bytes(b"")
+    scene, cloud = through(drive, tmp_path)
+    assert len(read_points(scene, scene.sweeps[3]).xyz) == 0
+    assert len(cloud.static) > 0
+    assert any("no points" in f.words for f in check_scene(scene.root))
+
+
+def test_one_camera_of_several_is_enough(tmp_path: Path) -> None:
+    scene = ToyStreet(times=(0.0, 0.1)).write(tmp_path / "scene")
+    assert list(scene.cameras) == ["front"]
+    assert len(annotate.run(AnnotateConfig(), tmp_path / "scene", tmp_path / "out").name) > 0
+
+
+# --- broken scenes reach every stage the same way -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def good_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("good") / "scene"
+    ToyStreet(car_start=(12, 0), car_velocity=(3, 0), times=(0.0, 0.1, 0.2)).write(
+        root, labels=False, width=80, height=40
+    )
+    (root / store.MANIFEST).unlink()
+    return root
+
+
+def nan_in_poses(root: Path) -> None:
+    text = (root / "scene.json").read_text()
+    (root / "scene.json").write_text(text.replace('"world_from_cam": [0.0', '"world_from_cam": [NaN', 1))
+
+
+def bend_track(root: Path) -> None:
+    data = json.loads((root / "tracks.json").read_text())
+    data["tracks"][0]["world_from_object"][1][0] = 0.5
+    (root / "tracks.json").write_text(json.dumps(data))
+
+
+SCENES: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "missing image": ("missing", lambda r: (r / "images/front/000002.png").unlink()),
+    "truncated image": ("cannot be decoded", lambda r: cut(r / "images/front/000002.png")),
+    "truncated sweep": ("safetensors", lambda r: cut(r / "lidar/lidar/000002.safetensors")),
+    "missing sweep": ("missing", lambda r: (r / "lidar/lidar/000002.safetensors").unlink()),
+    "NaN pose": ("JSON", nan_in_poses),
+    "bent track": ("not a rigid motion", bend_track),
+    "index cut off": ("JSON", lambda r: cut(r / "scene.json")),
+    "sweep is an image": (
+        "safetensors",
+        lambda r: (r / "lidar/lidar/000002.safetensors").write_bytes((r / "images/front/000000.png").read_bytes()),
+    ),
+    "sweep without intensity": (
+        "no tensor 'intensity'",
+        lambda r: store.write_safetensors(r / "lidar/lidar/000002.safetensors", {"xyz": np.zeros((2, 3), np.float32)}),
+    ),
+    "sweep in double precision": (
+        "wrong form",
+        lambda r: store.write_safetensors(
+            r / "lidar/lidar/000002.safetensors",
+            {"xyz": np.zeros((2, 3)), "intensity": np.zeros(2), "dt_s": np.zeros(2)},
+        ),
+    ),
+    "sweep with NaN": (
+        "not finite",
+        lambda r: store.write_safetensors(
+            r / "lidar/lidar/000002.safetensors",
+            {
+                "xyz": np.full((2, 3), np.nan, np.float32),
+                "intensity": np.zeros(2, np.float32),
+                "dt_s": np.zeros(2, np.float32),
+            },
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SCENES)
+@pytest.mark.parametrize("verb", ["fuse", "annotate"])
+def test_broken_scene(case: str, verb: str, good_scene: Path, tmp_path: Path) -> None:
+    words, spoil = SCENES[case]
+    root = tmp_path / "scene"
+    shutil.copytree(good_scene, root)
+    spoil(root)
+    run = {
+        "fuse": lambda: fuse.run(FuseConfig(), root, tmp_path / "out"),
+        "annotate": lambda: annotate.run(AnnotateConfig(), root, tmp_path / "out"),
+    }
+    with pytest.raises(InputError) as caught:
+        run[verb]()
+    assert words in str(caught.value)
+    assert str(root) in caught.value.where
+    for finished in ("fuse.json", "scene.json", "manifest.json"):
+        assert not (tmp_path / "out" / finished).exists()
+    assert [f for f in check_scene(root) if f.level == "error"]
+
+
+def test_output_that_cannot_be_written(tmp_path: Path) -> None:
+    ToyStreet(times=(0.0,)).write(tmp_path / "scene")
+    (tmp_path / "file").write_text("in the way")
+    for act in (
+        lambda: fuse.run(FuseConfig(), tmp_path / "scene", tmp_path / "file" / "out"),
+        lambda: ingest.run(IngestConfig(), tmp_path / "scene", tmp_path / "file" / "out"),
+        lambda: annotate.run(AnnotateConfig(), tmp_path / "scene", tmp_path / "file" / "out"),
+    ):
+        with pytest.raises(MudgError) as caught:
+            act()
+        assert isinstance(caught.value, ResourceError | UsageError)
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_images_with_colour_maps_and_grey_are_read_as_rgb(tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    source = made.write_derived(tmp_path / "drive", made.Drive((0, 1)))
+    grey = made.image(0)[..., 1]
+    Image.fromarray(grey).save(source / "image_02/data/0000000000.png")
+    Image.fromarray(made.image(1)).convert("P", palette=Image.Palette.ADAPTIVE).save(
+        source / "image_02/data/0000000001.png"
+    )
+    scene = IMPORTERS["kitti"](source, tmp_path / "out", ImportOptions())
+    assert (read_image(scene, scene.frames[0]) == grey[..., None]).all()
+    assert read_image(scene, scene.frames[1]).shape == (made.HEIGHT, made.WIDTH, 3)

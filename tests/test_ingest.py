@@ -1,0 +1,130 @@
+"""The ingest stage: recognising logs, copying scenes, the city; reused, refused, continued."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import kitti_folders as made
+import numpy as np
+import pytest
+from toy_scene import ToyStreet
+
+from mudg import native
+from mudg.base import store
+from mudg.base.errors import InputError, UsageError
+from mudg.data.city import CityConfig
+from mudg.data.importers import IMPORTERS
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scene_schema import scene_to_json_text
+from mudg.data.scenefile import read_image, read_label, read_points, read_scene, write_zip
+from mudg.stages import ingest
+from mudg.stages.config import IngestConfig
+
+needs_native = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
+TINY_CITY = CityConfig(
+    seed=3, n_frames=6, width=48, height=32, cameras=("front",), lidar_beams=8, lidar_azimuth_step_deg=2
+)
+
+
+def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    scene = read_scene(ingest.run(IngestConfig(), str(drive), tmp_path / "out"))
+    direct = IMPORTERS["kitti"](drive, tmp_path / "direct", ImportOptions())
+    assert scene_to_json_text(scene) == scene_to_json_text(direct)
+    summary = store.read_json(tmp_path / "out" / "run.json")["summary"]
+    assert summary == {"frames": 6, "sweeps": 6, "tracks": 1, "held_out": 1}
+
+
+def test_flags_reach_the_importer(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    scene = read_scene(ingest.run(IngestConfig(frames="1:6", test_every=2, untwist="no"), drive, tmp_path / "out"))
+    assert len(scene.frames) == 5
+    assert sorted(i for i, s in scene.split.items() if s == "test") == ["front/000002", "front/000004"]
+    assert not read_points(scene, scene.sweeps[0]).dt_s.any()
+
+
+def test_unknown_folders_and_missing_ones_are_named(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"x")
+    with pytest.raises(InputError, match="not recognised") as caught:
+        ingest.run(IngestConfig(), str(tmp_path / "photos"), tmp_path / "out")
+    assert "a.jpg" in caught.value.got
+    with pytest.raises(InputError, match="does not exist"):
+        ingest.run(IngestConfig(), str(tmp_path / "nowhere"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "photos" / "image_02").mkdir()
+    with pytest.raises(InputError, match="no KITTI images"):
+        ingest.run(IngestConfig(format="kitti"), str(tmp_path / "photos"), tmp_path / "out")
+
+
+def test_finished_work_is_reused_and_other_settings_are_refused(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    out = ingest.run(IngestConfig(), drive, tmp_path / "out")
+    made_ns = (out / "scene.json").stat().st_mtime_ns
+    assert (
+        ingest.run(IngestConfig(city=CityConfig(seed=5)), drive, out) == out
+    )  # the city's settings do not matter here
+    assert (out / "scene.json").stat().st_mtime_ns == made_ns
+    with pytest.raises(UsageError, match="another configuration"):
+        ingest.run(IngestConfig(test_every=3), drive, out)
+    (drive / "tracklet_labels.xml").unlink()  # the log changed
+    with pytest.raises(UsageError, match="another configuration"):
+        ingest.run(IngestConfig(), drive, out)
+    assert len(read_scene(ingest.run(IngestConfig(), drive, out, overwrite=True)).tracks) == 0
+
+
+def test_a_failed_import_leaves_no_scene_and_a_repeat_finishes(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    scan = drive / "velodyne_points" / "data" / "0000000004.bin"
+    content = scan.read_bytes()
+    scan.write_bytes(content[:-5])
+    with pytest.raises(InputError, match="cut off"):
+        ingest.run(IngestConfig(), drive, tmp_path / "out")
+    assert not (tmp_path / "out" / "scene.json").exists()
+    assert not (tmp_path / "out" / "images").exists()
+    assert not list(tmp_path.glob(".out.*"))
+    scan.write_bytes(content)
+    assert len(read_scene(ingest.run(IngestConfig(), drive, tmp_path / "out", overwrite=True)).frames) == 6
+
+
+def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_again(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    out = ingest.run(IngestConfig(), drive, tmp_path / "out")
+    state = store.read_json(out / "run.json")
+    store.write_json(out / "run.json", {**state, "state": "running"})
+    made_ns = (out / "scene.json").stat().st_mtime_ns
+    ingest.run(IngestConfig(), drive, out)
+    assert store.read_json(out / "run.json")["state"] == "complete"
+    assert (out / "scene.json").stat().st_mtime_ns == made_ns
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) -> None:
+    scene = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene")
+    source = write_zip(tmp_path / "scene", tmp_path / "scene.zip") if packed else tmp_path / "scene"
+    copy = read_scene(ingest.run(IngestConfig(), source, tmp_path / "out"))
+    assert scene_to_json_text(copy) == scene_to_json_text(scene)
+    assert (copy.tracks[0].world_from_object == scene.tracks[0].world_from_object).all()
+    for frame in scene.frames:
+        assert (read_image(copy, frame) == read_image(scene, frame)).all()
+        for name in frame.labels:
+            assert np.array_equal(
+                read_label(copy, frame, name), read_label(scene, frame, name), equal_nan=name == "depth"
+            )
+    with pytest.raises(UsageError, match="taken as it is"):
+        ingest.run(IngestConfig(frames="0:2"), source, tmp_path / "out2")
+
+
+@needs_native
+def test_the_city_is_made_with_the_split_asked_for_and_always_the_same(tmp_path: Path) -> None:
+    config = IngestConfig(city=TINY_CITY, test_every=2)
+    one = read_scene(ingest.run(config, "city", tmp_path / "one"))
+    two = read_scene(ingest.run(config, "city", tmp_path / "two"))
+    assert one.source.recipe is not None
+    assert len(one.frames) == 6
+    assert [i for i, s in one.split.items() if s == "test"] == ["front/000002", "front/000004"]
+    assert set(one.frames[0].labels) >= {"depth", "semantics", "sky"}
+    listed = [store.read_json(Path(s.root) / "manifest.json")["files"] for s in (one, two)]
+    for name in listed[0]:
+        if not name.startswith("run."):
+            assert listed[0][name] == listed[1][name], name

@@ -1,0 +1,293 @@
+"""KITTI importer: every layout against folders written from an exact drive, and the real pieces against known answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import kitti_folders as made
+import numpy as np
+import pytest
+
+from mudg.base import geometry, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import invert
+from mudg.base.types import Scene, View
+from mudg.data.importers import IMPORTERS, kitti_boxes
+from mudg.data.importers.kitti_calib import read_calibration_day, read_calibration_text
+from mudg.data.importers.kitti_poses import read_timestamps
+from mudg.data.importers.options import ImportOptions, holdout_split, parse_frame_range
+from mudg.data.scenefile import read_image, read_points
+
+
+def ingest(source: Path, out: Path, **options: object) -> Scene:
+    return IMPORTERS["kitti"](source, out, ImportOptions(**options))  # type: ignore[arg-type]
+
+
+def worst(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.abs(np.asarray(a) - np.asarray(b)).max())
+
+
+# --- calibration ----------------------------------------------------------------------------------------------------
+
+
+def test_camera_projects_as_the_projection_matrix_does_with_pixel_centres_at_half(tmp_path: Path) -> None:
+    made.write_calibration_text(tmp_path / "calib.txt")
+    calibration = read_calibration_text(tmp_path / "calib.txt")
+    camera = calibration.camera(2, "front", made.WIDTH, made.HEIGHT)
+    view = View(camera, calibration.velo_from_cam(2), 0.0)
+    points = np.array([[10.0, 1, 0.5], [25, -4, -1], [6, 0, 0]])
+    uv, z = geometry.project(view, points)
+    rect0 = points @ made.RECT0_FROM_VELO[:3, :3].T + made.RECT0_FROM_VELO[:3, 3]
+    homogeneous = np.c_[rect0, np.ones(3)] @ made.projection(2).T
+    assert worst(uv - 0.5, homogeneous[:, :2] / homogeneous[:, 2:]) < 1e-9
+    assert worst(z, homogeneous[:, 2]) < 1e-9
+
+
+def test_day_calibration_equals_object_calibration(tmp_path: Path) -> None:
+    made.write_calibration_text(tmp_path / "calib.txt")
+    made.write_calibration_day(tmp_path / "day")
+    one, other = read_calibration_text(tmp_path / "calib.txt"), read_calibration_day(tmp_path / "day")
+    assert worst(one.rect0_from_velo, other.rect0_from_velo) < 1e-12
+    assert worst(one.velo_from_imu, other.velo_from_imu) < 1e-12
+    assert worst(one.velo_from_cam(3), other.velo_from_cam(3)) < 1e-12
+
+
+def test_rounded_rotation_becomes_exact_and_a_scaled_one_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "calib.txt"
+    made.write_calibration_text(path)
+    rounded = [f"{v:.4f}" for v in geometry.yaw_matrix(0.3)[:3, :3].ravel()]
+    text = path.read_text()
+    path.write_text(text.replace(made.numbers(np.eye(3)), " ".join(rounded)))
+    rotation = read_calibration_text(path).rect0_from_velo[:3, :3]
+    assert worst(rotation @ rotation.T, np.eye(3)) < 1e-14
+    path.write_text(text.replace(made.numbers(np.eye(3)), made.numbers(1.01 * np.eye(3))))
+    with pytest.raises(InputError, match="not a rotation"):
+        read_calibration_text(path)
+
+
+# --- raw drives -----------------------------------------------------------------------------------------------------
+
+
+def test_raw_drive_poses_images_times_and_calibration(tmp_path: Path) -> None:
+    scene = ingest(made.write_raw_drive(tmp_path / "2011_09_26"), tmp_path / "out")
+    assert [frame.id for frame in scene.frames] == [f"front/{n:06d}" for n in range(6)]
+    assert worst(scene.ego.world_from_ego, np.stack([made.world_from_imu(0.1 * n) for n in range(6)])) < 2e-5
+    assert worst([f.view.time_s for f in scene.frames], np.arange(6) * 0.1) < 1e-6
+    for n, (frame, sweep) in enumerate(zip(scene.frames, scene.sweeps, strict=True)):
+        velo = made.world_from_velo(0.1 * n)
+        cam_from_rect0 = geometry.from_rotation_translation(np.eye(3), [0.06, 0, 0.003])
+        assert worst(sweep.world_from_lidar, velo) < 2e-5
+        assert worst(frame.view.world_from_cam, velo @ invert(cam_from_rect0 @ made.RECT0_FROM_VELO)) < 2e-5
+        assert (read_image(scene, frame) == made.image(n)).all()
+    assert scene.split["front/000004"] == "test"
+    assert sorted(scene.split.values()).count("test") == 1
+    assert "CC BY-NC-SA" in scene.source.licence
+
+
+def test_raw_scans_are_untwisted_to_where_the_posts_are(tmp_path: Path) -> None:
+    drive = made.Drive()
+    folder = made.write_raw_drive(tmp_path / "day")
+    scene = ingest(folder, tmp_path / "out")
+    plain = ingest(folder, tmp_path / "plain", untwist="no")
+    for sweep, twisted in zip(scene.sweeps[1:-1], plain.sweeps[1:-1], strict=True):
+        points = read_points(scene, sweep)
+        world = geometry.transform_points(sweep.world_from_lidar, points.xyz.astype(np.float64))
+        error = np.linalg.norm(world - drive.posts, axis=1)
+        assert error.max() < 0.01
+        raw = geometry.transform_points(twisted.world_from_lidar, read_points(plain, twisted).xyz.astype(np.float64))
+        assert np.linalg.norm(raw - drive.posts, axis=1).max() > 0.3  # what is undone is not small
+        turn = np.arctan2(points.xyz[:, 1], points.xyz[:, 0]) / (2 * np.pi) * 0.1
+        behind = np.abs(turn) > 0.045  # the correction may carry a point across the seam
+        assert worst(points.dt_s[~behind], turn[~behind]) < 1e-3
+        assert not read_points(plain, twisted).dt_s.any()
+
+
+@pytest.mark.parametrize("twisted", [True, False])
+def test_tracklets_become_the_cars_exact_path(tmp_path: Path, twisted: bool) -> None:
+    folder = made.write_raw_drive(tmp_path / "day", twisted=twisted)
+    scene = ingest(folder, tmp_path / "out", untwist="yes" if twisted else "no")
+    (track,) = scene.tracks
+    assert track.label == "car"
+    assert track.size_m.tolist() == list(made.CAR_SIZE_M)
+    truth = np.stack([made.world_from_car(t) for t in track.times_s])
+    assert worst(track.world_from_object[:, :3, 3], truth[:, :3, 3]) < 5e-3
+    assert worst(track.world_from_object[:, :3, :3], truth[:, :3, :3]) < 5e-3
+
+
+def test_frame_range_keeps_places_and_says_which_frames(tmp_path: Path) -> None:
+    scene = ingest(made.write_raw_drive(tmp_path / "day"), tmp_path / "out", frames=(2, 5))
+    assert len(scene.frames) == 3
+    moved = invert(made.world_from_imu(0.2)) @ made.world_from_imu(0.4)
+    assert worst((invert(scene.ego.world_from_ego[0]) @ scene.ego.world_from_ego[2]), moved) < 2e-5
+    assert any("source frames 2 to 4" in note for note in scene.source.notes)
+
+
+def test_camera_times_outside_the_pose_packets_go_on_as_the_motion_did(tmp_path: Path) -> None:
+    folder = made.write_raw_drive(tmp_path / "day")
+    late = "\n".join(made.clock_line(0.1 * n + 0.03) for n in range(6)) + "\n"
+    (folder / "image_02" / "timestamps.txt").write_text(late)
+    scene = ingest(folder, tmp_path / "out")
+    last = scene.frames[-1].view
+    cam_from_rect0 = geometry.from_rotation_translation(np.eye(3), [0.06, 0, 0.003])
+    expected = made.world_from_velo(0.53) @ invert(cam_from_rect0 @ made.RECT0_FROM_VELO)
+    assert last.time_s == pytest.approx(0.53, abs=1e-6)
+    assert worst(last.world_from_cam, expected) < 3e-3
+
+
+def test_timestamps_keep_nanoseconds_across_a_minute(tmp_path: Path) -> None:
+    path = tmp_path / "timestamps.txt"
+    path.write_text("2011-09-26 13:02:59.964389445\n2011-09-26 13:03:00.067891234\n")
+    first, second = read_timestamps(path)
+    assert second - first == pytest.approx(0.103501789, abs=1e-6)
+
+
+# --- other layouts --------------------------------------------------------------------------------------------------
+
+
+def test_odometry_sequence(tmp_path: Path) -> None:
+    scene = ingest(made.write_odometry(tmp_path), tmp_path / "out")
+    truth = np.stack([invert(made.world_from_velo(0)) @ made.world_from_velo(0.1 * n) for n in range(6)])
+    assert worst(scene.ego.world_from_ego, truth) < 1e-9
+    assert worst([s.time_s for s in scene.sweeps], np.arange(6) * 0.1) < 1e-6
+    assert scene.tracks == ()
+    assert not read_points(scene, scene.sweeps[3]).dt_s.any()
+
+
+def test_derived_poses_and_tracking_labels_are_found_without_a_flag(tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    scene = ingest(made.write_derived(tmp_path / "drive"), tmp_path / "out")
+    first = invert(made.world_from_velo(0))
+    assert worst(scene.ego.world_from_ego[5], first @ made.world_from_velo(0.5)) < 1e-9
+    (track,) = scene.tracks
+    assert track.id == "7"
+    truth = np.stack([first @ made.world_from_car(t) for t in track.times_s])
+    assert worst(track.world_from_object, truth) < 1e-6
+    assert any("10 Hz" in note for note in scene.source.notes)
+
+
+def test_tracking_layout_needs_its_sequence_named(tmp_path: Path) -> None:
+    root = made.write_tracking(tmp_path / "training")
+    with pytest.raises(UsageError, match="several sequences") as caught:
+        ingest(root, tmp_path / "out")
+    assert "0003" in caught.value.expected
+    scene = ingest(root, tmp_path / "out", sequence="0003")
+    assert worst(scene.ego.world_from_ego[4], made.world_from_imu(0.4)) < 2e-5
+    truth = np.stack([made.world_from_car(t) for t in scene.tracks[0].times_s])
+    assert worst(scene.tracks[0].world_from_object, truth) < 1e-4
+
+
+def test_object_frame(tmp_path: Path) -> None:
+    root = made.write_object(tmp_path / "training")
+    scene = ingest(root, tmp_path / "out")
+    assert len(scene.frames) == len(scene.sweeps) == 1
+    assert worst(scene.ego.world_from_ego[0], np.eye(4)) == 0
+    (track,) = scene.tracks  # the DontCare row is no box
+    assert worst(track.world_from_object[0], invert(made.world_from_velo(0.8)) @ made.world_from_car(0.8)) < 1e-6
+    made.write_object(tmp_path / "many", frames=(3, 8))
+    with pytest.raises(UsageError, match="unrelated frames"):
+        ingest(tmp_path / "many", tmp_path / "out2")
+    assert len(ingest(tmp_path / "many", tmp_path / "out2", sequence="000008").frames) == 1
+
+
+def test_explicit_files_win_over_those_found(tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    root = made.write_derived(tmp_path / "drive")
+    still = tmp_path / "still.txt"
+    still.write_text("\n".join(f"{n} {made.numbers(np.eye(4)[:3])}" for n in range(6)) + "\n")
+    none = tmp_path / "none.txt"
+    none.write_text("")
+    scene = ingest(root, tmp_path / "out", poses=still, boxes=none)
+    assert worst(scene.ego.world_from_ego, np.stack([np.eye(4)] * 6)) == 0
+    assert scene.tracks == ()
+
+
+def test_track_with_a_gap_is_split_where_it_is_long(tmp_path: Path) -> None:
+    drive = made.Drive(tuple(range(14)))
+    (tmp_path / "drive").mkdir()
+    root = made.write_derived(tmp_path / "drive", drive)
+    rows = [made.label_line(0.1 * n, f"{n} 7 ") for n in drive.frames if n not in (2, 3, 6, 7, 8, 9, 10, 11)]
+    (root / "derived" / "label_02.txt").write_text("\n".join(rows) + "\n")
+    scene = ingest(root, tmp_path / "out")
+    spans = {
+        track.id: (round(float(track.times_s[0]), 3), round(float(track.times_s[-1]), 3)) for track in scene.tracks
+    }
+    assert spans == {"7": (0.0, 0.5), "7.1": (1.2, 1.3)}
+    short_gap = scene.track("7").pose_at(0.25)
+    assert worst(short_gap, invert(made.world_from_velo(0)) @ made.world_from_car(0.25)) < 1e-6
+    assert any("split into 2" in note for note in scene.source.notes)
+
+
+def test_holdout_split_takes_all_cameras_of_a_moment_and_never_the_first() -> None:
+    moments = [[f"{camera}/{n:06d}" for camera in ("front", "left")] for n in range(10)]
+    split = holdout_split(moments, 4)
+    assert {i for i, s in split.items() if s == "test"} == {
+        "front/000004",
+        "left/000004",
+        "front/000008",
+        "left/000008",
+    }
+    assert set(holdout_split(moments, 0).values()) == {"train"}
+
+
+def test_frame_range_words() -> None:
+    assert parse_frame_range("") is None
+    assert parse_frame_range("10:26") == (10, 26)
+    for wrong in ("5", "7:7", "9:2", "a:b", "-1:4"):
+        with pytest.raises(UsageError, match="frame range"):
+            parse_frame_range(wrong)
+
+
+# --- real pieces ----------------------------------------------------------------------------------------------------
+
+
+def test_real_sequence_imports_with_one_command(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    source = shared_data("kitti_2011_09_26")
+    scene = ingest(source, tmp_path / "out")
+    assert (len(scene.frames), len(scene.sweeps), len(scene.tracks)) == (16, 16, 8)
+    poses = np.loadtxt(source / "derived" / "poses_velo.txt")
+    assert worst(scene.ego.world_from_ego[:, :3].reshape(16, 12), poses[:, 1:]) < 1e-6
+    # the two pose files of the folder agree with each other once frames of reference are put right
+    other = ingest(source, tmp_path / "cam0", poses=source / "derived" / "poses_cam0.txt")
+    assert worst(other.ego.world_from_ego, scene.ego.world_from_ego) < 1e-6
+    # boxes against the same boxes given in the world
+    objects = store.read_json(source / "derived" / "tracks.json")["objects"]
+    for track in scene.tracks:
+        given = np.array([objects[track.id]["world_from_box"][str(n)] for n in range(16)]).reshape(16, 3, 4)
+        # labels turn about the camera's y axis, which leans by about 0.01 rad against the LiDAR's z axis
+        assert worst(track.world_from_object[:, :3, 3], given[:, :, 3]) < 0.025
+        assert worst(track.world_from_object[:, :3, :3], given[:, :, :3]) < 0.02
+
+
+def test_real_tracking_boxes_project_to_their_rectangles(shared_data: Callable[[str], Path]) -> None:
+    source = shared_data("kitti_tracking_0001")
+    calibration = read_calibration_text(source / "calib.txt")
+    camera = calibration.camera(2, "front", 1242, 375)
+    view = View(camera, calibration.velo_from_cam(2), 0.0)
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
+    differences = []
+    for box in kitti_boxes.read_label_text(source / "label_02.txt", calibration.rect0_from_velo):
+        assert box.box2d_px is not None
+        left, top, right, bottom = box.box2d_px
+        uncut = left > 1 and top > 1 and right < 1240 and bottom < 373
+        if box.frame not in (10, 20) or not uncut:
+            continue
+        corners = geometry.transform_points(box.sensor_from_box, signs * box.size_m)
+        uv = geometry.project(view, corners)[0] - 0.5  # KITTI counts from the pixel's centre
+        differences.append(np.abs(np.r_[uv.min(0), uv.max(0)] - [left, top, right, bottom]).max())
+    assert len(differences) >= 10
+    assert np.median(differences) < 0.35
+
+
+def test_real_object_frame_points_and_box_counts(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    source = shared_data("kitti_object_000008")
+    scene = ingest(source, tmp_path / "out")
+    points = read_points(scene, scene.sweeps[0]).xyz
+    assert len(points) == 17238
+    uv, z = geometry.project(scene.frames[0].view, points)
+    column, row = (uv - 0.5).T  # KITTI counts from the pixel's centre
+    assert int(((z > 0) & (column >= 0) & (row >= 0) & (column < 1241) & (row < 374)).sum()) == 17186
+    counts = [1325, 1900, 881, 659, 55, 162]
+    for track, expected in zip(scene.tracks, counts, strict=True):
+        local = geometry.transform_points(invert(track.world_from_object[0]), points)
+        assert (np.abs(local) <= track.size_m / 2).all(1).sum() == pytest.approx(expected, rel=0.08)

@@ -1,0 +1,512 @@
+"""Scene directories: what is written is what is read; nothing half-written, nothing outside, nothing silently wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from toy_scene import ToyStreet
+
+from mudg.base import store
+from mudg.base.errors import InputError, IntegrityError, MudgError
+from mudg.base.geometry import yaw_matrix
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
+from mudg.data.scene_files import open_files
+from mudg.data.scene_schema import ref_problem, scene_to_json_text
+from mudg.data.scenefile import SceneWriter, check_scene, read_image, read_label, read_points, read_scene, write_zip
+
+CAMERA = Camera("front", 32, 20, 30.0, 31.0, 16.0, 10.0, (0.1, -0.02), 0.005)
+
+
+def view_at(time_s: float, camera: Camera = CAMERA) -> View:
+    return View(camera, yaw_matrix(0.1 * time_s, (3 * time_s, 0.2, 1.5)), time_s)
+
+
+def random_image(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (20, 32, 3)).astype(np.uint8)
+
+
+def some_points(count: int = 7) -> SweepPoints:
+    rng = np.random.default_rng(count)
+    return SweepPoints(rng.normal(size=(count, 3)).astype(np.float32) * 10, rng.random(count).astype(np.float32),
+                       rng.uniform(-0.05, 0.05, count).astype(np.float32))  # fmt: skip
+
+
+def fill(writer: SceneWriter, frames: int = 3) -> None:
+    writer.add_camera(CAMERA)
+    for n in range(frames):
+        writer.add_frame(f"front/{n:06d}", view_at(0.1 * n), random_image(n))
+        writer.add_sweep(f"top/{n:06d}", "top", 0.1 * n, yaw_matrix(0.2 * n), some_points(5 + n))
+    writer.set_ego(EgoPath(np.array([0.0, 0.3]), np.stack([np.eye(4), yaw_matrix(0.1, (1, 2, 3))])))
+
+
+def small_scene(root: Path) -> Scene:
+    with SceneWriter(root, "small", Source("test", "none")) as writer:
+        fill(writer)
+        return writer.finish()
+
+
+# --- round trips ----------------------------------------------------------------------------------------------------
+
+
+def test_everything_comes_back_exactly(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    poses = np.stack([yaw_matrix(a, rng.normal(size=3) * 100) for a in rng.uniform(-3, 3, 4)])
+    track = Track("a/b c", "car", [4.1, 1.8, 1.5], [0.0, 0.1, 0.25, 0.3], poses)
+    source = Source("city", "CC0", {"seed": 3, "nested": {"x": [1, 2.5]}}, ("a note", "ünïcode"))
+    depth = rng.uniform(1, 90, (20, 32)).astype(np.float32)
+    depth[3, 4], depth[5, 6], depth[7, 8], depth[9, 1] = np.inf, np.nan, 0, -2
+    labels = {
+        "depth": depth,
+        "semantics": rng.choice([*range(19), 255], (20, 32)).astype(np.uint8),
+        "sky": rng.random((20, 32)) > 0.5,
+        "dynamic": rng.random((20, 32)) > 0.5,
+        "instance": rng.integers(0, 70000, (20, 32)).astype(np.int32),
+        "semantics_confidence": rng.random((20, 32)).astype(np.float32),
+    }
+    with SceneWriter(tmp_path / "scene", "round trip", source) as writer:
+        writer.add_camera(CAMERA)
+        writer.add_frame("front/000007", view_at(0.123456789012345), random_image(1), labels)
+        writer.add_sweep("top/000000", "top", 0.1, poses[0], some_points())
+        writer.add_track(track)
+        writer.set_ego(EgoPath(np.array([0.0, 1.0]), poses[:2]))
+        writer.set_split({"front/000007": "test"})
+        writer.finish()
+    scene = read_scene(tmp_path / "scene")
+    frame, sweep, read_track = scene.frames[0], scene.sweeps[0], scene.tracks[0]
+    assert scene.cameras["front"] == CAMERA == frame.view.camera
+    assert frame.view.time_s == 0.123456789012345
+    assert (frame.view.world_from_cam == view_at(0.123456789012345).world_from_cam).all()
+    assert (sweep.world_from_lidar == poses[0]).all()
+    assert (read_track.world_from_object == poses).all()
+    assert (read_track.id, read_track.label, read_track.size_m.tolist()) == ("a/b c", "car", [4.1, 1.8, 1.5])
+    assert (scene.ego.world_from_ego == poses[:2]).all()
+    assert dict(scene.split) == {"front/000007": "test"}
+    assert (scene.source.dataset, scene.source.licence, scene.source.notes) == ("city", "CC0", ("a note", "ünïcode"))
+    assert dict(scene.source.recipe or {}) == {"seed": 3, "nested": {"x": [1, 2.5]}}
+    assert (read_image(scene, frame) == random_image(1)).all()
+    points = read_points(scene, sweep)
+    for name in ("xyz", "intensity", "dt_s"):
+        assert (getattr(points, name) == getattr(some_points(), name)).all()
+    for name, array in labels.items():
+        found = read_label(scene, frame, name)
+        if name == "depth":
+            bad = ~(np.isfinite(array) & (array > 0))
+            assert (np.isnan(found) == bad).all()
+            assert bad.sum() == 4
+            found, array = found[~bad], array[~bad]
+        assert found.dtype == array.dtype
+        assert (found == array).all(), name
+
+
+def test_jpeg_option_and_ready_made_image_bytes(tmp_path: Path) -> None:
+    smooth = np.broadcast_to(np.arange(32, dtype=np.uint8)[None, :, None] * 7, (20, 32, 3)).copy()
+    with SceneWriter(tmp_path / "jpeg", "j", Source("t", "n"), jpeg_quality=92) as writer:
+        writer.add_camera(CAMERA)
+        writer.add_frame("front/000000", view_at(0), smooth)
+        writer.set_ego(EgoPath(np.zeros(1), np.eye(4)[None]))
+        jpeg = writer.finish()
+    assert jpeg.frames[0].image.path.endswith(".jpg")
+    assert np.abs(read_image(jpeg, jpeg.frames[0]).astype(int) - smooth).max() < 12
+    file = Path(jpeg.root) / jpeg.frames[0].image.path
+    with SceneWriter(tmp_path / "copy", "c", Source("t", "n")) as writer:
+        writer.add_camera(CAMERA)
+        writer.add_frame("front/000000", view_at(0), file)
+        writer.add_frame("front/000001", view_at(1), file.read_bytes())
+        writer.set_ego(EgoPath(np.zeros(1), np.eye(4)[None]))
+        copied = writer.finish()
+    for frame in copied.frames:
+        assert (Path(copied.root) / frame.image.path).read_bytes() == file.read_bytes()
+
+
+def test_zip_reads_like_the_folder_also_inside_one_folder(tmp_path: Path) -> None:
+    scene = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene")
+    packed = write_zip(tmp_path / "scene", tmp_path / "scene.zip")
+    with zipfile.ZipFile(tmp_path / "wrapped.zip", "w") as archive:
+        for file in sorted((tmp_path / "scene").rglob("*")):
+            if file.is_file():
+                archive.write(file, "my scene/" + file.relative_to(tmp_path / "scene").as_posix())
+    for path in (packed, tmp_path / "wrapped.zip"):
+        other = read_scene(path)
+        assert scene_to_json_text(other) == scene_to_json_text(scene)
+        assert (other.tracks[0].world_from_object == scene.tracks[0].world_from_object).all()
+        for frame in other.frames:
+            assert (read_image(other, frame) == read_image(scene, frame)).all()
+            assert (read_label(other, frame, "semantics") == read_label(scene, frame, "semantics")).all()
+        assert (read_points(other, other.sweeps[2]).xyz == read_points(scene, scene.sweeps[2]).xyz).all()
+    assert not [f for f in check_scene(packed) if f.level == "error"]
+
+
+def test_frames_come_in_time_order_whatever_the_order_of_writing(tmp_path: Path) -> None:
+    side = replace(CAMERA, name="side")
+    with SceneWriter(tmp_path / "s", "s", Source("t", "n")) as writer:
+        writer.add_camera(CAMERA)
+        writer.add_camera(side)
+        for camera in (side, CAMERA):
+            for n in (2, 0, 1):
+                writer.add_frame(f"{camera.name}/{n:06d}", view_at(0.1 * n, camera), random_image(n))
+        writer.set_ego(EgoPath(np.zeros(1), np.eye(4)[None]))
+        scene = writer.finish()
+    assert [f.id for f in scene.frames] == [f"{c}/{n:06d}" for n in range(3) for c in ("front", "side")]
+    assert set(scene.split.values()) == {"train"}
+
+
+def test_the_index_is_opened_once_and_again_after_a_change(tmp_path: Path) -> None:
+    small_scene(tmp_path / "scene")
+    first = open_files(tmp_path / "scene")
+    assert open_files(tmp_path / "scene") is first
+    index = tmp_path / "scene" / "scene.json"
+    os.utime(index, ns=(1, 1))
+    assert open_files(tmp_path / "scene") is not first
+
+
+# --- completely or not at all ---------------------------------------------------------------------------------------
+
+
+def test_a_failure_while_writing_leaves_nothing(tmp_path: Path) -> None:
+    def write(stop: bool) -> None:
+        with SceneWriter(tmp_path / "out" / "scene", "x", Source("t", "n")) as writer:
+            writer.add_camera(CAMERA)
+            writer.add_frame("front/000000", view_at(0), random_image(0))
+            if stop:
+                raise RuntimeError("stop")
+            writer.finish()
+
+    for error, words, stop in ((RuntimeError, "stop", True), (InputError, "ego path", False)):
+        with pytest.raises(error, match=words):
+            write(stop)
+        assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_what_a_killed_writer_left_is_cleared_and_a_live_one_is_not(tmp_path: Path) -> None:
+    dead = tmp_path / ".scene.999999999-1.part"
+    alive = tmp_path / f".scene.{os.getppid()}-1.part"
+    for folder in (dead, alive):
+        (folder / "images").mkdir(parents=True)
+    small_scene(tmp_path / "scene")
+    assert not dead.exists()
+    assert alive.exists()
+
+
+def test_bookkeeping_in_the_destination_stays_and_a_scene_there_is_refused(tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    (root / "images").mkdir(parents=True)  # half a move of an earlier, killed finish
+    (root / "run.json").write_text("{}")
+    scene = small_scene(root)
+    assert (root / "run.json").read_text() == "{}"
+    assert len(read_scene(root).frames) == 3
+    with pytest.raises(InputError, match="scene here already"):
+        SceneWriter(root, "x", Source("t", "n"))
+    assert (read_image(scene, scene.frames[0]) == random_image(0)).all()
+
+
+def test_every_byte_is_covered_by_the_manifest(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path / "scene")
+    store.verify_manifest(tmp_path / "scene")
+    listed = set(store.read_json(tmp_path / "scene" / "manifest.json")["files"])
+    assert listed == {
+        p.relative_to(tmp_path / "scene").as_posix() for p in (tmp_path / "scene").rglob("*") if p.is_file()
+    } - {"manifest.json"}
+    file = tmp_path / "scene" / scene.sweeps[1].points.path
+    content = bytearray(file.read_bytes())
+    content[-3] ^= 4  # one bit of one coordinate: still a perfectly readable file
+    file.write_bytes(content)
+    with pytest.raises(IntegrityError, match="differs from what was written"):
+        read_points(scene, scene.sweeps[1])
+    (tmp_path / "scene" / "manifest.json").unlink()
+    assert len(read_points(read_scene(tmp_path / "scene"), scene.sweeps[1]).xyz) == 6
+
+
+# --- the writer refuses ---------------------------------------------------------------------------------------------
+
+
+def bad_frames() -> dict[str, tuple[str, Callable[[SceneWriter], None]]]:
+    nan_pose = np.eye(4)
+    nan_pose[0, 3] = np.nan
+    image = random_image(0)
+    return {
+        "unknown camera": (
+            "not added",
+            lambda w: w.add_frame("side/000000", view_at(0, replace(CAMERA, name="side")), image),
+        ),
+        "changed camera": (
+            "not added",
+            lambda w: w.add_frame("front/000009", view_at(0, replace(CAMERA, fx=50.0)), image),
+        ),
+        "id of another camera": ("does not fit", lambda w: w.add_frame("side/000001", view_at(0), image)),
+        "id that climbs": ("does not fit", lambda w: w.add_frame("front/../../x", view_at(0), image)),
+        "twice": ("added twice", lambda w: w.add_frame("front/000000", view_at(9), image)),
+        "float image": ("wrong form", lambda w: w.add_frame("front/000009", view_at(9), image / 255)),
+        "small image": ("wrong form", lambda w: w.add_frame("front/000009", view_at(9), image[:10])),
+        "not an image": ("not a PNG or JPEG", lambda w: w.add_frame("front/000009", view_at(9), b"hello")),
+        "label size": ("camera's size", lambda w: w.add_label("front/000000", "sky", np.zeros((3, 3)))),
+        "label name": ("no such label", lambda w: w.add_label("front/000000", "skies", np.zeros((20, 32)))),
+        "label of no frame": ("not added", lambda w: w.add_label("front/000077", "sky", np.zeros((20, 32)))),
+        "class 19": ("no train id", lambda w: w.add_label("front/000000", "semantics", np.full((20, 32), 19))),
+        "confidence 2": (
+            "outside 0..1",
+            lambda w: w.add_label("front/000000", "depth_confidence", np.full((20, 32), 2.0)),
+        ),
+        "NaN sweep pose": ("rigid", lambda w: w.add_sweep("top/000009", "top", 9.0, nan_pose, some_points())),
+        "scaled sweep pose": (
+            "rigid",
+            lambda w: w.add_sweep("top/000009", "top", 9.0, np.diag([2.0, 2, 2, 1]), some_points()),
+        ),
+        "NaN point": ("not finite", lambda w: w.add_sweep("top/000009", "top", 9.0, np.eye(4), nan_points())),
+        "camera name": ("folder name", lambda w: w.add_camera(replace(CAMERA, name="../x"))),
+        "focal length": ("focal length", lambda w: w.add_camera(replace(CAMERA, name="b", fx=1e-4))),
+    }
+
+
+def nan_points() -> SweepPoints:
+    points = some_points()
+    points.xyz[2, 1] = np.nan
+    return points
+
+
+@pytest.mark.parametrize("case", bad_frames())
+def test_writer_refuses(case: str, tmp_path: Path) -> None:
+    words, act = bad_frames()[case]
+    with SceneWriter(tmp_path / "s", "s", Source("t", "n")) as writer:
+        fill(writer)
+        with pytest.raises(InputError, match=words):
+            act(writer)
+        if case not in ("twice",):
+            assert len(writer.finish().frames) == 3  # the refusal did not spoil what was there
+
+
+def test_times_must_increase_per_camera(tmp_path: Path) -> None:
+    with SceneWriter(tmp_path / "s", "s", Source("t", "n")) as writer:
+        fill(writer)
+        writer.add_frame("front/000009", view_at(0.1), random_image(0))
+        with pytest.raises(InputError, match="do not increase"):
+            writer.finish()
+
+
+# --- the reader refuses ---------------------------------------------------------------------------------------------
+
+
+def edited(root: Path, change: Callable[[dict[str, Any]], object], name: str = "scene.json") -> Path:
+    """A scene whose index was edited by hand (and whose manifest was therefore removed)."""
+    small_scene(root)
+    (root / "manifest.json").unlink()
+    data = json.loads((root / name).read_text())
+    change(data)
+    (root / name).write_text(json.dumps(data))
+    return root
+
+
+IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]
+EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
+    "version": ("schema version", "schema_version", lambda d: d.update(schema_version=99)),
+    "format": ("not a mudg-scene", "scene.json", lambda d: d.update(format="other")),
+    "typo": ("unknown field", "frames[1]", lambda d: d["frames"][1].update(world_from_camera=IDENTITY)),
+    "missing field": ("missing", "frames[0]", lambda d: d["frames"][0].pop("image")),
+    "mirrored pose": (
+        "rigid",
+        "frames[0].world_from_cam",
+        lambda d: d["frames"][0].update(world_from_cam=[-1.0, *IDENTITY[1:]]),
+    ),
+    "scaled pose": (
+        "rigid",
+        "sweeps[2].world_from_lidar",
+        lambda d: d["sweeps"][2].update(world_from_lidar=[1.1, *IDENTITY[1:]]),
+    ),
+    "short pose": ("3x4", "frames[2].world_from_cam", lambda d: d["frames"][2].update(world_from_cam=IDENTITY[:11])),
+    "text in pose": (
+        "not a number",
+        "world_from_cam[3]",
+        lambda d: d["frames"][2]["world_from_cam"].__setitem__(3, "x"),
+    ),
+    "huge number": ("not finite", "time_s", lambda d: d["frames"][2].update(time_s=10**400)),
+    "true as number": ("not a number", "time_s", lambda d: d["frames"][2].update(time_s=True)),
+    "zero focal length": ("focal length", "cameras.front.fx", lambda d: d["cameras"]["front"].update(fx=0)),
+    "focal length in mm": ("focal length", "cameras.front.fy", lambda d: d["cameras"]["front"].update(fy=0.004)),
+    "principal point": ("principal point", "cameras.front.cx", lambda d: d["cameras"]["front"].update(cx=9000)),
+    "width": ("image size", "cameras.front.width", lambda d: d["cameras"]["front"].update(width=0)),
+    "unknown camera": ("does not have", "frames[0].camera", lambda d: d["frames"][0].update(camera="rear")),
+    "no frames": ("no frames", "frames", lambda d: d.update(frames=[], split={})),
+    "no cameras": ("no cameras", "cameras", lambda d: d.update(cameras={}, frames=[])),
+    "double id": ("twice", "frames", lambda d: d["frames"][1].update(id="front/000000")),
+    "unsorted": ("do not increase", "frames of camera front", lambda d: d["frames"].reverse()),
+    "split": ("does not have", "split", lambda d: d["split"].update({"front/000099": "test"})),
+    "split word": ("train and test", "split", lambda d: d["split"].update({"front/000000": "val"})),
+    "missing file": (
+        "missing",
+        "frame front/000001 image",
+        lambda d: d["frames"][1].update(image="images/front/777.png"),
+    ),
+    "shared file": ("same file", "front/000001", lambda d: d["frames"][1].update(image="images/front/000000.png")),
+    "climbing ref": ("'..'", "frames[1].image", lambda d: d["frames"][1].update(image="../../etc/passwd")),
+    "absolute ref": ("absolute", "frames[1].image", lambda d: d["frames"][1].update(image="/etc/passwd")),
+    "drive letter": ("colon", "frames[1].image", lambda d: d["frames"][1].update(image="C:/x.png")),
+    "backslash": ("backslash", "frames[1].image", lambda d: d["frames"][1].update(image="images\\front\\000001.png")),
+    "control character": ("control", "frames[1].image", lambda d: d["frames"][1].update(image="images/a\u0000.png")),
+    "label name": ("unknown field", "labels", lambda d: d["frames"][1].update(labels={"skyy": "a"})),
+    "ego": ("pair up", "ego", lambda d: d["ego"]["times_s"].pop()),
+    "ego order": ("do not increase", "ego", lambda d: d["ego"]["times_s"].reverse()),
+    "notes": ("list of texts", "source.notes", lambda d: d["source"].update(notes=[1])),
+}
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_reader_refuses_in_words(case: str, tmp_path: Path) -> None:
+    words, where, change = EDITS[case]
+    root = edited(tmp_path / "scene", change)
+    with pytest.raises(InputError) as caught:
+        read_scene(root)
+    assert words in str(caught.value)
+    assert where in caught.value.where
+    assert [f for f in check_scene(root) if f.level == "error" and where in f.where and words in f.words]
+
+
+def test_a_scene_needs_no_manifest_sweeps_tracks_or_split(tmp_path: Path) -> None:
+    root = edited(tmp_path / "scene", lambda d: [d.pop(key) for key in ("sweeps", "split", "conventions")])
+    (root / "tracks.json").unlink()
+    scene = read_scene(root)
+    assert scene.sweeps == scene.tracks == ()
+    assert set(scene.split.values()) == {"train"}
+
+
+def test_poses_may_be_given_as_rows(tmp_path: Path) -> None:
+    rows = yaw_matrix(0.3, (1, 2, 3)).tolist()
+    root = edited(tmp_path / "scene", lambda d: d["frames"][0].update(world_from_cam=rows))
+    assert (read_scene(root).frames[0].view.world_from_cam == np.array(rows)).all()
+
+
+def test_json_must_be_strict(tmp_path: Path) -> None:
+    root = edited(tmp_path / "scene", lambda d: None)
+    good = (root / "scene.json").read_text()
+    for text, words in ((good[: len(good) // 2], "JSON"), (good.replace("0.1", "NaN", 1), "NaN"), ("[]", "not an object"),
+                        (good.replace('"id"', '"id": "x", "id"', 1), "twice"), ("", "JSON")):  # fmt: skip
+        (root / "scene.json").write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_scene(root)
+
+
+def test_a_link_out_of_the_scene_is_refused(tmp_path: Path) -> None:
+    root = edited(tmp_path / "scene", lambda d: None)
+    secret = tmp_path / "secret.png"
+    secret.write_bytes((root / "images/front/000001.png").read_bytes())
+    (root / "images/front/000001.png").unlink()
+    (root / "images/front/000001.png").symlink_to(secret)
+    with pytest.raises(InputError, match="leads out"):
+        read_scene(root)
+    (root / "images/front/000001.png").unlink()
+    (root / "images/front/000001.png").symlink_to(root / "images/front/000002.png")  # inside is fine
+    assert len(read_scene(root).frames) == 3
+
+
+@given(st.text(max_size=30) | st.lists(st.sampled_from(["a", "..", ".", "", "b c", "C:", "x.png", "\\"])).map("/".join))
+def test_accepted_references_stay_inside(text: str) -> None:
+    if ref_problem(text) is None:
+        parts = PurePosixPath(text).parts
+        assert parts
+        assert not any(part in ("..", "/", ".") for part in parts)
+        assert os.path.normpath(os.path.join("/root/scene", text)).startswith("/root/scene/")
+
+
+def test_zip_tricks_are_refused(tmp_path: Path) -> None:
+    small_scene(tmp_path / "scene")
+    good = write_zip(tmp_path / "scene", tmp_path / "good.zip")
+
+    def repacked(name: str, edit: Callable[[zipfile.ZipFile], None], compression: int = zipfile.ZIP_STORED) -> Path:
+        path = tmp_path / name
+        with zipfile.ZipFile(good) as old, zipfile.ZipFile(path, "w", compression) as new:
+            for info in old.infolist():
+                new.writestr(info.filename, old.read(info))
+            edit(new)
+        return path
+
+    cases = {
+        "compressed": repacked("deflated.zip", lambda z: None, zipfile.ZIP_DEFLATED),
+        "'..'": repacked("climb.zip", lambda z: z.writestr("../evil.png", b"x")),
+        "absolute": repacked("absolute.zip", lambda z: z.writestr("/evil.png", b"x")),
+        "no scene.json": tmp_path / "empty.zip",
+    }
+    with zipfile.ZipFile(cases["no scene.json"], "w") as archive:
+        archive.writestr("readme.txt", "x")
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        cases["twice"] = repacked("double.zip", lambda z: z.writestr("scene.json", b"{}"))
+    for words, path in cases.items():
+        with pytest.raises(InputError, match=words):
+            read_scene(path)
+    content = good.read_bytes()
+    (tmp_path / "cut.zip").write_bytes(content[: len(content) - 40])
+    with pytest.raises(InputError, match="readable zip"):
+        read_scene(tmp_path / "cut.zip")
+    scene = read_scene(good)
+    at = content.index((tmp_path / "scene" / "images/front/000001.png").read_bytes()) + 60
+    (tmp_path / "flip.zip").write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    flipped = read_scene(tmp_path / "flip.zip")
+    with pytest.raises(MudgError, match="damaged"):
+        read_image(flipped, flipped.frames[1])
+    assert (read_image(flipped, flipped.frames[0]) == read_image(scene, scene.frames[0])).all()
+
+
+def test_not_a_scene(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_scene(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="not a scene"):
+        read_scene(tmp_path)
+    (tmp_path / "a.zip").write_bytes(b"PK nothing")
+    with pytest.raises(InputError, match="readable zip"):
+        read_scene(tmp_path / "a.zip")
+
+
+# --- doctor ---------------------------------------------------------------------------------------------------------
+
+
+def test_check_finds_nothing_wrong_with_a_good_scene(tmp_path: Path) -> None:
+    ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene")
+    assert check_scene(tmp_path / "scene") == []
+
+
+def test_check_lists_all_errors_at_once_worst_first(tmp_path: Path) -> None:
+    def spoil(data: dict[str, Any]) -> None:
+        data["frames"][0]["world_from_cam"][0] = 5
+        data["frames"][2]["image"] = "images/front/none.png"
+        data["sweeps"][1]["time_s"] = "noon"
+
+    root = edited(tmp_path / "scene", spoil)
+    (root / "lidar/top/000002.safetensors").write_bytes(b"short")
+    findings = check_scene(root)
+    errors = [f for f in findings if f.level == "error"]
+    assert [f.level for f in findings] == sorted((f.level for f in findings), key=["error", "warning", "note"].index)
+    for where in ("frames[0].world_from_cam", "front/000002", "sweeps[1].time_s", "top/000002"):
+        assert any(where in f.where or where in f.words for f in errors), where
+
+
+def test_check_names_what_is_odd(tmp_path: Path) -> None:
+    with SceneWriter(tmp_path / "s", "s", Source("t", "n")) as writer:
+        writer.add_camera(CAMERA)
+        for n in range(3):
+            tilted = View(
+                CAMERA, yaw_matrix(0, (40.0 * n, 0, 0)), 0.1 * n
+            )  # z forward of the camera is up: not a street
+            writer.add_frame(f"front/{n:06d}", tilted, np.full((20, 32, 3), 7, np.uint8))
+        behind = SweepPoints(
+            np.tile(np.float32([[0, 0, -9]]), (4, 1)), np.full(4, 90, np.float32), np.zeros(4, np.float32)
+        )
+        writer.add_sweep("top/000000", "top", 0.0, np.eye(4), behind)
+        writer.add_sweep("top/000001", "top", 0.1, np.eye(4), some_points(0))
+        poses = np.stack([yaw_matrix(0, (0, 0, 0)), yaw_matrix(0, (900.0, 0, 0))])
+        writer.add_track(Track("1", "car", [1.8, 4.5, 1.5], [0.0, 5.0], poses))
+        writer.add_track(Track("2", "car", [4.5, 1.8, 1.5], [70.0, 71.0], np.stack([np.eye(4)] * 2)))
+        writer.set_ego(EgoPath(np.array([0.0, 0.1]), np.stack([np.eye(4), yaw_matrix(0, (50, 0, 0))])))
+        writer.finish()
+    findings = check_scene(tmp_path / "s")
+    assert not [f for f in findings if f.level == "error"]
+    for words in ("moves at 400 m/s", "down direction", "vehicle moves at 500 m/s", "width and length swapped", "moves at 180 m/s",
+                  "not seen for 5.0 s", "lie outside the time", "no points", "intensity reaches 90", "none of its points falls",
+                  "one flat colour", "no sweep within", "no frame is held out"):  # fmt: skip
+        assert any(words in f.words for f in findings), words
