@@ -1,0 +1,190 @@
+"""Every loss of the scene fit, as pure functions: maps where they are maps, scalars where a sum is part of the idea.
+
+All work in float32 and float64 and are differentiable in the prediction. Masks are boolean and never change the shape of
+the work. Published form: Street Gaussians (recorded views) and the supervision of MuDG's scene stage (virtual views).
+
+    recorded:  (1 - w) L1 + w (1 - SSIM)  +  trimmed LiDAR depth  +  sky  +  semantics
+    virtual:   perceptual + robust dense depth + semantics, every pixel weighted by the observation's confidence
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Final
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mudg.base.errors import InputError
+from mudg.base.palette import UNLABELLED
+
+SSIM_WINDOW: Final = 11
+SSIM_SIGMA_PX: Final = 1.5
+SSIM_C1: Final = 0.01**2
+SSIM_C2: Final = 0.03**2
+
+
+def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Sum of ``values * weight`` over sum of ``weight`` (broadcast); zero, still differentiable, where nothing weighs."""
+    weight = weight.to(values.dtype).expand_as(values)
+    return (values * weight).sum() / weight.sum().clamp_min(1e-12)
+
+
+# ---- colour ------------------------------------------------------------------------------------------------------
+
+
+def l1_map(prediction: Tensor, target: Tensor) -> Tensor:
+    """Absolute difference, same shape as the inputs."""
+    _same_shape(prediction, target, "l1_map")
+    return (prediction - target).abs()
+
+
+@functools.lru_cache(maxsize=8)
+def _window(channels: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-(offset**2) / (2 * SSIM_SIGMA_PX**2))
+    weights = (weights / weights.sum()).to(dtype)
+    return (
+        weights.view(1, 1, 1, -1).expand(channels, 1, 1, SSIM_WINDOW).contiguous(),
+        weights.view(1, 1, -1, 1).expand(channels, 1, SSIM_WINDOW, 1).contiguous(),
+    )
+
+
+def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity at every pixel and channel (Wang et al. 2004), ``[C, H, W]`` in, ``[C, H, W]`` out, <= 1.
+
+    11x11 Gaussian window with sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2, for values in [0, 1].
+    """
+    _same_shape(prediction, target, "ssim_map")
+    channels = prediction.shape[0]
+    row, column = _window(5 * channels, prediction.dtype)
+    stack = torch.cat([prediction, target, prediction**2, target**2, prediction * target])[None]
+    half = SSIM_WINDOW // 2
+    blurred = F.conv2d(F.conv2d(stack, row, padding=(0, half), groups=5 * channels), column, padding=(half, 0), groups=5 * channels)
+    mean_p, mean_t, square_p, square_t, product = blurred[0].split(channels)
+    variance_p, variance_t = square_p - mean_p**2, square_t - mean_t**2
+    covariance = product - mean_p * mean_t
+    luminance = (2 * mean_p * mean_t + SSIM_C1) / (mean_p**2 + mean_t**2 + SSIM_C1)
+    return luminance * (2 * covariance + SSIM_C2) / (variance_p + variance_t + SSIM_C2)
+
+
+def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
+
+    ``core.fused.photometric`` computes the same value and gradient in one native pass.
+    """
+    return (1 - ssim_weight) * l1_map(prediction, target).mean() + ssim_weight * (1 - ssim_map(prediction, target).mean())
+
+
+def outside_mask_copied(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """The prediction with the target copied in where ``mask`` (bool ``[1, H, W]``) is False.
+
+    Image losses then see no difference there and pass no gradient, while their windows stay full.
+    """
+    return prediction if mask is None else torch.where(mask, prediction, target)
+
+
+# ---- depth -------------------------------------------------------------------------------------------------------
+
+
+def trimmed_mean(values: Tensor, keep: float) -> Tensor:
+    """Mean of the smallest ``keep`` share of a flat tensor; zero for an empty one.
+
+    Outliers are the point of trimming: a LiDAR return seen through a window, or past an edge, must not pull the surface.
+    """
+    if values.numel() == 0:
+        return values.sum()
+    count = max(1, math.floor(keep * values.numel()))
+    if count == values.numel():
+        return values.mean()
+    return torch.topk(values, count, largest=False, sorted=False).values.mean()
+
+
+def sparse_depth(depth_m: Tensor, pixel: Tensor, target_m: Tensor, keep: float = 0.95) -> Tensor:
+    """Trimmed mean of |depth - target| / target over sparse LiDAR pixels (relative, so that near and far weigh alike).
+
+    Args:
+        depth_m: expected depth ``[1, H, W]``, metres.
+        pixel: i64[M], flat pixel index ``row * W + column`` of each measurement.
+        target_m: ``[M]`` metres, positive.
+        keep: share of the smallest errors that count (Street Gaussians: 0.95).
+    """
+    at = depth_m.reshape(-1)[pixel]
+    return trimmed_mean((at - target_m).abs() / target_m, keep)
+
+
+def dense_depth_map(depth_m: Tensor, target_m: Tensor, delta: float = 0.1) -> Tensor:
+    """Robust loss of log depth at every pixel: Huber on ``log depth - log target``, linear beyond ``delta``.
+
+    A generated depth map errs in proportion to distance and has gross outliers at edges; both inputs in metres,
+    ``[1, H, W]``, positive (clamped to 0.1 m). Huber is divided by ``delta``, so that far from zero it is |log ratio|.
+    """
+    _same_shape(depth_m, target_m, "dense_depth_map")
+    difference = torch.log(depth_m.clamp_min(0.1)) - torch.log(target_m.clamp_min(0.1))
+    return F.huber_loss(difference, torch.zeros_like(difference), reduction="none", delta=delta) / delta
+
+
+# ---- sky, semantics, objects -------------------------------------------------------------------------------------
+
+
+def sky_map(alpha: Tensor, sky: Tensor, floor: float = 1e-3) -> Tensor:
+    """Binary cross-entropy of opacity against the sky mask at every pixel (Street Gaussians, lambda 0.05).
+
+    ``-log(1 - alpha)`` where ``sky`` (bool), ``-log(alpha)`` elsewhere; ``alpha`` ``[1, H, W]`` in [0, 1] is kept
+    ``floor`` away from 0 and 1, so the loss and its gradient stay bounded.
+    """
+    _same_shape(alpha, sky, "sky_map")
+    opaque = alpha.clamp(floor, 1 - floor)
+    return -torch.log(torch.where(sky, 1 - opaque, opaque))
+
+
+def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
+    """Cross-entropy at every pixel; unlabelled pixels (255) give 0.
+
+    Args:
+        logits: ``[C, H, W]``.
+        target: i64[H, W] in 0..C-1 or 255.
+
+    Returns:
+        ``[H, W]``.
+    """
+    if logits.shape[1:] != target.shape:
+        raise InputError("semantic loss: sizes differ", expected=str(tuple(logits.shape[1:])), got=str(tuple(target.shape)))
+    return F.cross_entropy(logits[None], target[None], ignore_index=UNLABELLED, reduction="none")[0]
+
+
+def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) -> Tensor:
+    """Regulariser of an objects-only render (Street Gaussians, lambda 0.1, after densification).
+
+    Entropy of the opacity inside the projected boxes (be there or not, but decide), ``-log(1 - alpha)`` outside (objects
+    leave no haze outside their boxes). ``[1, H, W]`` each; ``inside_boxes`` bool.
+    """
+    _same_shape(object_alpha, inside_boxes, "object_map")
+    alpha = object_alpha.clamp(floor, 1 - floor)
+    entropy = -(alpha * torch.log(alpha) + (1 - alpha) * torch.log(1 - alpha))
+    return torch.where(inside_boxes, entropy, -torch.log(1 - alpha))
+
+
+# ---- features ----------------------------------------------------------------------------------------------------
+
+
+def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Tensor) -> Tensor:
+    """Weighted mean absolute difference of feature maps, averaged over the scales.
+
+    Args:
+        prediction, target: per scale ``[C_s, H_s, W_s]``.
+        weight: ``[1, H, W]`` in [0, 1] at full size; averaged down to each scale.
+    """
+    total = prediction[0].new_zeros(())
+    for mine, theirs in zip(prediction, target):
+        _same_shape(mine, theirs, "feature_distance")
+        scale_weight = F.adaptive_avg_pool2d(weight.to(mine.dtype), mine.shape[-2:])
+        total = total + weighted_mean((mine - theirs).abs(), scale_weight)
+    return total / len(prediction)
+
+
+def _same_shape(a: Tensor, b: Tensor, what: str) -> None:
+    if a.shape != b.shape:
+        raise InputError(f"{what}: shapes differ", expected=str(tuple(a.shape)), got=str(tuple(b.shape)))

@@ -1,0 +1,279 @@
+"""Image, depth and semantic metrics, each as a small accumulator over a whole trajectory.
+
+A metric takes a predicted and a true observation and adds what it needs to its sums; ``value()`` is asked once at the end.
+What a method did not produce stays None ("not produced"); what needs weights that are not there is listed in ``METRICS``
+with ``build=None`` ("not computed"). Nothing is ever reported as zero for want of data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal, Protocol
+
+import torch
+from torch import Tensor
+
+from mudg.base.errors import InputError
+from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.core.losses import ssim_map
+
+CLASS_COUNT: Final = len(CLASSES)
+
+
+def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB for values in [0, 1].
+
+    Args:
+        prediction, truth: ``[C, H, W]``; the prediction is clamped to [0, 1].
+        mask: bool ``[1, H, W]``: pixels that count (default all).
+
+    Returns:
+        dB from the mean squared error over all counted values; infinity for equal images, NaN when nothing counts.
+    """
+    squared = (prediction.clamp(0, 1) - truth).double() ** 2
+    if mask is not None:
+        squared = squared[mask.expand_as(squared)]
+    if squared.numel() == 0:
+        return math.nan
+    error = float(squared.mean())
+    return math.inf if error == 0 else -10.0 * math.log10(error)
+
+
+def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+    """Structural similarity (Wang 2004: 11x11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2), zero padding.
+
+    ``[C, H, W]`` in [0, 1]; mean over channels and over the pixels in ``mask`` (bool ``[1, H, W]``). NaN if none.
+    """
+    values = ssim_map(prediction.clamp(0, 1), truth)
+    if mask is not None:
+        values = values[mask.expand_as(values)]
+    return float(values.double().mean()) if values.numel() else math.nan
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Depth errors over the pixels that count: mean |d-t|/t, root mean square error in metres, share within 1.25x."""
+
+    abs_rel: float
+    rmse_m: float
+    delta1: float
+    pixels: int
+
+
+def depth_errors(prediction_m: Tensor, truth_m: Tensor, mask: Tensor) -> DepthErrors:
+    """Compare depth maps (camera z, metres) where ``mask`` is set and the truth is positive and finite.
+
+    Args:
+        prediction_m, truth_m: ``[1, H, W]``. mask: bool ``[1, H, W]``.
+
+    Raises:
+        InputError: a counted prediction is not finite.
+    """
+    counted = mask & torch.isfinite(truth_m) & (truth_m > 0)
+    predicted, true = prediction_m[counted].double(), truth_m[counted].double()
+    if predicted.numel() == 0:
+        return DepthErrors(math.nan, math.nan, math.nan, 0)
+    if not torch.isfinite(predicted).all():
+        raise InputError("a predicted depth is not finite where truth exists", expected="finite metres")
+    error = (predicted - true).abs()
+    ratio = torch.maximum(predicted.clamp_min(1e-6) / true, true / predicted.clamp_min(1e-6))
+    return DepthErrors(
+        float((error / true).mean()), float((error**2).mean().sqrt()), float((ratio < 1.25).double().mean()),
+        int(predicted.numel()),
+    )  # fmt: skip
+
+
+def confusion(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Confusion counts i64[19, 19] (row = truth, column = prediction).
+
+    Args:
+        prediction, truth: class ids, integers ``[H, W]``; truth 255 is not counted, a prediction outside 0..18 counts
+            as wrong (it enters no column: see ``iou_of``).
+        mask: bool broadcastable to ``[H, W]``.
+
+    Returns:
+        i64[19, 20]: the last column counts predictions outside the 19 classes.
+    """
+    true, predicted = truth.long(), prediction.long()
+    counted = (true >= 0) & (true < CLASS_COUNT)
+    if mask is not None:
+        counted = counted & mask.reshape(counted.shape)
+    predicted = torch.where((predicted >= 0) & (predicted < CLASS_COUNT), predicted, CLASS_COUNT)
+    index = true[counted] * (CLASS_COUNT + 1) + predicted[counted]
+    counts = torch.bincount(index, minlength=CLASS_COUNT * (CLASS_COUNT + 1))
+    return counts.reshape(CLASS_COUNT, CLASS_COUNT + 1)
+
+
+def iou_of(counts: Tensor) -> dict[str, float]:
+    """Intersection over union per class that occurs in the truth, from pooled confusion counts i64[19, 20]."""
+    hit = counts[:, :CLASS_COUNT].diagonal().double()
+    true, predicted = counts.sum(1).double(), counts[:, :CLASS_COUNT].sum(0).double()
+    union = true + predicted - hit
+    return {CLASSES[i]: float(hit[i] / union[i]) for i in range(CLASS_COUNT) if true[i] > 0}
+
+
+# ---- accumulators over a trajectory ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One predicted view with its truth. Absent modalities are None.
+
+    rgb ``[3, H, W]`` in [0, 1]; depth ``[1, H, W]`` m; semantics i64 ``[H, W]``; truth_depth_valid bool ``[1, H, W]``;
+    mask bool ``[1, H, W]``: pixels that count at all (outside the ego vehicle).
+    """
+
+    rgb: Tensor | None
+    depth: Tensor | None
+    semantics: Tensor | None
+    truth_rgb: Tensor | None
+    truth_depth: Tensor | None
+    truth_depth_valid: Tensor | None
+    truth_semantics: Tensor | None
+    mask: Tensor | None = None
+
+
+class Metric(Protocol):
+    """Accumulates over the pairs of one trajectory."""
+
+    def update(self, pair: Pair) -> None:
+        """Add one view."""
+        ...
+
+    def value(self) -> float | None:
+        """The metric over all views so far, or None if no view had what it needs."""
+        ...
+
+
+class FrameMean:
+    """Mean over views of a per-view number; views without the modality do not count."""
+
+    def __init__(self, of: Callable[[Pair], float | None]) -> None:
+        self._of = of
+        self._sum = 0.0
+        self._views = 0
+
+    def update(self, pair: Pair) -> None:
+        """Add one view; a view whose number is None or NaN (nothing to compare) is left out."""
+        number = self._of(pair)
+        if number is not None and not math.isnan(number):
+            self._sum += min(number, 100.0)  # equal images give infinite dB; 100 keeps the mean readable
+            self._views += 1
+
+    def value(self) -> float | None:
+        """Mean over the counted views, or None."""
+        return self._sum / self._views if self._views else None
+
+
+class DepthError:
+    """Depth errors pooled over all pixels of the trajectory."""
+
+    def __init__(self, field: Literal["abs_rel", "rmse_m", "delta1"]) -> None:
+        self._field: Literal["abs_rel", "rmse_m", "delta1"] = field
+        self._sum = 0.0
+        self._pixels = 0
+
+    def update(self, pair: Pair) -> None:
+        """Add one view with predicted and true depth."""
+        if pair.depth is None or pair.truth_depth is None:
+            return
+        mask = torch.ones_like(pair.truth_depth, dtype=torch.bool) if pair.mask is None else pair.mask
+        if pair.truth_depth_valid is not None:
+            mask = mask & pair.truth_depth_valid
+        errors = depth_errors(pair.depth, pair.truth_depth, mask)
+        if errors.pixels:
+            number = {"abs_rel": errors.abs_rel, "rmse_m": errors.rmse_m**2, "delta1": errors.delta1}[self._field]
+            self._sum += number * errors.pixels
+            self._pixels += errors.pixels
+
+    def value(self) -> float | None:
+        """Pooled error, or None."""
+        if not self._pixels:
+            return None
+        mean = self._sum / self._pixels
+        return math.sqrt(mean) if self._field == "rmse_m" else mean
+
+
+class Segmentation:
+    """Mean IoU over the classes present in the truth, or pixel accuracy, from one pooled confusion matrix."""
+
+    def __init__(self, field: Literal["miou", "accuracy"]) -> None:
+        self._field = field
+        self.counts = torch.zeros(CLASS_COUNT, CLASS_COUNT + 1, dtype=torch.int64)
+
+    def update(self, pair: Pair) -> None:
+        """Add one view with predicted and true semantics."""
+        if pair.semantics is not None and pair.truth_semantics is not None:
+            self.counts += confusion(pair.semantics, pair.truth_semantics, pair.mask)
+
+    def value(self) -> float | None:
+        """Pooled value in [0, 1], or None."""
+        total = int(self.counts.sum())
+        if not total:
+            return None
+        if self._field == "accuracy":
+            return float(self.counts[:, :CLASS_COUNT].diagonal().sum()) / total
+        iou = iou_of(self.counts)
+        return sum(iou.values()) / len(iou)
+
+
+def _psnr_of(pair: Pair) -> float | None:
+    if pair.rgb is None or pair.truth_rgb is None:
+        return None
+    return psnr(pair.rgb, pair.truth_rgb, pair.mask)
+
+
+def _ssim_of(pair: Pair) -> float | None:
+    if pair.rgb is None or pair.truth_rgb is None:
+        return None
+    return ssim(pair.rgb, pair.truth_rgb, pair.mask)
+
+
+@dataclass(frozen=True)
+class MetricRow:
+    """One row of the table: what it needs, which way is better, how to build it (None: weights not part of this build)."""
+
+    title: str
+    unit: str
+    needs: tuple[str, ...]
+    better: Literal["higher", "lower"]
+    build: Callable[[], Metric] | None
+
+
+METRICS: Final[dict[str, MetricRow]] = {
+    "psnr": MetricRow("PSNR", "dB", ("rgb",), "higher", lambda: FrameMean(_psnr_of)),
+    "ssim": MetricRow("SSIM", "", ("rgb",), "higher", lambda: FrameMean(_ssim_of)),
+    "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
+    "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
+    "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
+    "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: DepthError("abs_rel")),
+    "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: DepthError("rmse_m")),
+    "delta1": MetricRow("delta < 1.25", "", ("depth",), "higher", lambda: DepthError("delta1")),
+    "miou": MetricRow("mIoU", "", ("semantics",), "higher", lambda: Segmentation("miou")),
+    "accuracy": MetricRow("pixel accuracy", "", ("semantics",), "higher", lambda: Segmentation("accuracy")),
+}
+
+
+def build_all() -> dict[str, Metric]:
+    """A fresh accumulator for every metric that can be computed."""
+    return {name: row.build() for name, row in METRICS.items() if row.build is not None}
+
+
+def results(metrics: dict[str, Metric]) -> dict[str, float | str]:
+    """Values of all rows of ``METRICS``: a number, "not produced" (input absent) or "not computed" (weights absent)."""
+    table: dict[str, float | str] = {}
+    for name, row in METRICS.items():
+        if row.build is None:
+            table[name] = "not computed"
+            continue
+        number = metrics[name].value()
+        table[name] = "not produced" if number is None else number
+    return table
+
+
+__all__ = [
+    "CLASS_COUNT", "METRICS", "UNLABELLED", "DepthError", "DepthErrors", "FrameMean", "Metric", "MetricRow", "Pair",
+    "Segmentation", "build_all", "confusion", "depth_errors", "iou_of", "psnr", "results", "ssim",
+]  # fmt: skip

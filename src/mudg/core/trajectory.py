@@ -1,0 +1,229 @@
+"""Camera paths: the recorded one, the same drive on another line, another speed, or a spline through given poses.
+
+Which left is used
+------------------
+``shifted`` moves the whole vehicle sideways along **the ego's own left axis at that moment, made horizontal**: the y axis
+of ``world_from_ego(time)`` with its vertical part removed, normalised. That is the direction left of travel for a car
+driving forwards. It is not the x axis of the camera (a side camera's x axis points along the road) and not a finite
+difference of positions (which has no direction while the car stands, and turns round when it reverses: here, left stays
+the vehicle's left). Where the vehicle's heading and the tangent of its path differ (sideslip, a pose origin far from the
+rear axle in a tight turn), the heading wins; ``heading_against_path_rad`` tells by how much they differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Camera, EgoPath, Scene, Trajectory, View
+
+WORLD_UP = np.array([0.0, 0.0, 1.0])
+
+
+def trajectory_name(camera: str, shift_m: float | None = None) -> str:
+    """Name of a trajectory as used for folders: ``front_recorded``, ``front_shift+2.0`` (left), ``front_shift-4.0``."""
+    return f"{camera}_recorded" if shift_m is None else f"{camera}_shift{shift_m:+.1f}"
+
+
+def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Horizontal unit vector to the left of the vehicle, ``f64[3]`` in world axes.
+
+    Raises:
+        InputError: when the vehicle lies on its side, so that its left axis is vertical.
+    """
+    left = world_from_ego[:3, 1].copy()
+    left[2] = 0.0
+    length = float(np.linalg.norm(left))
+    if length < 1e-3:
+        raise InputError(
+            "the vehicle's left axis is vertical, so there is no lateral direction",
+            expected="ego poses with x forward, y left, z up",
+            got=f"left axis {world_from_ego[:3, 1].tolist()}",
+        )
+    return left / length
+
+
+def recorded(scene: Scene, camera: str) -> Trajectory:
+    """The recorded views of one camera in time order.
+
+    Raises:
+        UsageError: unknown camera name, or a camera without frames.
+    """
+    views = sorted((frame.view for frame in _frames(scene, camera)), key=lambda view: view.time_s)
+    return Trajectory(trajectory_name(camera), tuple(views), "recorded")
+
+
+def shifted(
+    scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0
+) -> Trajectory:
+    """The drive of one camera with the vehicle moved sideways; camera orientation kept (up to ``yaw_rad``).
+
+    Args:
+        scene: the log; its ego path gives the left direction at each frame's time.
+        camera: camera name, any mounting direction.
+        shift_m: signed distance, positive to the left of the direction of travel (see the module's docstring).
+        height_m: added to world z.
+        yaw_rad: rotation of the camera about the vertical through its own centre, counter-clockwise from above.
+
+    Returns:
+        Trajectory of origin "shifted" with one view per recorded frame. Each camera centre moves by exactly
+        ``hypot(shift_m, height_m)``.
+
+    Raises:
+        UsageError: unknown camera or a number that is not finite. InputError: no ego pose at a frame's time.
+    """
+    for name, value in (("shift_m", shift_m), ("height_m", height_m), ("yaw_rad", yaw_rad)):
+        if not np.isfinite(value):
+            raise UsageError(f"{name} must be a finite number", got=str(value))
+    views = []
+    for view in recorded(scene, camera).views:
+        left = ego_left_world(_ego_pose(scene.ego, view))
+        world_from_cam = np.array(view.world_from_cam, np.float64)
+        if yaw_rad:
+            world_from_cam[:3, :3] = geometry.yaw_matrix(yaw_rad)[:3, :3] @ world_from_cam[:3, :3]
+        world_from_cam[:3, 3] += shift_m * left + height_m * WORLD_UP
+        views.append(View(view.camera, world_from_cam, view.time_s))
+    name = trajectory_name(camera, shift_m)
+    if height_m:
+        name += f"_up{height_m:+.1f}"
+    if yaw_rad:
+        name += f"_yaw{np.degrees(yaw_rad):+.0f}"
+    return Trajectory(name, tuple(views), "shifted")
+
+
+def heading_against_path_rad(path: EgoPath) -> NDArray[np.float64]:
+    """Angle from the path's tangent to the vehicle's heading at each ego pose, ``f64[T]`` radians in (-pi, pi].
+
+    The tangent is a central difference of positions (one-sided at the ends); where the vehicle moves less than 1 cm
+    between the neighbours the angle is reported as 0, for want of a tangent. Near pi means reversing.
+    """
+    position = path.world_from_ego[:, :2, 3]
+    count = len(position)
+    angles = np.zeros(count)
+    for i in range(count):
+        step = position[min(i + 1, count - 1)] - position[max(i - 1, 0)]
+        if np.hypot(*step) >= 0.01:
+            difference = geometry.yaw_of(path.world_from_ego[i]) - np.arctan2(step[1], step[0])
+            angles[i] = np.pi - (np.pi - difference) % (2 * np.pi)
+    return angles
+
+
+def resampled(trajectory: Trajectory, *, speed_factor: float | None = None, count: int | None = None) -> Trajectory:
+    """The same path and the same time span with other sampling, by interpolation between neighbouring views.
+
+    Exactly one of the two is given. ``speed_factor`` 2 drives twice as fast through the scene: half as many views, each
+    showing the scene at the time it was passed (scene time keeps pace with the camera). ``count`` asks for that many
+    views, evenly spaced in time, first and last kept.
+
+    Raises:
+        UsageError: neither or both given, a factor that is not positive, or a count below 1.
+    """
+    if (speed_factor is None) == (count is None):
+        raise UsageError("give either speed_factor or count, not both and not none")
+    views = trajectory.views
+    if count is None:
+        factor = float(speed_factor or 0.0)
+        if not np.isfinite(factor) or factor <= 0:
+            raise UsageError("speed_factor must be positive", got=str(speed_factor))
+        positions = np.arange(0.0, len(views) - 1 + 1e-9, factor)
+        times = np.interp(positions, np.arange(len(views)), [view.time_s for view in views])
+    else:
+        if count < 1:
+            raise UsageError("count must be at least 1", got=str(count))
+        times = np.linspace(views[0].time_s, views[-1].time_s, count) if count > 1 else np.array([views[0].time_s])
+    keys = np.array([view.time_s for view in views])
+    poses = np.stack([view.world_from_cam for view in views])
+    sampled = []
+    for time_s in times:
+        pose = geometry.pose_at(keys, poses, float(time_s))
+        if pose is None:
+            raise InputError("a resampled time lies outside the trajectory", where=trajectory.name, got=f"{time_s} s")
+        sampled.append(View(views[0].camera, pose, float(time_s)))
+    return Trajectory(f"{trajectory.name}_x{len(sampled)}", tuple(sampled), trajectory.origin)
+
+
+def spline_through(
+    world_from_cam: Sequence[NDArray[np.float64]],
+    camera: Camera,
+    key_times_s: Sequence[float],
+    times_s: Sequence[float] | None = None,
+    *,
+    name: str = "planned",
+) -> Trajectory:
+    """A smooth camera path that passes through given poses.
+
+    Positions: natural cubic spline in time. Rotations: cubic rotation spline with continuous angular rate (Kang & Park
+    1999, as in scipy's RotationSpline). Both are exact at the keys. Two keys give a straight line and a slerp.
+
+    Args:
+        world_from_cam: ``K`` rigid 4x4 poses.
+        camera: intrinsics of all views.
+        key_times_s: ``K`` strictly increasing times.
+        times_s: where to sample; default the key times. Inside the span of the keys.
+
+    Raises:
+        InputError: no poses, lengths differ, times not increasing, a pose not rigid, or a sample outside the span.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    keys = np.asarray(key_times_s, np.float64)
+    poses = np.asarray(world_from_cam, np.float64)
+    if len(poses) == 0 or len(poses) != len(keys) or (np.diff(keys) <= 0).any():
+        raise InputError(
+            "a spline needs as many increasing times as poses, at least one",
+            got=f"{len(poses)} poses, times {keys.tolist()[:8]}",
+        )
+    for index, pose in enumerate(poses):
+        problem = geometry.rigid_problem(pose)
+        if problem:
+            raise InputError(f"pose {index} of the spline is not rigid: {problem}")
+    samples = keys if times_s is None else np.asarray(times_s, np.float64)
+    if samples.min() < keys[0] - 1e-9 or samples.max() > keys[-1] + 1e-9:
+        raise InputError(
+            "a spline is not extrapolated",
+            expected=f"times within [{keys[0]}, {keys[-1]}] s",
+            got=f"[{samples.min()}, {samples.max()}] s",
+        )
+    if len(keys) == 1:
+        return Trajectory(name, tuple(View(camera, poses[0], float(t)) for t in samples), "planned")
+    positions = CubicSpline(keys, poses[:, :3, 3], bc_type="natural")(samples)
+    rotations = RotationSpline(keys, Rotation.from_matrix(poses[:, :3, :3]))(samples).as_matrix()
+    views = tuple(
+        View(camera, geometry.from_rotation_translation(rotation, position), float(time_s))
+        for rotation, position, time_s in zip(rotations, positions, samples)
+    )
+    return Trajectory(name, views, "planned")
+
+
+def _frames(scene: Scene, camera: str) -> tuple:
+    if camera not in scene.cameras:
+        raise UsageError(
+            f"the scene has no camera named {camera!r}",
+            where=f"scene {scene.id}",
+            expected=f"one of {', '.join(scene.cameras)}",
+        )
+    frames = tuple(scene.frames_of(camera))
+    if not frames:
+        raise UsageError(f"camera {camera!r} has no frames", where=f"scene {scene.id}")
+    return frames
+
+
+def _ego_pose(path: EgoPath, view: View) -> NDArray[np.float64]:
+    """Ego pose at the view's time; a camera that fires up to 0.2 s outside the ego track uses the nearest end."""
+    pose = path.pose_at(view.time_s)
+    if pose is not None:
+        return pose
+    nearest = 0 if view.time_s < path.times_s[0] else -1
+    if abs(path.times_s[nearest] - view.time_s) <= 0.2:
+        return path.world_from_ego[nearest]
+    raise InputError(
+        "no ego pose at the time of a camera frame, so there is no left direction",
+        where=f"camera {view.camera.name}",
+        expected=f"a time within [{path.times_s[0]}, {path.times_s[-1]}] s",
+        got=f"{view.time_s} s",
+    )

@@ -1,0 +1,160 @@
+"""MP4 video (H.264, 4:2:0) through PyAV; panels side by side; depth and semantics in colours."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import av.error
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from mudg.base import palette, store
+from mudg.base.errors import InputError, ResourceError
+from mudg.base.types import Observation
+
+# Control points of a perceptually ordered map (near = warm and light, far = dark blue), interpolated linearly in RGB.
+_DEPTH_STOPS = np.array(
+    [[252, 253, 191], [254, 176, 120], [241, 96, 93], [183, 55, 121], [114, 31, 129], [45, 17, 96], [10, 8, 40]], np.float64
+)
+_CODECS = ("libx264", "h264", "mpeg4")
+
+
+def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 20) -> Path:
+    """Encode frames u8[H, W, 3] to ``path`` atomically; odd sizes are padded by one pixel of the edge.
+
+    Raises:
+        InputError: no frames, or frames of different sizes. ResourceError: no usable encoder, or the disk is full.
+    """
+    with store.atomic_path(Path(path)) as temporary:
+        _encode(str(temporary), frames, fps, crf)
+    return Path(path)
+
+
+def mp4_bytes(frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 26) -> bytes:
+    """The same as bytes, for embedding in a page."""
+    buffer = io.BytesIO()
+    _encode(buffer, frames, fps, crf)
+    return buffer.getvalue()
+
+
+def read_mp4(path: Path) -> NDArray[np.uint8]:
+    """All frames of a video, u8[T, H, W, 3]."""
+    try:
+        with av.open(str(path)) as container:
+            return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+    except (av.error.FFmpegError, ValueError, IndexError) as error:
+        raise InputError("not a readable video", where=str(path), got=str(error)) from error
+
+
+def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int) -> None:
+    container = stream = None
+    size: tuple[int, ...] = ()
+    try:
+        for index, frame in enumerate(frames):
+            if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+                raise InputError("a video frame must be u8[H, W, 3]", where=f"frame {index}", got=f"{frame.dtype} {frame.shape}")
+            if container is None:
+                size = frame.shape
+                # The index first, so that players start at once; only a file can be rewritten that way.
+                options = {"movflags": "+faststart"} if isinstance(target, str) else {}
+                container = av.open(target, "w", format="mp4", options=options)
+                stream = _stream(container, frame.shape, fps, crf)
+            if frame.shape != size:
+                raise InputError("video frames differ in size", where=f"frame {index}", expected=str(size), got=str(frame.shape))
+            for packet in stream.encode(av.VideoFrame.from_ndarray(_even(frame), format="rgb24")):  # type: ignore[union-attr]
+                container.mux(packet)
+        if container is None or stream is None:
+            raise InputError("a video needs at least one frame")
+        for packet in stream.encode():
+            container.mux(packet)
+    except av.error.FFmpegError as error:
+        raise ResourceError("the video could not be encoded", where=str(target), got=str(error)) from error
+    finally:
+        if container is not None:
+            container.close()
+
+
+def _stream(container: Any, shape: tuple[int, ...], fps: float, crf: int) -> Any:
+    codec = next((name for name in _CODECS if name in av.codecs_available), None)
+    if codec is None:
+        raise ResourceError("PyAV was built without an MP4 video encoder", expected=" or ".join(_CODECS))
+    stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1000))
+    stream.width, stream.height = shape[1] + shape[1] % 2, shape[0] + shape[0] % 2
+    stream.pix_fmt = "yuv420p"
+    stream.thread_count = 1  # the same bytes on every machine with this encoder
+    stream.options = {"crf": str(crf), "preset": "medium"} if codec == "libx264" else {}
+    return stream
+
+
+def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = frame.shape[:2]
+    if height % 2 == 0 and width % 2 == 0:
+        return np.ascontiguousarray(frame)
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+# ---- pictures ------------------------------------------------------------------------------------------------------
+
+
+def depth_colors(depth_m: NDArray[np.floating], near_m: float = 2.0, far_m: float = 100.0) -> NDArray[np.uint8]:
+    """Depth f[H, W] in metres to colours u8[H, W, 3], logarithmic from near (light) to far (dark); no depth is black."""
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    safe = np.where(known, depth_m, far_m).clip(near_m, far_m)
+    along = np.log(safe / near_m) / np.log(far_m / near_m) * (len(_DEPTH_STOPS) - 1)
+    index = np.minimum(along.astype(int), len(_DEPTH_STOPS) - 2)
+    part = (along - index)[..., None]
+    colors = _DEPTH_STOPS[index] * (1 - part) + _DEPTH_STOPS[index + 1] * part
+    colors[~known] = 0
+    return colors.round().astype(np.uint8)
+
+
+def semantic_colors(train_ids: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """Train ids [H, W] to the colours people know from Cityscapes; unlabelled is black."""
+    return palette.encode(train_ids, palette.DISPLAY_COLORS)
+
+
+def panels_of(observation: Observation) -> list[NDArray[np.uint8]]:
+    """Colour, depth and semantics of an observation as pictures of one size (those that exist)."""
+    panels = [(observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()]
+    if observation.depth is not None:
+        panels.append(depth_colors(observation.depth[0].cpu().numpy()))
+    if observation.semantics is not None:
+        panels.append(semantic_colors(observation.semantics.cpu().numpy()))
+    return panels
+
+
+def side_by_side(
+    panels: Sequence[NDArray[np.uint8]], titles: Sequence[str] = (), columns: int = 0, gap_px: int = 2
+) -> NDArray[np.uint8]:
+    """Panels u8[H, W, 3] of one size in a grid (``columns`` per row; 0 = one row), titles drawn in their upper left corner.
+
+    Raises:
+        InputError: no panels, or panels of different sizes.
+    """
+    if not panels or any(panel.shape != panels[0].shape for panel in panels):
+        raise InputError("panels must be of one size, at least one", got=str([panel.shape for panel in panels]))
+    per_row = columns or len(panels)
+    height, width = panels[0].shape[:2]
+    rows = -(-len(panels) // per_row)
+    canvas = np.full((rows * (height + gap_px) - gap_px, per_row * (width + gap_px) - gap_px, 3), 255, np.uint8)
+    for index, panel in enumerate(panels):
+        top, left = (index // per_row) * (height + gap_px), (index % per_row) * (width + gap_px)
+        canvas[top : top + height, left : left + width] = _titled(panel, titles[index]) if index < len(titles) else panel
+    return canvas
+
+
+def _titled(panel: NDArray[np.uint8], title: str) -> NDArray[np.uint8]:
+    if not title:
+        return panel
+    image = Image.fromarray(panel)
+    draw = ImageDraw.Draw(image)
+    left, top, right, bottom = draw.textbbox((4, 2), title)
+    draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill=(0, 0, 0))
+    draw.text((4, 2), title, fill=(255, 255, 255))
+    return np.asarray(image)

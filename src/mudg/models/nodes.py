@@ -1,0 +1,515 @@
+"""The scene model: a static world, one rigid node per moving object, a sky; and how they become Gaussians at a time.
+
+All Gaussians live in **one** row-aligned ``Table`` whose rows are ordered by node, so that composing a moment touches only what
+moves: rotation and translation of the rows of rigid nodes. Everything else is passed to the renderer as it is. A node says
+how its rows are placed in the world at a time; a new kind of node is a class with ``place`` and one row in ``NODES``.
+
+Columns of the table (raw, unactivated):
+
+    means [N, 3]      metres, in the node's own frame (world for static, box for rigid)
+    quats [N, 4]      (w, x, y, z), any length
+    log_scales [N, 3] natural logarithm of metres
+    logits [N]        opacity = sigmoid
+    sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0)
+    semantics [N, C]  class logits of the classes in ``SceneModel.classes``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import geometry
+from mudg.base.errors import InputError
+from mudg.base.palette import CLASSES, ID
+from mudg.base.types import Gaussians, Track, View
+from mudg.core.table import Table
+
+SH_C0: Final = 0.28209479177387814
+SKY_LOGIT: Final = 10.0
+"""Logit of the sky class where nothing covers it; large beside what a Gaussian learns."""
+
+
+class Node(Protocol):
+    """Places a block of table rows in the world."""
+
+    kind: str
+    name: str
+
+    def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor] | None:
+        """World means ``[n, 3]`` m and rotations ``[n, 4]`` of local rows at a time; None: the node is not there then."""
+        ...
+
+    def parameters(self) -> Table | None:
+        """The node's own optimisable table beside the shared one (pose offsets), or None."""
+        ...
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """What rebuilds it: plain JSON values and tensors."""
+        ...
+
+
+class StaticNode:
+    """Rows already in the world."""
+
+    kind = "static"
+
+    def __init__(self, name: str = "background") -> None:
+        self.name = name
+
+    def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor]:
+        """The rows as they are."""
+        return means, quats
+
+    def parameters(self) -> None:
+        """None: nothing beside the shared rows."""
+        return
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``Node``."""
+        return {"name": self.name}, {}
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> StaticNode:
+        """Inverse of ``state``."""
+        return cls(str(facts["name"]))
+
+
+class RigidNode:
+    """A tracked moving object: rows in the frame of its box, carried by the box's pose.
+
+    The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by learnable offsets in
+    the frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
+    positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
+    """
+
+    kind = "rigid"
+
+    def __init__(
+        self, name: str, label: str, size_m: Sequence[float], times_s: NDArray[np.float64],
+        world_from_object: NDArray[np.float64], offsets: Table | None = None, learn_pose: bool = False,
+    ) -> None:  # fmt: skip
+        self.name = name
+        self.label = label
+        self.size_m = tuple(float(value) for value in size_m)
+        self.times_s = np.asarray(times_s, np.float64)
+        self.world_from_object = np.asarray(world_from_object, np.float64)
+        self.learn_pose = learn_pose
+        count = len(self.times_s)
+        self.offsets = offsets or Table({"offsets": torch.zeros(count, 4)})
+        self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
+        self._quats = torch.from_numpy(np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])).float()
+        self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
+        self._positions = torch.from_numpy(self.world_from_object[:, :3, 3].copy()).float()
+
+    @classmethod
+    def from_track(cls, track: Track, learn_pose: bool = False) -> RigidNode:
+        """A node that follows ``track``."""
+        return cls(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object, learn_pose=learn_pose)
+
+    def _key_pose(self, index: int) -> tuple[Tensor, Tensor]:
+        """Corrected key: position ``[3]`` and unit quaternion ``[4]`` in the world."""
+        offset = self.offsets["offsets"][index]
+        position = self._positions[index] + self._rotations[index] @ offset[:3]
+        half = offset[3] / 2
+        zero = torch.zeros_like(half)
+        turn = torch.stack([torch.cos(half), zero, zero, torch.sin(half)])
+        return position, left_product_matrix(self._quats[index]) @ turn
+
+    def pose_at(self, time_s: float) -> tuple[Tensor, Tensor] | None:
+        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, differentiable in the offsets; None outside the span."""
+        tolerance_s = 1e-6
+        times = self.times_s
+        if len(times) == 0 or time_s < times[0] - tolerance_s or time_s > times[-1] + tolerance_s:
+            return None
+        after = int(np.searchsorted(times, time_s))
+        for near in (after, after - 1):
+            if 0 <= near < len(times) and abs(times[near] - time_s) <= tolerance_s:
+                return self._key_pose(near)
+        before = after - 1
+        u = float((time_s - times[before]) / (times[after] - times[before]))
+        position0, quat0 = self._key_pose(before)
+        position1, quat1 = self._key_pose(after)
+        return position0 + u * (position1 - position0), slerp(quat0, quat1, u)
+
+    def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor] | None:
+        """See ``Node``."""
+        placement = self._placement(time_s) if self.learn_pose else self._fixed_placement(time_s)
+        if placement is None:
+            return None
+        position, rotation_t, product_t = placement
+        return torch.addmm(position, means, rotation_t), quats @ product_t
+
+    def _placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``."""
+        pose = self.pose_at(time_s)
+        return None if pose is None else (pose[0], rotation_matrix(pose[1]).T, left_product_matrix(pose[1]).T)
+
+    def _fixed_placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
+        """The same, remembered per time: a pose that is not learnt is worked out once."""
+        if time_s not in self._placements:
+            with torch.no_grad():
+                self._placements[time_s] = self._placement(time_s)
+        return self._placements[time_s]
+
+    def parameters(self) -> Table | None:
+        """The pose offsets, when they are learnt."""
+        return self.offsets if self.learn_pose else None
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``Node``."""
+        facts = {"name": self.name, "label": self.label, "size_m": list(self.size_m), "learn_pose": self.learn_pose}
+        tensors = {
+            "times_s": torch.from_numpy(self.times_s.copy()),
+            "world_from_object": torch.from_numpy(self.world_from_object.copy()),
+        }
+        return facts, tensors | {f"offsets.{key}": value for key, value in self.offsets.state().items()}
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> RigidNode:
+        """Inverse of ``state``."""
+        offsets = {key.removeprefix("offsets."): value for key, value in tensors.items() if key.startswith("offsets.")}
+        return cls(
+            str(facts["name"]), str(facts["label"]), facts["size_m"], tensors["times_s"].numpy(),
+            tensors["world_from_object"].numpy(), Table.from_state(offsets), bool(facts["learn_pose"]),
+        )  # fmt: skip
+
+
+class SkyNode:
+    """Colour of the sky by direction: a longitude-latitude panorama, seen wherever nothing covers it.
+
+    Column ``panorama`` ``[1, 3, Hs, 2 Hs]``, colours around [0, 1] (raw; clamped when an image is written). Row 0 looks
+    straight up, the last row straight down; the columns run from longitude -pi to pi (world x axis in the middle).
+    """
+
+    kind = "sky"
+
+    def __init__(self, panorama: Table) -> None:
+        self.table = panorama
+
+    @classmethod
+    def uniform(cls, rows: int, rgb: Sequence[float] = (0.6, 0.7, 0.8)) -> SkyNode:
+        """A sky of one colour with ``rows`` rows of texels."""
+        color = torch.tensor(list(rgb), dtype=torch.float32)
+        return cls(Table({"panorama": color.view(1, 3, 1, 1).expand(1, 3, rows, 2 * rows).contiguous()}))
+
+    @property
+    def rows(self) -> int:
+        """Rows of the panorama."""
+        return int(self.table["panorama"].shape[2])
+
+    def at(self, view: View) -> Tensor:
+        """Sky colour ``[3, H, W]`` at every pixel of a view; differentiable in the panorama.
+
+        The panorama is far coarser than an image, so it is sampled on every s-th pixel (s chosen such that samples stay
+        denser than texels) and interpolated between them.
+        """
+        camera = view.camera
+        texel_rad = np.pi / self.rows
+        stride = int(np.clip(0.7 * texel_rad * min(camera.fx, camera.fy), 1, 8))
+        height, width = -(-camera.height // stride), -(-camera.width // stride)
+        grid = torch.from_numpy(self._grid(view, height, width)).to(self.table["panorama"].dtype)
+        padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
+        coarse = F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)
+        if stride == 1:
+            return coarse[0]
+        return F.interpolate(coarse, size=(camera.height, camera.width), mode="bilinear", align_corners=False)[0]
+
+    def _grid(self, view: View, height: int, width: int) -> NDArray[np.float32]:
+        """Sampling positions in the padded panorama, ``f32[height, width, 2]`` in [-1, 1]."""
+        camera = view.camera.resized(width, height)
+        x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
+        rays = np.stack([np.broadcast_to(x, (height, width)), np.broadcast_to(y[:, None], (height, width)), np.ones((height, width))], -1)
+        return self.panorama_grid(rays @ view.world_from_cam[:3, :3].T, padding=1)
+
+    def panorama_grid(self, directions_world: NDArray[np.float64], padding: int = 0) -> NDArray[np.float32]:
+        """Directions ``[..., 3]`` to panorama positions ``[..., 2]`` in [-1, 1] (x: longitude, y: from up to down)."""
+        longitude = np.arctan2(directions_world[..., 1], directions_world[..., 0])
+        elevation = np.arctan2(directions_world[..., 2], np.hypot(directions_world[..., 0], directions_world[..., 1]))
+        columns = 2 * self.rows
+        x = (longitude / np.pi) * columns / (columns + 2 * padding)
+        return np.stack([x, -2 * elevation / np.pi], -1).astype(np.float32)
+
+    def fill(self, directions_world: NDArray[np.float64], rgb: NDArray[np.float32]) -> None:
+        """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
+
+        Args:
+            directions_world: ``[M, 3]``. rgb: f32[M, 3] in [0, 1].
+        """
+        if len(rgb) == 0:
+            return
+        from scipy.ndimage import distance_transform_edt
+
+        rows, columns = self.rows, 2 * self.rows
+        grid = self.panorama_grid(directions_world)
+        column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
+        row = np.clip(((grid[:, 1] + 1) / 2 * rows).astype(np.int64), 0, rows - 1)
+        texel = row * columns + column
+        count = np.bincount(texel, minlength=rows * columns).astype(np.float64)
+        mean = np.stack([np.bincount(texel, rgb[:, c], rows * columns) for c in range(3)]) / np.maximum(count, 1)
+        seen = (count > 0).reshape(rows, columns)
+        tiled = np.concatenate([seen, seen, seen], 1)  # longitude wraps round
+        nearest = distance_transform_edt(~tiled, return_distances=False, return_indices=True)
+        rows_of, columns_of = nearest[0][:, columns : 2 * columns], nearest[1][:, columns : 2 * columns] % columns
+        filled = mean.reshape(3, rows, columns)[:, rows_of, columns_of]
+        self.table.columns["panorama"].detach().copy_(torch.from_numpy(filled).float()[None])
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``Node``."""
+        return {"name": "sky"}, self.table.state()
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SkyNode:
+        """Inverse of ``state``."""
+        return cls(Table.from_state(tensors))
+
+
+NODES: Final[dict[str, Any]] = {"static": StaticNode, "rigid": RigidNode, "sky": SkyNode}
+
+
+@dataclass
+class SceneModel:
+    """A fitted, or to be fitted, scene.
+
+    Args:
+        table: all Gaussians, rows ordered by node; label column ``node`` i32 is the index into ``nodes``.
+        nodes: static node first.
+        sky: or None (background black).
+        classes: train ids of the semantic channels, in channel order; empty = no semantics.
+        sh_degree: of the colour columns.
+        facts: JSON values kept with the model (method, scene id, ...).
+    """
+
+    table: Table
+    nodes: tuple[StaticNode | RigidNode, ...]
+    sky: SkyNode | None
+    classes: tuple[int, ...]
+    sh_degree: int
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def counts(self) -> list[int]:
+        """Rows of each node, in order."""
+        return torch.bincount(self.table.labels["node"].long(), minlength=len(self.nodes)).tolist()
+
+    def sort_rows(self) -> None:
+        """Bring rows back into node order after rows were appended (stable)."""
+        self.table.take(torch.argsort(self.table.labels["node"], stable=True))
+
+    def node_tables(self) -> dict[str, Table]:
+        """The optimisable tables beside the shared one, by name (pose offsets; the sky's panorama)."""
+        tables = {f"node.{node.name}": own for node in self.nodes if (own := node.parameters()) is not None}
+        return tables | ({"sky": self.sky.table} if self.sky is not None else {})
+
+    def node_names(self) -> tuple[str, ...]:
+        """Names of the moving objects."""
+        return tuple(node.name for node in self.nodes if node.kind != "static")
+
+    def without_nodes(self, names: Sequence[str]) -> SceneModel:
+        """A copy without the named objects (the rest keeps its parameters, not its moments)."""
+        kept = [index for index, node in enumerate(self.nodes) if node.name not in names or node.kind == "static"]
+        renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
+        renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
+        owner = renumber[self.table.labels["node"].long()]
+        rows = owner >= 0
+        table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]})
+        return SceneModel(table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts))
+
+    # -- state ------------------------------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+        """JSON values and named groups of tensors (``gaussians``, ``nodes``) that rebuild the model with its moments."""
+        nodes, tensors = [], {}
+        for index, node in enumerate((*self.nodes, *(() if self.sky is None else (self.sky,)))):
+            facts, own = node.state()
+            nodes.append({"kind": node.kind, **facts})
+            tensors |= {f"{index}/{name}": value for name, value in own.items()}
+        tensors.setdefault("none", torch.zeros(1))
+        values = {"nodes": nodes, "classes": list(self.classes), "sh_degree": self.sh_degree, "facts": self.facts}
+        return values, {"gaussians": self.table.state(), "nodes": tensors}
+
+    @classmethod
+    def from_state(cls, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]) -> SceneModel:
+        """Inverse of ``state``.
+
+        Raises:
+            InputError: an unknown node kind, a class that does not exist, or rows that belong to no node.
+        """
+        nodes: list[StaticNode | RigidNode] = []
+        sky = None
+        for index, facts in enumerate(values["nodes"]):
+            if facts["kind"] not in NODES:
+                raise InputError("unknown kind of scene node", expected=", ".join(NODES), got=str(facts["kind"]))
+            own = {key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")}
+            node = NODES[facts["kind"]].from_state(facts, own)
+            if isinstance(node, SkyNode):
+                sky = node
+            else:
+                nodes.append(node)
+        table = Table.from_state(groups["gaussians"])
+        owner = table.labels["node"]
+        if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
+            raise InputError("a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}")
+        classes = tuple(int(value) for value in values["classes"])
+        if any(not 0 <= value < len(CLASSES) for value in classes):
+            raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
+        return cls(table, tuple(nodes), sky, classes, int(values["sh_degree"]), dict(values["facts"]))
+
+
+def compose(model: SceneModel, time_s: float, sh_degree: int | None = None, semantics: bool = True) -> Gaussians:
+    """All Gaussians of the scene in the world at a time, activated, differentiable in every column.
+
+    Objects that do not exist at that time stay in the rows with opacity 0, so that rows always match the table.
+
+    Args:
+        sh_degree: use only bands up to this one (default: all).
+        semantics: add the class logits as ``extra`` channels.
+    """
+    table = model.table
+    counts = model.counts()
+    degree = model.sh_degree if sh_degree is None else min(sh_degree, model.sh_degree)
+    means, quats, present = [], [], []
+    for node, local_means, local_quats in zip(model.nodes, table["means"].split(counts), table["quats"].split(counts)):
+        placed = node.place(local_means, local_quats, time_s)
+        present.append(1.0 if placed is not None else 0.0)
+        world_means, world_quats = placed if placed is not None else (local_means, local_quats)
+        means.append(world_means)
+        quats.append(world_quats)
+    opacity = torch.sigmoid(table["logits"])
+    if 0.0 in present:
+        gate = torch.tensor(present, dtype=opacity.dtype).repeat_interleave(torch.tensor(counts))
+        opacity = opacity * gate
+    sh = table["sh_dc"]
+    if degree > 0:
+        sh = torch.cat([sh, table["sh_rest"][:, : (degree + 1) ** 2 - 1]], 1)
+    return Gaussians(
+        means=torch.cat(means) if len(means) > 1 else means[0],
+        quats=torch.cat(quats) if len(quats) > 1 else quats[0],
+        scales=torch.exp(table["log_scales"]),
+        opacity=opacity,
+        sh=sh,
+        extra=table["semantics"] if semantics and model.classes else None,
+        node=table.labels["node"],
+    )
+
+
+def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> Tensor:
+    """Colours ``[3, H, W]`` over the sky: ``rgb + (1 - alpha) * sky``."""
+    return rgb if model.sky is None else rgb + (1 - alpha) * model.sky.at(view)
+
+
+def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
+    """Rendered class logits ``[C, H, W]`` with the sky's logit added where nothing covers it.
+
+    The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
+    """
+    if ID["sky"] not in model.classes:
+        return extra
+    one_hot = torch.zeros(len(model.classes), 1, 1, dtype=extra.dtype)
+    one_hot[model.classes.index(ID["sky"])] = SKY_LOGIT
+    return extra + (1 - alpha.detach()) * one_hot
+
+
+# ---- starting values ---------------------------------------------------------------------------------------------
+
+
+def voxel_filter(xyz: NDArray[np.float32], size_m: NDArray[np.floating] | float) -> NDArray[np.int64]:
+    """Indices of one point per cube of side ``size_m`` (a number, or one per point, taken to powers of sqrt 2), sorted."""
+    if np.isscalar(size_m):
+        level, cell = np.zeros(len(xyz), np.int64), np.floor(xyz / float(size_m)).astype(np.int64)  # type: ignore[arg-type]
+    else:
+        level = np.round(2 * np.log2(np.asarray(size_m, np.float64))).astype(np.int64)
+        cell = np.floor(xyz / np.exp2(level / 2)[:, None]).astype(np.int64)
+    keys = np.column_stack([level, cell])
+    keys = keys - keys.min(0, initial=0)
+    spans = keys.max(0, initial=0) + 1
+    flat = ((keys[:, 0] * spans[1] + keys[:, 1]) * spans[2] + keys[:, 2]) * spans[3] + keys[:, 3]
+    return np.sort(np.unique(flat, return_index=True)[1])
+
+
+def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest_m: float = 1.5) -> NDArray[np.float32]:
+    """Root mean square distance to the three nearest other points, f32[N] metres, kept within bounds."""
+    from scipy.spatial import cKDTree
+
+    if len(xyz) < 4:
+        return np.full(len(xyz), 0.1, np.float32)
+    distance, _ = cKDTree(xyz).query(xyz, k=4, workers=1)
+    return np.sqrt((distance[:, 1:] ** 2).mean(1)).clip(smallest_m, largest_m).astype(np.float32)
+
+
+def columns_from_points(
+    xyz: NDArray[np.float32], rgb: NDArray[np.uint8], semantics: NDArray[np.uint8] | None, classes: Sequence[int],
+    sh_degree: int, opacity: float = 0.1, scale_m: NDArray[np.float32] | None = None,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known.
+
+    Args:
+        xyz: f32[N, 3] metres in the node's frame. rgb: u8[N, 3]. semantics: u8[N] train ids (255 = unknown) or None.
+        scale_m: f32[N]; default from the three nearest neighbours.
+    """
+    count = len(xyz)
+    scale = neighbour_scale(xyz) if scale_m is None else scale_m
+    logits = np.zeros((count, len(classes)), np.float32)
+    if semantics is not None:
+        for channel, train_id in enumerate(classes):
+            logits[semantics == train_id, channel] = 3.0
+    quats = np.zeros((count, 4), np.float32)
+    quats[:, 0] = 1.0
+    columns = {
+        "means": torch.from_numpy(np.array(xyz, np.float32)),
+        "quats": torch.from_numpy(quats),
+        "log_scales": torch.from_numpy(np.log(scale))[:, None].repeat(1, 3),
+        "logits": torch.full((count,), float(np.log(opacity / (1 - opacity)))),
+        "sh_dc": torch.from_numpy((rgb.astype(np.float32) / 255 - 0.5) / SH_C0)[:, None],
+        "semantics": torch.from_numpy(logits),
+    }
+    if sh_degree > 0:
+        columns["sh_rest"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3)
+    return columns
+
+
+def box_grid(size_m: Sequence[float], rgb: Sequence[float], per_axis: int = 12) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one colour."""
+    axis = np.linspace(-0.5, 0.5, per_axis)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    surface = grid[(np.abs(grid) > 0.5 - 1e-9).any(1)]
+    xyz = (surface * 0.9 * np.asarray(size_m)).astype(np.float32)
+    return xyz, np.broadcast_to(np.asarray(rgb, np.uint8), (len(xyz), 3)).copy()
+
+
+# ---- quaternions in torch ----------------------------------------------------------------------------------------
+
+
+def left_product_matrix(quat: Tensor) -> Tensor:
+    """``[4, 4]`` matrix L with ``L @ p == quat * p`` (Hamilton product, w x y z)."""
+    w, x, y, z = quat.unbind()
+    return torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]).view(4, 4)
+
+
+def rotation_matrix(quat: Tensor) -> Tensor:
+    """Rotation ``[3, 3]`` of a quaternion ``[4]``, normalised here."""
+    w, x, y, z = (quat / quat.norm()).unbind()
+    return torch.stack(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    ).view(3, 3)  # fmt: skip
+
+
+def slerp(quat0: Tensor, quat1: Tensor, u: float) -> Tensor:
+    """Spherical interpolation of unit quaternions ``[4]`` along the shorter arc, differentiable in both."""
+    cosine = (quat0 * quat1).sum()
+    if cosine.item() < 0:
+        quat1, cosine = -quat1, -cosine
+    if cosine.item() > 1 - 1e-6:  # nearly equal: the chord is the arc, and arccos has no gradient there
+        mixed = (1 - u) * quat0 + u * quat1
+        return mixed / mixed.norm()
+    angle = torch.arccos(cosine)
+    return (torch.sin((1 - u) * angle) * quat0 + torch.sin(u * angle) * quat1) / torch.sin(angle)

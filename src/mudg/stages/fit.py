@@ -1,0 +1,442 @@
+"""fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out.
+
+The loop is ``optimise`` and reads top to bottom. What it calls: ``fit_views`` (what a view is), ``fit_start`` (where the
+Gaussians start), ``models.nodes.compose`` (the scene at a time), ``core.raster`` (the renderer), ``core.losses`` (every
+loss), ``models.densify``. Nothing else touches the parameters.
+
+    OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``)
+    OUT/log.jsonl, preview/*.png                                how it went
+    OUT/steps/                                                  checkpoints, while it runs
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from mudg.base import checkpoint, log, palette, store
+from mudg.base.config import to_dict
+from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.types import Observation, Render, View
+from mudg.core import fused as kernels
+from mudg.core import losses, metrics
+from mudg.core.raster import RasterConfig, rasterize
+from mudg.data.cloudfile import read_fused
+from mudg.data.scenefile import read_scene
+from mudg.models.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
+from mudg.models.featnets import FilterBank
+from mudg.models.nodes import SceneModel, compose, composite_semantics, composite_sky
+from mudg.stages.config import FitConfig
+from mudg.stages.fit_start import StartSettings, start_model
+from mudg.stages.fit_trust import unseen_maps
+from mudg.stages.fit_views import Sample, ViewSet, classes_of, load_recorded, load_virtual, training_frames
+
+VERSION = 1
+PUBLISHED_STEPS = 30_000
+FARTHEST_VIRTUAL_DEPTH_M = 100.0
+SHAPE_EVERY = 10
+NEAR_M = 0.2
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a method consists of: nodes of the scene and kinds of supervision."""
+
+    objects: bool
+    sky: bool
+    lidar: bool
+    virtual: bool
+
+
+RECIPES: dict[str, Recipe] = {
+    "gs3d": Recipe(objects=False, sky=False, lidar=False, virtual=False),
+    "street_gaussians": Recipe(objects=True, sky=True, lidar=True, virtual=False),
+    "mudg_s": Recipe(objects=True, sky=True, lidar=True, virtual=True),
+}
+
+
+def run(
+    config: FitConfig, scene: Path, fused: Path, out: Path, *, observations: Path | None = None, overwrite: bool = False
+) -> Path:
+    """Fit a scene.
+
+    Args:
+        config: method, iterations, weights.
+        scene: scene directory (ingest).
+        fused: fused clouds (fuse).
+        out: folder for the model.
+        observations: folder of virtual observation sets (synthesize); needed by methods that use them, ignored by others.
+
+    Returns:
+        ``out``, finished. An interrupted run continues when called again with the same arguments.
+
+    Raises:
+        UsageError: a method with virtual views without ``observations``. NumericsError: a loss or gradient is not
+        finite. InputError: damaged inputs.
+    """
+    recipe = RECIPES[config.method]
+    if recipe.virtual and observations is None:
+        raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and hand its folder on")
+    virtual = observations if recipe.virtual else None
+    inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
+    if virtual is not None:
+        inputs["observations"] = store.digest(Path(virtual))
+    folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
+    if folder.complete:
+        return folder.reused()
+    state = _prepare(config, recipe, Path(scene), Path(fused), virtual, folder.path)
+    optimise(state, config, folder)
+    save_model(state.model, folder.path)
+    shutil.rmtree(folder.path / "steps", ignore_errors=True)
+    folder.finish(state.summary())
+    return folder.path
+
+
+@dataclass
+class FitState:
+    """Everything that changes while fitting, and what it is fitted to."""
+
+    model: SceneModel
+    views: ViewSet
+    stats: DensifyStats
+    schedule: DensifySettings
+    step: int
+    seconds: float = 0.0
+    last: Mapping[str, float] | None = None
+    unseen: Tensor | None = None
+    """u8[V, H, W] of the virtual views: 1 where no recorded view saw what they show; None before they join."""
+
+    def summary(self) -> dict[str, Any]:
+        """For run.json."""
+        return {"gaussians": len(self.model.table), "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
+
+
+def _prepare(config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Path, virtual: Path | None, out: Path) -> FitState:
+    """Read views, then continue from the newest checkpoint or build the starting model."""
+    scene = read_scene(scene_path)
+    frames = training_frames(scene, config.cameras)
+    classes = classes_of(scene, frames, virtual) if config.semantics else ()
+    recorded = load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0)
+    views = ViewSet(recorded, load_virtual(virtual, classes) if virtual is not None else ())
+    schedule = densify_schedule(config)
+    found = checkpoint.latest(out / "steps")
+    if found is not None:
+        model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
+        log.info(f"continuing at step {found.step} of {config.iterations}")
+        stats = DensifyStats.from_state(found.tensors("stats"))
+        unseen = found.tensors("unseen").get("maps") if found.state["virtual"] else None
+        return FitState(model, views, stats, schedule, found.step, float(found.state["seconds"]), found.state["last"], unseen)
+    start = StartSettings(
+        config.initial_gaussians, config.voxel_m, config.far_m, config.sh_degree, recipe.objects, recipe.sky,
+        config.learn_poses, config.seed,
+    )  # fmt: skip
+    model = start_model(scene, read_fused(fused_path), recorded, classes, start)
+    model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
+    return FitState(model, views, DensifyStats.zeros(len(model.table)), schedule, 0)
+
+
+# ---- the loop ------------------------------------------------------------------------------------------------------
+
+
+def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
+    """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each.
+
+    Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
+    that changes. Ctrl-C is taken at the end of a step: checkpoint, then KeyboardInterrupt.
+    """
+    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), FilterBank()
+    virtual_from = config.virtual_start * config.iterations
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, _interrupt_at_end_of_step() as interrupted:
+        while state.step < config.iterations:
+            began = time.perf_counter()
+            step = state.step + 1
+            if step > virtual_from and state.unseen is None and state.views.virtual:
+                state.unseen = weigh_virtual_views(state, raster)
+            probability = config.virtual_probability if step > virtual_from else 0.0
+            sample = state.views.choose(config.seed, step, probability, state.unseen)
+            observation = sample.observation
+            recorded = observation.kind == "recorded"
+            growing = recorded and config.densify and step <= state.schedule.stop
+
+            gaussians = compose(state.model, observation.view.time_s, semantics=not recorded or step % config.semantic_every == 0)
+            render = rasterize(gaussians, observation.view, raster, absgrad=growing)
+            terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception)
+            finite_or_refuse(terms, sample.name, step)
+            torch.stack(list(terms.values())).sum().backward()
+            gradients_or_refuse(state.model, sample.name, step)
+            adam_step(state.model, step, config)
+            if step % SHAPE_EVERY == 0:
+                shorten_needles(state.model.table, config.longest_to_middle)
+            if growing:
+                state.stats.observe(render.trace, observation.view.camera.width, observation.view.camera.height)
+            grown = _densify_if_due(state, config, step)
+
+            state.step, state.seconds = step, state.seconds + time.perf_counter() - began
+            if step % 20 == 0 or step == config.iterations or grown:
+                state.last = _progress(state, render, sample, terms)
+                folder.log(step=step, view=sample.name, seconds=round(state.seconds, 3), **state.last, **grown)
+                bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
+            if step % config.preview_every == 0 or step == config.iterations:
+                write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
+            if step % config.checkpoint_every == 0 or interrupted.is_set():
+                save_checkpoint(state, folder.path / "steps")
+            bar.advance()
+            if interrupted.is_set():
+                folder.pause(state.summary())
+                raise KeyboardInterrupt
+
+
+def weigh_virtual_views(state: FitState, raster: RasterConfig) -> Tensor:
+    """Maps u8[V, H, W] of what only virtual views see (padded to the largest of them); see ``fit_trust``."""
+    maps = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
+    height, width = (max(size) for size in zip(*(found.shape for found in maps)))
+    stacked = torch.zeros(len(maps), height, width, dtype=torch.uint8)
+    for index, found in enumerate(maps):
+        stacked[index, : found.shape[0], : found.shape[1]] = torch.from_numpy(found)
+    log.info(f"virtual views: {float(np.mean([found.mean() for found in maps])):.0%} of their pixels show what no recorded view saw")
+    return stacked
+
+
+def recorded_terms(
+    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank
+) -> dict[str, Tensor]:
+    """Weighted loss terms of a recorded view: colour, LiDAR depth, sky, semantics (those that apply)."""
+    seen = sample.observation
+    rgb = losses.outside_mask_copied(composite_sky(model, seen.view, render.rgb, render.alpha), seen.rgb, seen.mask)
+    terms = {"color": kernels.photometric(rgb, seen.rgb, config.ssim_weight)}
+    if sample.lidar is not None and len(sample.lidar.pixel) and config.lidar_weight:
+        terms["lidar"] = config.lidar_weight * losses.sparse_depth(render.depth, sample.lidar.pixel, sample.lidar.depth_m)
+    if sample.sky is not None and config.sky_weight and model.sky is not None:
+        terms["sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), seen.mask)
+    if render.extra is not None and seen.semantics is not None and config.semantic_weight:
+        logits = composite_semantics(model, render.extra, render.alpha)
+        terms["semantics"] = config.semantic_weight * losses.weighted_mean(losses.semantic_map(logits, seen.semantics), seen.mask[0])
+    return terms
+
+
+def virtual_terms(
+    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank
+) -> dict[str, Tensor]:
+    """Weighted loss terms of a virtual view, every pixel weighted by the observation's confidence."""
+    seen = sample.observation
+    weight = seen.confidence * seen.mask * torch.where(sample.unseen, 1.0, config.virtual_seen_weight)
+    rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
+    terms: dict[str, Tensor] = {}
+    if config.virtual_color_weight:
+        terms["virtual_color"] = config.virtual_color_weight * losses.weighted_mean(losses.l1_map(rgb, seen.rgb), weight)
+    if config.virtual_perceptual_weight:
+        with torch.no_grad():
+            target = perception(seen.rgb)
+        terms["virtual_perceptual"] = config.virtual_perceptual_weight * losses.feature_distance(perception(rgb), target, weight)
+    if seen.depth is not None and config.virtual_depth_weight:
+        valid = torch.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth < FARTHEST_VIRTUAL_DEPTH_M)
+        loss = losses.dense_depth_map(render.depth, torch.where(valid, seen.depth, 1.0))
+        terms["virtual_depth"] = config.virtual_depth_weight * losses.weighted_mean(loss, weight * valid)
+    if sample.sky is not None and config.sky_weight and model.sky is not None:
+        terms["virtual_sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), weight)
+    if render.extra is not None and seen.semantics is not None and config.virtual_semantic_weight:
+        logits = composite_semantics(model, render.extra, render.alpha)
+        terms["virtual_semantics"] = config.virtual_semantic_weight * losses.weighted_mean(losses.semantic_map(logits, seen.semantics), weight[0])
+    return terms
+
+
+def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
+    """NumericsError naming term, view and step if a loss term is not finite; nothing has been changed by then."""
+    for name, value in terms.items():
+        if not math.isfinite(value.item()):
+            raise NumericsError(
+                f"the loss term {name!r} is not finite", where=f"view {view}, step {step}", got=str(value.item()),
+                remedy="check this view's image and labels; the parameters are those of the step before",
+            )  # fmt: skip
+
+
+def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
+    """NumericsError naming the parameter if a gradient is not finite; the parameters have not been touched."""
+    for owner, table in {"gaussians": model.table, **model.node_tables()}.items():
+        for name, gradient in table.gradients().items():
+            if not math.isfinite(gradient.sum().item()):
+                count = int((~torch.isfinite(gradient)).sum())
+                table.clear_gradients()
+                raise NumericsError(
+                    "a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
+                    got=f"{count} values", remedy="the parameters are those of the step before; lower the learning rate or report the scene",
+                )  # fmt: skip
+
+
+# ---- schedules -----------------------------------------------------------------------------------------------------
+
+
+def learning_rates(step: int, iterations: int) -> dict[str, float]:
+    """Learning rate of every column at a step (from 1).
+
+    Published rates belong to 30,000 steps. A shorter run takes larger steps, by the square root of the ratio and at most
+    4 times; positions decay to a hundredth over the run, scales and colours to a fifth.
+    """
+    boost = min(4.0, math.sqrt(max(1.0, PUBLISHED_STEPS / iterations)))
+    along = step / max(1, iterations)
+    decay, gentle = 0.01**along, 0.2**along
+    return {
+        "means": 1.6e-4 * 10.0 * boost * decay,
+        "quats": 1e-3 * boost,
+        "log_scales": 5e-3 * boost * gentle,
+        "logits": 5e-2 * math.sqrt(boost),
+        "sh_dc": 2.5e-3 * boost * gentle,
+        "sh_rest": 1.25e-4 * boost * gentle,
+        "semantics": 1e-2 * boost,
+        "panorama": 1e-2 * gentle,
+        "offsets": 1e-3 * boost * gentle,
+    }
+
+
+def densify_schedule(config: FitConfig) -> DensifySettings:
+    """The published schedule (from 500, every 100, until half; opacity reset every 3000), scaled to the iterations."""
+    total = config.iterations
+    every = max(10, min(100, total // 20))
+    return DensifySettings(
+        start=max(every, min(500, total // 10)), stop=int(0.6 * total), every=every, max_rows=config.max_gaussians,
+        reset_every=3000 if total >= 10_000 else 0,
+    )  # fmt: skip
+
+
+def adam_step(model: SceneModel, step: int, config: FitConfig) -> None:
+    """One Adam step on every table of the model, then gradients are dropped."""
+    rates = learning_rates(step, config.iterations)
+    for table in (model.table, *model.node_tables().values()):
+        table.adam_step(step, rates, kernels.adam)
+        table.clear_gradients()
+
+
+def _densify_if_due(state: FitState, config: FitConfig, step: int) -> dict[str, Any]:
+    if not config.densify:
+        return {}
+    report: dict[str, Any] = {}
+    if state.schedule.due(step):
+        report = densify(state.model, state.stats, step, state.schedule, config.seed)
+        state.stats = DensifyStats.zeros(len(state.model.table))
+    if state.schedule.reset_due(step):
+        reset_opacity(state.model, state.schedule)
+    return report
+
+
+# ---- on disk -------------------------------------------------------------------------------------------------------
+
+
+def save_checkpoint(state: FitState, folder: Path) -> None:
+    """All that changes: model with moments, statistics, step."""
+    values, groups = state.model.state()
+    groups = {**groups, "stats": state.stats.state()}
+    if state.unseen is not None:
+        groups["unseen"] = {"maps": state.unseen}
+    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "virtual": state.unseen is not None}
+    checkpoint.save(folder, state.step, groups, facts)
+
+
+def save_model(model: SceneModel, folder: Path) -> None:
+    """The fitted scene without optimiser moments."""
+    values, groups = model.state()
+    store.write_json(folder / "model.json", {"schema": 1, **values})
+    for name, tensors in groups.items():
+        kept = {key: value for key, value in tensors.items() if "moment" not in key}
+        store.write_safetensors(folder / f"{name}.safetensors", kept)
+
+
+def load_model(folder: Path) -> SceneModel:
+    """Read a fitted scene.
+
+    Raises:
+        InputError: not the folder of a finished fit, or of another schema. IntegrityError: a file was altered.
+    """
+    folder = Path(folder)
+    if not (folder / "model.json").is_file():
+        raise InputError("no fitted scene here", where=str(folder), expected="a folder made by `mudg fit`")
+    if (folder / store.MANIFEST).is_file():
+        store.verify_manifest(folder)
+    values = store.read_json(folder / "model.json")
+    if values.get("schema") != 1:
+        raise InputError("unknown schema of a fitted scene", where=str(folder / "model.json"), expected="1", got=str(values.get("schema")))
+    groups = {}
+    for name in ("gaussians", "nodes"):
+        arrays = store.read_safetensors(folder / f"{name}.safetensors")
+        groups[name] = {key: torch.from_numpy(value.copy()) for key, value in arrays.items()}
+    return SceneModel.from_state(values, groups)
+
+
+# ---- looking at it --------------------------------------------------------------------------------------------------
+
+
+def _progress(state: FitState, render: Render, sample: Sample, terms: Mapping[str, Tensor]) -> dict[str, float]:
+    seen = sample.observation
+    with torch.no_grad():
+        rgb = composite_sky(state.model, seen.view, render.rgb, render.alpha)
+        psnr = metrics.psnr(rgb, seen.rgb, seen.mask)
+    shown = {f"loss_{name}": round(value.item(), 6) for name, value in terms.items()}
+    return {"psnr": round(min(psnr, 99.0), 3), **shown}
+
+
+@torch.no_grad()
+def render_view(model: SceneModel, view: View, raster: RasterConfig, sky_below_alpha: float = 0.5, source: str = "") -> Observation:
+    """Render one view of a fitted scene as an observation of kind "virtual".
+
+    Where coverage is below ``sky_below_alpha``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
+    sky has no depth. Confidence is the coverage (1 where the sky is a valid answer).
+    """
+    render = rasterize(compose(model, view.time_s), view, raster)
+    rgb = composite_sky(model, view, render.rgb, render.alpha).clamp(0, 1)
+    covered = render.alpha >= sky_below_alpha
+    depth = torch.where(covered, render.depth, torch.nan)
+    semantics = None
+    if render.extra is not None:
+        channel = composite_semantics(model, render.extra, render.alpha).argmax(0)
+        semantics = torch.tensor(model.classes)[channel]
+        if model.sky is not None:
+            semantics = torch.where(covered[0], semantics, palette.ID["sky"])
+            depth = torch.where(semantics[None] == palette.ID["sky"], torch.nan, depth)
+    confidence = render.alpha.clamp(0, 1) if model.sky is None else torch.where(covered, render.alpha, 1 - render.alpha).clamp(0, 1)
+    return Observation(view, rgb, depth, semantics, confidence, torch.ones_like(covered), "virtual", source or str(model.facts.get("method", "fit")))
+
+
+def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
+    """A picture: truth, render, depth, semantics of the middle recorded view."""
+    from mudg.data.exporters.video import depth_colors
+
+    stored = state.views.recorded[len(state.views.recorded) // 2]
+    seen = render_view(state.model, stored.view, raster)
+    panels = [stored.rgb, (seen.rgb * 255).round().byte().permute(1, 2, 0).numpy(), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
+    if seen.semantics is not None:
+        panels.append(palette.encode(seen.semantics.numpy(), palette.DISPLAY_COLORS))
+    with store.atomic_path(path) as temporary:
+        Image.fromarray(np.concatenate(panels, 1)).save(temporary)
+
+
+@contextlib.contextmanager
+def _interrupt_at_end_of_step() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C into a flag, so that a step is never cut in half; a second one interrupts at once."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: Any) -> None:
+        if flag.is_set() and callable(before):
+            before(number, frame)
+        flag.set()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, before)

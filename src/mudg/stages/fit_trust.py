@@ -1,0 +1,108 @@
+"""Where a virtual view has something to say: the part of it that no recorded camera ever saw.
+
+A generated view is the best there is behind a parked bus, and worse than the photographs wherever they look. So each of its
+pixels is asked: is the surface you show seen by any recorded view? The pixel's point (at the depth the virtual view itself
+claims) is carried to a number of recorded views, with its moving object if it lies in one's box, and compared with the depth
+the model renders there: if the recorded view looks at or through that point, the pixel is *seen*. Points that are hidden in
+every recorded view, or in none's image, are *unseen*, and there the virtual view keeps its full weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mudg.base import geometry, log
+from mudg.base.types import View
+from mudg.core.raster import RasterConfig, rasterize
+from mudg.models.nodes import RigidNode, SceneModel, compose
+from mudg.stages.fit_views import StoredView
+
+WITNESSES = 36
+"""Recorded views asked, spread evenly over cameras and time."""
+STRIDE_PX = 2
+TOLERANCE = 0.15
+SKY_AT_M = 1000.0
+WITNESS_WIDTH_PX = 160
+
+
+@dataclass(frozen=True)
+class _Witness:
+    """A recorded view and what it sees: depth f32[H, W], infinite in the sky."""
+
+    view: View
+    depth: NDArray[np.float32]
+
+
+@torch.no_grad()
+def unseen_maps(
+    model: SceneModel, recorded: Sequence[StoredView], virtual: Sequence[StoredView], raster: RasterConfig
+) -> list[NDArray[np.bool_]]:
+    """For every virtual view: bool[H, W], True where no recorded view saw the surface it shows.
+
+    Pixels without depth count as sky, far away. Depends on the geometry the model has by now.
+    """
+    chosen = [recorded[i] for i in np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))]
+    witnesses = [_witness(model, stored.view, raster) for stored in chosen]
+    objects = [node for node in model.nodes if isinstance(node, RigidNode)]
+    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "what virtual views add")]
+
+
+def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
+    camera = view.camera
+    width = min(WITNESS_WIDTH_PX, camera.width)
+    small = view.resized(width, max(1, round(camera.height * width / camera.width)))
+    render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
+    depth = torch.where(render.alpha > 0.5, render.depth, torch.inf)
+    return _Witness(small, depth[0].numpy())
+
+
+def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence[RigidNode]) -> NDArray[np.bool_]:
+    height, width = stored.rgb.shape[:2]
+    row, column = np.mgrid[STRIDE_PX // 2 : height : STRIDE_PX, STRIDE_PX // 2 : width : STRIDE_PX]
+    shape = row.shape
+    row, column = row.ravel(), column.ravel()
+    depth = np.full(len(row), SKY_AT_M) if stored.depth is None else stored.depth[row, column].astype(np.float64)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, SKY_AT_M)
+    points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), depth)
+    carried = [(node, inside, local) for node in objects if (found := _in_box(node, points, stored.view.time_s)) for inside, local in [found]]
+    seen = np.zeros(len(points), bool)
+    for witness in witnesses:
+        moved = points.copy()
+        exists = np.ones(len(points), bool)
+        for node, inside, local in carried:
+            pose = _pose(node, witness.view.time_s)
+            exists[inside] = pose is not None
+            if pose is not None:
+                moved[inside] = geometry.transform_points(pose, local)
+        seen |= exists & _looks_at_or_through(witness, moved)
+    coarse = ~seen.reshape(shape)
+    return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
+
+
+def _looks_at_or_through(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    camera = witness.view.camera
+    uv, z = geometry.project(witness.view, points)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0.2) & (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+    column = np.where(inside, np.nan_to_num(uv[:, 0]), 0).astype(int).clip(0, camera.width - 1)
+    row = np.where(inside, np.nan_to_num(uv[:, 1]), 0).astype(int).clip(0, camera.height - 1)
+    return inside & (witness.depth[row, column] >= z * (1 - TOLERANCE))
+
+
+def _in_box(node: RigidNode, points: NDArray[np.float64], time_s: float) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """Indices of points in the node's box (grown by a tenth) and their coordinates in it; None if there are none."""
+    pose = _pose(node, time_s)
+    if pose is None:
+        return None
+    local = geometry.transform_points(geometry.invert(pose), points)
+    inside = np.flatnonzero((np.abs(local) < np.array(node.size_m) * 0.55 + 0.1).all(1))
+    return (inside, local[inside]) if len(inside) else None
+
+
+def _pose(node: RigidNode, time_s: float) -> NDArray[np.float64] | None:
+    return geometry.pose_at(node.times_s, node.world_from_object, time_s)

@@ -1,0 +1,106 @@
+"""render: a fitted scene on recorded and shifted trajectories -> observation folders and videos.
+
+    OUT/<trajectory>/    observations (see data/observations.py)
+    OUT/<trajectory>.mp4 colour, depth, semantics side by side
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from mudg.base import log, store
+from mudg.base.config import to_dict
+from mudg.base.errors import UsageError
+from mudg.base.types import Scene, Trajectory
+from mudg.core import trajectory
+from mudg.core.edit import without_tracks
+from mudg.core.raster import RasterConfig
+from mudg.data.exporters.video import panels_of, side_by_side, write_mp4
+from mudg.data.observations import ObservationWriter, read_observations
+from mudg.data.scenefile import read_scene
+from mudg.models.nodes import SceneModel
+from mudg.stages.config import RenderConfig
+from mudg.stages.fit import NEAR_M, load_model, render_view
+from mudg.stages.fit_views import resized_view
+
+VERSION = 1
+
+
+def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite: bool = False) -> Path:
+    """Render every camera and shift of the configuration.
+
+    Args:
+        scene: scene directory; gives cameras, times and the path of the vehicle.
+        model: folder made by fit.
+        out: one observation folder (and video) per trajectory.
+
+    Returns:
+        ``out``, finished; an interrupted run continues with the next missing view.
+    """
+    inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
+    folder = store.RunDir.open(Path(out), "render", to_dict(config), inputs, VERSION, overwrite)
+    if folder.complete:
+        return folder.reused()
+    fitted = load_model(Path(model))
+    if config.remove_tracks:
+        fitted = without_tracks(fitted, config.remove_tracks)
+    source = str(fitted.facts.get("method", "fit"))
+    paths = trajectories(read_scene(Path(scene)), config)
+    try:
+        with log.task(f"render {source}", sum(len(path) for path in paths)) as bar:
+            for path in paths:
+                _render_trajectory(fitted, path, config, folder.path / path.name, source, bar)
+                if config.video:
+                    _write_video(folder.path / path.name, folder.path / f"{path.name}.mp4", config.fps)
+    except KeyboardInterrupt:
+        folder.pause()
+        raise
+    folder.finish({"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)})
+    return folder.path
+
+
+def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
+    """The trajectories a configuration names: every camera at every shift (0 = recorded).
+
+    Raises:
+        UsageError: an unknown camera, or nothing to render.
+    """
+    cameras = config.cameras or tuple(scene.cameras)[:1]
+    if not config.shifts_m:
+        raise UsageError("nothing to render: no shifts given", remedy="0 is the recorded drive")
+    paths = []
+    for camera in cameras:
+        for shift_m in config.shifts_m:
+            if shift_m == 0 and not config.height_m and not config.yaw_deg:
+                path = trajectory.recorded(scene, camera)
+            else:
+                path = trajectory.shifted(
+                    scene, camera, shift_m, height_m=config.height_m, yaw_rad=math.radians(config.yaw_deg)
+                )
+            paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
+    return tuple(paths)
+
+
+def _render_trajectory(
+    model: SceneModel, path: Trajectory, config: RenderConfig, out: Path, source: str, bar: log.Task
+) -> None:
+    """One folder of observations; views that an earlier, interrupted run wrote are kept."""
+    if (out / "observations.json").is_file():
+        bar.advance(len(path))
+        return
+    raster = RasterConfig(backend=config.raster, near_m=NEAR_M)
+    with ObservationWriter(out, path.name, source) as writer:
+        for index, view in enumerate(path.views):
+            if index < writer.done:
+                writer.skip(view)
+            else:
+                writer.add(render_view(model, view, raster, config.sky_below_alpha, source))
+            bar.advance()
+
+
+def _write_video(observations: Path, path: Path, fps: float) -> None:
+    if path.is_file():
+        return
+    views = read_observations(observations)
+    write_mp4(path, (side_by_side(panels_of(views[index])) for index in range(len(views))), fps)

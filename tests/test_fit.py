@@ -1,0 +1,278 @@
+"""The fit end to end on a tiny exact street: it learns, it resumes bit for bit, it refuses what is not finite."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
+
+from mudg.base import geometry, store
+from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.palette import ID
+from mudg.base.types import View
+from mudg.core import metrics, trajectory
+from mudg.core.raster import RasterConfig
+from mudg.data.cloudfile import write_fused
+from mudg.data.observations import ObservationWriter
+from mudg.data.scenefile import read_scene
+from mudg.stages import fit, fit_start, fit_views
+from mudg.stages.config import FitConfig
+
+SIZE = (60, 40)
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> dict[str, Path]:
+    """A scene, its fused cloud, and perfect virtual views 2 m to either side."""
+    root = tmp_path_factory.mktemp("world")
+    scene = write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
+    write_fused(root / "fuse", fused_cloud(FRAMES), {})
+    for shift_m in (2.0, -2.0):
+        path = trajectory.shifted(scene, "front", shift_m)
+        with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
+            for view in path.views:
+                writer.add(truth(view.resized(30, 20)))
+    return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+
+
+def settings(method: str = "street_gaussians", **changes) -> FitConfig:
+    small = {"iterations": 24, "initial_gaussians": 900, "max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
+    return FitConfig(method=method, **{**small, **changes})
+
+
+def fitted_bytes(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in ("gaussians.safetensors", "nodes.safetensors", "model.json")}
+
+
+def mean_psnr(folder: Path, left_m: float = 0.0) -> float:
+    model = fit.load_model(folder)
+    values = []
+    for time_s in (0.3, 0.9):
+        view = view_at(time_s, camera(width=SIZE[0], height=SIZE[1]), left_m=left_m)
+        values.append(metrics.psnr(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb))
+    return float(np.mean(values))
+
+
+def test_it_learns(world, tmp_path):
+    """Some 150 steps from round grey blobs must clearly beat the start, in colour, depth and semantics."""
+    start = fit.run(settings(iterations=1), world["scene"], world["fuse"], tmp_path / "start")
+    end = fit.run(settings(iterations=150), world["scene"], world["fuse"], tmp_path / "end")
+    assert mean_psnr(end) > mean_psnr(start) + 5.0
+    assert mean_psnr(end) > 21.0
+    view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
+    seen, exact = fit.render_view(fit.load_model(end), view, RasterConfig()), truth(view)
+    both = torch.isfinite(exact.depth) & torch.isfinite(seen.depth)
+    assert metrics.depth_errors(seen.depth, exact.depth, both).abs_rel < 0.15
+    iou = metrics.iou_of(metrics.confusion(seen.semantics, exact.semantics))
+    assert iou["road"] > 0.9
+    assert iou["sky"] > 0.9
+    for name in ("model.json", "gaussians.safetensors", "nodes.safetensors", "log.jsonl", "preview/000150.png", "run.yaml", "manifest.json"):
+        assert (end / name).is_file(), name
+    assert not (end / "steps").exists()
+
+
+def test_the_moving_car_is_where_its_track_says(world, tmp_path):
+    folder = fit.run(settings(iterations=80), world["scene"], world["fuse"], tmp_path / "fit")
+    model = fit.load_model(folder)
+    cam = camera(width=SIZE[0], height=SIZE[1])
+    for time_s in (0.0, 1.4):
+        view = view_at(time_s, cam)
+        semantics = fit.render_view(model, view, RasterConfig()).semantics
+        uv, _ = geometry.project(view, car_pose(time_s)[None, :3, 3])
+        assert semantics[int(uv[0, 1]), int(uv[0, 0])] == ID["car"]
+
+
+def test_same_in_same_out(world, tmp_path):
+    first = fit.run(settings(), world["scene"], world["fuse"], tmp_path / "a")
+    second = fit.run(settings(), world["scene"], world["fuse"], tmp_path / "b")
+    assert fitted_bytes(first) == fitted_bytes(second)
+    other = fit.run(settings(seed=1), world["scene"], world["fuse"], tmp_path / "c")
+    assert fitted_bytes(other) != fitted_bytes(first)
+
+
+@pytest.mark.parametrize("stop_after", [7, 21])
+def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, stop_after):
+    """Ctrl-C before and after a densification; virtual views, learnt poses and all. Bit for bit."""
+    config = settings("mudg_s", iterations=32, learn_poses=True)
+    schedule = fit.densify_schedule(config)
+    steps = [step for step in range(1, 33) if schedule.due(step)]
+    assert steps, "the test must cross a densification"
+    arguments = (config, world["scene"], world["fuse"])
+    whole = fit.run(*arguments, tmp_path / "whole", observations=world["virtual"])
+
+    adam_step = fit.adam_step
+
+    def ctrl_c(model, step, config):
+        adam_step(model, step, config)
+        if step == stop_after:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(fit, "adam_step", ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
+    monkeypatch.setattr(fit, "adam_step", adam_step)
+    assert (tmp_path / "parts" / "steps" / f"step_{stop_after:08d}").is_dir()
+    parts = fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
+    assert fitted_bytes(parts) == fitted_bytes(whole)
+
+
+def test_densification_grows_within_its_cap(world, tmp_path):
+    folder = fit.run(settings(iterations=60, max_gaussians=1600), world["scene"], world["fuse"], tmp_path / "fit")
+    rows = [line["rows"] for line in map(store.parse_json, (folder / "log.jsonl").read_text().splitlines(), ["log"] * 99) if "rows" in line]
+    assert max(rows) > 1500
+    assert max(rows) <= 1600
+    assert len(fit.load_model(folder).table) > 0
+
+
+def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
+    kinds = []
+    observe = fit.DensifyStats.observe
+    rasterize = fit.rasterize
+
+    def spy(gaussians, view, config, absgrad=False, **rest):
+        kinds.append((view.camera.width, absgrad))
+        return rasterize(gaussians, view, config, absgrad=absgrad, **rest)
+
+    monkeypatch.setattr(fit, "rasterize", spy)
+    monkeypatch.setattr(fit.DensifyStats, "observe", observe)
+    fit.run(settings("mudg_s", virtual_probability=0.5, virtual_start=0.0, checkpoint_every=999), world["scene"], world["fuse"],
+            tmp_path / "fit", observations=world["virtual"])  # fmt: skip
+    assert {absgrad for width, absgrad in kinds if width == 30} == {False}
+    assert any(absgrad for width, absgrad in kinds if width == SIZE[0])
+
+
+def test_perfect_virtual_views_help_off_the_path(world, tmp_path):
+    arguments = {"iterations": 150, "virtual_probability": 0.4}
+    plain = fit.run(settings(**arguments), world["scene"], world["fuse"], tmp_path / "plain")
+    guided = fit.run(settings("mudg_s", **arguments), world["scene"], world["fuse"], tmp_path / "guided", observations=world["virtual"])
+    assert mean_psnr(guided, left_m=2.0) > mean_psnr(plain, left_m=2.0) + 0.3
+
+
+# ---- what must be refused ---------------------------------------------------------------------------------------------
+
+
+def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeypatch):
+    before = {}
+    sky_map = fit.losses.sky_map
+    calls = {"count": 0}
+
+    def poisoned(alpha, sky):
+        calls["count"] += 1
+        return sky_map(alpha, sky) * (float("nan") if calls["count"] == 5 else 1.0)
+
+    refuse = fit.finite_or_refuse
+
+    def snapshot(terms, view, step):
+        before["step"] = step
+        refuse(terms, view, step)
+
+    monkeypatch.setattr(fit.losses, "sky_map", poisoned)
+    monkeypatch.setattr(fit, "finite_or_refuse", snapshot)
+    with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/00000\d, step 5"):
+        fit.run(settings(), world["scene"], world["fuse"], tmp_path / "fit")
+    assert before["step"] == 5
+
+
+def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
+    scene = read_scene(world["scene"])
+    frames = fit_views.training_frames(scene, ())
+    classes = fit_views.classes_of(scene, frames, None)
+    stored = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=False)
+    start = fit_start.StartSettings(300, 0.15, 150.0, 0, True, True, False, 0)
+    model = fit_start.start_model(scene, fused_cloud(FRAMES), stored, classes, start)
+    model.table["log_scales"].grad = torch.zeros_like(model.table["log_scales"])
+    model.table["log_scales"].grad[3, 1] = float("inf")
+    with pytest.raises(NumericsError, match=r"gaussians.log_scales, view front/000001, step 9"):
+        fit.gradients_or_refuse(model, "front/000001", 9)
+    assert model.table["log_scales"].grad is None
+
+
+def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
+    with pytest.raises(UsageError, match="virtual observations"):
+        fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no finished folders"):
+        fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "empty")
+
+
+def test_another_configuration_in_the_same_folder_is_refused(world, tmp_path):
+    fit.run(settings(iterations=2), world["scene"], world["fuse"], tmp_path / "fit")
+    assert fit.run(settings(iterations=2), world["scene"], world["fuse"], tmp_path / "fit") == tmp_path / "fit"
+    with pytest.raises(UsageError, match="another configuration"):
+        fit.run(settings(iterations=3), world["scene"], world["fuse"], tmp_path / "fit")
+
+
+def test_unknown_camera_and_no_fit(world, tmp_path):
+    with pytest.raises(UsageError, match="no camera named 'rear'"):
+        fit.run(settings(cameras=("rear",)), world["scene"], world["fuse"], tmp_path / "fit")
+    with pytest.raises(InputError, match="no fitted scene"):
+        fit.load_model(tmp_path)
+
+
+# ---- odd scenes -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["gs3d", "street_gaussians"])
+def test_scenes_without_tracks_or_labels_or_with_one_frame_work(tmp_path, method):
+    write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
+    cloud = fused_cloud(1, semantics=False)
+    write_fused(tmp_path / "fuse", type(cloud)(cloud.static, {}), {})
+    folder = fit.run(settings(method, iterations=6), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit")
+    model = fit.load_model(folder)
+    seen = fit.render_view(model, view_at(0.0, camera(width=SIZE[0], height=SIZE[1])), RasterConfig())
+    assert seen.semantics is None
+    assert torch.isfinite(seen.rgb).all()
+
+
+def test_view_order_is_a_function_of_seed_and_step_and_fair():
+    views = fit_views.ViewSet(tuple("abcd"), tuple("xy"))
+    drawn = [views.choose(7, step, 0.0) for step in range(40)]
+    assert drawn == [views.choose(7, step, 0.0) for step in range(40)]
+    assert all(sorted(drawn[i : i + 4]) == list("abcd") for i in range(0, 40, 4))
+    virtual = [views.choose(7, step, 0.3) for step in range(400)]
+    assert 0.2 < sum(v in "xy" for v in virtual) / 400 < 0.4
+
+
+def test_lidar_pixels_agree_with_exact_depth(world):
+    scene = read_scene(world["scene"])
+    frame = scene.frames_of("front")[2]
+    lidar = fit_views._SweepCache(scene).pixels_of(frame.view)
+    exact = truth(frame.view).depth.reshape(-1)[lidar.pixel]
+    relative = ((lidar.depth_m - exact).abs() / exact).nan_to_num(1.0)
+    assert len(lidar.pixel) > 200
+    assert len(torch.unique(lidar.pixel)) == len(lidar.pixel)
+    assert relative.median() < 0.03
+    assert (relative < 0.2).float().mean() > 0.85
+
+
+def test_a_point_behind_a_nearer_one_is_no_depth_of_this_camera():
+    view = View(camera(width=SIZE[0], height=SIZE[1]), geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
+    points = np.array([[5.0, 0.0, 0.0], [20.0, 0.02, 0.0], [20.0, -6.0, 0.0]], np.float32)
+    assert sorted(fit_views.visible_lidar(view, points).depth_m.tolist()) == [5.0, 20.0]
+    assert len(fit_views.visible_lidar(view, points[:0]).pixel) == 0
+
+
+def test_learning_rates_follow_the_length_of_the_run():
+    long, short = fit.learning_rates(1, 30_000), fit.learning_rates(1, 2_000)
+    assert short["means"] == pytest.approx(long["means"] * (30_000 / 2_000) ** 0.5, rel=0.01)
+    assert fit.learning_rates(2_000, 2_000)["means"] == pytest.approx(0.01 * short["means"], rel=0.01)
+
+
+def test_the_table_of_methods_and_the_recipes_agree():
+    from typing import get_args, get_type_hints
+
+    from mudg.methods import METHODS, fitted_methods
+
+    assert set(fitted_methods()) == set(fit.RECIPES) == set(get_args(get_type_hints(FitConfig)["method"]))
+    for name in fitted_methods():
+        recipe, row = fit.RECIPES[name], METHODS[name]
+        assert recipe.objects == ("rigid per moving track" in row.nodes)
+        assert recipe.sky == ("sky" in row.nodes) == ("sky" in row.supervision)
+        assert recipe.lidar == ("LiDAR depth" in row.supervision)
+        assert recipe.virtual == ("virtual views of mudg_r" in row.supervision)

@@ -1,0 +1,188 @@
+"""Losses against known values, float64 finite differences, and what they must ignore."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from mudg.base.errors import InputError
+from mudg.core import losses
+from mudg.models.featnets import FilterBank
+
+
+def image(seed: int, shape: tuple[int, ...] = (3, 14, 17), dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def check_gradient(function, *inputs: Tensor) -> None:
+    assert torch.autograd.gradcheck(function, [x.clone().requires_grad_() for x in inputs], eps=1e-6, atol=1e-6, rtol=1e-4)
+
+
+def test_ssim_of_equal_images_is_one():
+    x = image(0)
+    assert torch.allclose(losses.ssim_map(x, x), torch.ones_like(x), atol=1e-12)
+
+
+def test_ssim_agrees_with_an_independent_gaussian_filter():
+    """scipy's truncated Gaussian of radius 5 is the same 11-tap window; zero padding = mode constant."""
+    x, y = image(1, (1, 20, 24)), image(2, (1, 20, 24))
+
+    def blur(t: Tensor) -> Tensor:
+        return torch.from_numpy(gaussian_filter(t.numpy(), (0, 1.5, 1.5), mode="constant", radius=(0, 5, 5)))
+
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    expected = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    assert torch.allclose(losses.ssim_map(x, y), expected, atol=1e-12)
+
+
+def test_photometric_is_the_weighted_sum_of_its_parts():
+    x, y = image(1), image(2)
+    expected = 0.7 * (x - y).abs().mean() + 0.3 * (1 - losses.ssim_map(x, y).mean())
+    assert float(losses.photometric(x, y, 0.3)) == pytest.approx(float(expected), abs=1e-14)
+
+
+def test_photometric_gradient():
+    y = image(2, (3, 7, 8))
+    check_gradient(lambda x: losses.photometric(x, y), image(1, (3, 7, 8)))
+
+
+def test_masked_pixels_change_nothing_and_get_no_gradient():
+    x, y = image(1).requires_grad_(), image(2)
+    mask = torch.ones(1, 14, 17, dtype=torch.bool)
+    mask[:, 4:9, 5:] = False
+    losses.photometric(losses.outside_mask_copied(x, y, mask), y).backward()
+    assert x.grad is not None
+    assert (x.grad[:, 4:9, 5:] == 0).all()
+    assert (x.grad[:, :4] != 0).all()
+
+
+def test_weighted_mean_known_value_and_empty_weight():
+    values = torch.tensor([1.0, 2.0, 6.0], requires_grad=True)
+    assert losses.weighted_mean(values, torch.tensor([1.0, 0.0, 3.0])).item() == pytest.approx(19 / 4)
+    nothing = losses.weighted_mean(values, torch.zeros(3))
+    nothing.backward()
+    assert nothing.item() == 0.0
+    assert values.grad is not None
+    assert (values.grad == 0).all()
+
+
+def test_trimmed_mean_leaves_the_largest_out():
+    values = torch.tensor([5.0, 1.0, 2.0, 100.0, 3.0])
+    assert float(losses.trimmed_mean(values, 0.8)) == pytest.approx((1 + 2 + 3 + 5) / 4)
+    assert float(losses.trimmed_mean(values, 1.0)) == pytest.approx(111 / 5)
+    assert float(losses.trimmed_mean(values[:0], 0.95)) == 0.0
+
+
+def test_sparse_depth_reads_the_right_pixels():
+    depth = torch.arange(1.0, 13.0, dtype=torch.float64).view(1, 3, 4)
+    loss = losses.sparse_depth(depth, torch.tensor([1 * 4 + 2, 2 * 4 + 3]), torch.tensor([7.0, 10.0], dtype=torch.float64), keep=1.0)
+    assert float(loss) == pytest.approx((0 / 7 + 2 / 10) / 2)
+
+
+def test_sparse_depth_gradient():
+    pixel, target = torch.tensor([0, 5, 7, 11]), torch.tensor([2.0, 3.0, 9.0, 1.0], dtype=torch.float64)
+    check_gradient(lambda d: losses.sparse_depth(d, pixel, target, 0.75), 1 + 5 * image(3, (1, 3, 4)))
+
+
+def test_dense_depth_is_the_log_ratio_far_from_zero_and_symmetric():
+    two = torch.full((1, 1, 1), 20.0, dtype=torch.float64)
+    forty = 2 * two
+    expected = math.log(2) - 0.05  # Huber: delta * (|x| - delta / 2), divided by delta = 0.1
+    assert float(losses.dense_depth_map(two, forty)) == pytest.approx(expected)
+    assert float(losses.dense_depth_map(forty, two)) == pytest.approx(expected)
+    assert float(losses.dense_depth_map(two, two)) == 0.0
+
+
+def test_dense_depth_gradient():
+    target = 1 + 30 * image(5, (1, 3, 4))
+    check_gradient(lambda d: losses.dense_depth_map(d, target).sum(), 1 + 30 * image(4, (1, 3, 4)))
+
+
+def test_sky_loss_known_values_and_bounds():
+    alpha = torch.tensor([[[0.25, 0.25, 1.0, 0.0]]], dtype=torch.float64)
+    sky = torch.tensor([[[True, False, True, False]]])
+    values = losses.sky_map(alpha, sky)[0, 0]
+    assert values[0] == pytest.approx(-math.log(0.75))
+    assert values[1] == pytest.approx(-math.log(0.25))
+    assert values[2:].tolist() == pytest.approx([-math.log(1e-3)] * 2)
+
+
+def test_sky_gradient():
+    sky = image(8, (1, 3, 4)) > 0.5
+    check_gradient(lambda a: losses.sky_map(a, sky).sum(), 0.1 + 0.8 * image(7, (1, 3, 4)))
+
+
+def test_semantics_ignore_unlabelled_pixels():
+    logits = torch.zeros(4, 1, 2, dtype=torch.float64)
+    logits[2, 0, 0] = math.log(3)
+    values = losses.semantic_map(logits, torch.tensor([[2, 255]]))
+    assert values[0, 0] == pytest.approx(-math.log(3 / 6))
+    assert values[0, 1] == 0.0
+    with pytest.raises(InputError, match="sizes differ"):
+        losses.semantic_map(logits, torch.zeros(2, 2, dtype=torch.long))
+
+
+def test_semantic_gradient():
+    target = torch.tensor([[0, 2, 255], [1, 1, 0]])
+    check_gradient(lambda x: losses.semantic_map(x, target).sum(), image(9, (3, 2, 3)))
+
+
+def test_object_regulariser():
+    alpha = torch.tensor([[[0.5, 0.999, 0.5]]], dtype=torch.float64)
+    inside = torch.tensor([[[True, True, False]]])
+    values = losses.object_map(alpha, inside)[0, 0]
+    assert values[0] == pytest.approx(math.log(2))
+    assert values[1] < 0.01
+    assert values[2] == pytest.approx(math.log(2))
+    check_gradient(lambda a: losses.object_map(a, inside).sum(), 0.1 + 0.8 * image(7, (1, 1, 3)))
+
+
+def test_shapes_must_agree():
+    with pytest.raises(InputError, match="shapes differ"):
+        losses.l1_map(torch.zeros(3, 2, 2), torch.zeros(1, 2, 2))
+
+
+# ---- the filter bank ------------------------------------------------------------------------------------------------
+
+
+def distance(a: Tensor, b: Tensor) -> float:
+    bank = FilterBank()
+    return float(losses.feature_distance(bank(a), bank(b), torch.ones(1, *a.shape[1:], dtype=a.dtype)))
+
+
+def stripes(phase: float, width_px: float = 6.0) -> Tensor:
+    x = torch.arange(64, dtype=torch.float64)
+    row = 0.5 + 0.3 * torch.sin(2 * math.pi * (x / width_px + phase))
+    return row.expand(3, 48, 64).contiguous()
+
+
+def test_filter_bank_zero_for_equal_images_and_gradient():
+    x = image(3, (3, 16, 20))
+    assert distance(x, x) == 0.0
+    bank, weight = FilterBank(scales=2), torch.rand(1, 16, 20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    target = bank(image(4, (3, 16, 20)))
+    check_gradient(lambda p: losses.feature_distance(bank(p), target, weight), x)
+
+
+def test_filter_bank_prefers_a_shifted_texture_to_a_blurred_one():
+    """L1 prefers the blur (that is why it blurs); the filter bank must not."""
+    truth, shifted, blurred = stripes(0.0), stripes(0.5), torch.full((3, 48, 64), 0.5, dtype=torch.float64)
+    assert (shifted - truth).abs().mean() > 1.5 * (blurred - truth).abs().mean()
+    assert distance(shifted, truth) < distance(blurred, truth)
+
+
+def test_filter_bank_weight_silences_pixels():
+    """Beyond the reach of the coarsest filters (some 30 px) an unweighted difference counts nothing."""
+    bank = FilterBank()
+    a = image(1, (3, 32, 120))
+    b = a.clone()
+    b[:, :, 80:] = 0.0
+    weight = torch.zeros(1, 32, 120, dtype=torch.float64)
+    weight[:, :, :32] = 1.0
+    assert losses.feature_distance(bank(a), bank(b), weight).item() < 1e-12
+    assert distance(a, b) > 0.05

@@ -1,0 +1,99 @@
+"""Metrics against hand-computed values; pooling over a trajectory; the words for what is missing."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from mudg.base.errors import InputError
+from mudg.base.palette import CLASSES, ID
+from mudg.core import metrics
+from mudg.core.metrics import METRICS, Pair
+
+
+def pair(**given) -> Pair:
+    empty = dict.fromkeys(("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics"))
+    return Pair(**{**empty, **given})
+
+
+def test_psnr_known_value_mask_and_limits():
+    truth = torch.zeros(3, 2, 2)
+    prediction = torch.zeros(3, 2, 2)
+    prediction[:, 0, 0] = 0.1
+    assert metrics.psnr(prediction, truth) == pytest.approx(-10 * math.log10(0.01 / 4), abs=1e-5)
+    mask = torch.zeros(1, 2, 2, dtype=torch.bool)
+    mask[0, 0, 0] = True
+    assert metrics.psnr(prediction, truth, mask) == pytest.approx(20.0, abs=1e-5)
+    assert metrics.psnr(truth, truth) == math.inf
+    assert math.isnan(metrics.psnr(truth, truth, torch.zeros(1, 2, 2, dtype=torch.bool)))
+    assert metrics.psnr(truth - 5, truth) == math.inf  # clamped to [0, 1] first
+
+
+def test_ssim_identity_and_order():
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(3, 24, 32, generator=generator)
+    noise = torch.randn(3, 24, 32, generator=generator)
+    assert metrics.ssim(truth, truth) == pytest.approx(1.0, abs=1e-6)
+    assert metrics.ssim(truth + 0.02 * noise, truth) > metrics.ssim(truth + 0.1 * noise, truth)
+
+
+def test_depth_errors_known_values():
+    truth = torch.tensor([[[10.0, 20.0, 5.0, 0.0]]])
+    prediction = torch.tensor([[[11.0, 30.0, 5.0, 7.0]]])
+    errors = metrics.depth_errors(prediction, truth, torch.ones(1, 1, 4, dtype=torch.bool))
+    assert errors.pixels == 3  # a truth of 0 m is no truth
+    assert errors.abs_rel == pytest.approx((0.1 + 0.5 + 0) / 3, abs=1e-6)
+    assert errors.rmse_m == pytest.approx(math.sqrt((1 + 100 + 0) / 3), abs=1e-5)
+    assert errors.delta1 == pytest.approx(2 / 3)
+    with pytest.raises(InputError, match="not finite"):
+        metrics.depth_errors(prediction * math.nan, truth, torch.ones(1, 1, 4, dtype=torch.bool))
+
+
+def test_confusion_and_iou_by_hand():
+    road, car = ID["road"], ID["car"]
+    truth = torch.tensor([[road, road, road, car, 255]])
+    prediction = torch.tensor([[road, road, car, car, car]])
+    counts = metrics.confusion(prediction, truth)
+    assert int(counts.sum()) == 4
+    assert int(counts[road, car]) == 1
+    assert metrics.iou_of(counts) == {"road": pytest.approx(2 / 3), "car": pytest.approx(1 / 2)}
+
+
+def test_prediction_outside_the_classes_is_wrong_not_ignored():
+    truth = torch.zeros(1, 4, dtype=torch.long)
+    prediction = torch.tensor([[0, 0, 255, 0]])
+    assert metrics.iou_of(metrics.confusion(prediction, truth)) == {CLASSES[0]: pytest.approx(3 / 4)}
+
+
+def test_miou_is_pooled_over_the_trajectory_not_averaged_over_views():
+    metric = metrics.Segmentation("miou")
+    metric.update(pair(semantics=torch.zeros(1, 9, dtype=torch.long), truth_semantics=torch.zeros(1, 9, dtype=torch.long)))
+    metric.update(pair(semantics=torch.ones(1, 1, dtype=torch.long), truth_semantics=torch.zeros(1, 1, dtype=torch.long)))
+    assert metric.value() == pytest.approx(0.9)
+
+
+def test_rmse_is_pooled_over_pixels():
+    metric = metrics.DepthError("rmse_m")
+    valid = torch.ones(1, 1, 3, dtype=torch.bool)
+    metric.update(pair(depth=torch.full((1, 1, 3), 12.0), truth_depth=torch.full((1, 1, 3), 10.0), truth_depth_valid=valid))
+    metric.update(pair(depth=torch.full((1, 1, 1), 10.0), truth_depth=torch.full((1, 1, 1), 10.0)))
+    assert metric.value() == pytest.approx(math.sqrt(3 * 4 / 4))
+
+
+def test_absent_modalities_are_said_in_words():
+    accumulators = metrics.build_all()
+    rgb = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
+    for metric in accumulators.values():
+        metric.update(pair(rgb=rgb, truth_rgb=rgb, truth_depth=torch.ones(1, 16, 16), truth_semantics=torch.zeros(16, 16)))
+    table = metrics.results(accumulators)
+    assert table["psnr"] == 100.0
+    assert table["ssim"] == pytest.approx(1.0, abs=1e-6)
+    assert {table[name] for name in ("abs_rel", "rmse_m", "delta1", "miou", "accuracy")} == {"not produced"}
+    assert {table[name] for name in ("lpips", "fid", "fvd")} == {"not computed"}
+    assert set(table) == set(METRICS)
+
+
+def test_nothing_compared_is_not_zero():
+    assert metrics.results(metrics.build_all())["miou"] == "not produced"

@@ -1,0 +1,391 @@
+"""Scene nodes: poses between keys, composing, the sky, saving; and the table they live in."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.base.types import Camera, Track, View
+from mudg.core.edit import without_tracks
+from mudg.core.table import Table, torch_adam
+from mudg.models import nodes
+from mudg.models.nodes import RigidNode, SceneModel, SkyNode, StaticNode, compose
+
+
+def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0.0) -> np.ndarray:
+    tilt = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
+    return geometry.yaw_matrix(yaw, (x, y, z)) @ geometry.from_rotation_translation(tilt, (0, 0, 0))
+
+
+def track(name: str = "car", t0: float = 0.0) -> Track:
+    keys = [pose(0, 0, 1, 0.1), pose(2, 0.5, 1, 0.6, 0.05), pose(5, 2, 1.2, 2.9), pose(6, 4, 1.2, -2.9)]
+    return Track(name, "car", [4.0, 2.0, 1.5], t0 + np.array([0.0, 0.5, 1.0, 2.0]), np.stack(keys))
+
+
+def columns(count: int, seed: int, classes: int = 3, degree: int = 0) -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    made = {
+        "means": torch.randn(count, 3, generator=g), "quats": torch.randn(count, 4, generator=g),
+        "log_scales": torch.randn(count, 3, generator=g) - 2, "logits": torch.randn(count, generator=g),
+        "sh_dc": torch.randn(count, 1, 3, generator=g), "semantics": torch.randn(count, classes, generator=g),
+    }  # fmt: skip
+    if degree:
+        made["sh_rest"] = torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=g)
+    return made
+
+
+def model(learn_poses: bool = False, degree: int = 0) -> SceneModel:
+    parts = [columns(5, 1, degree=degree), columns(4, 2, degree=degree), columns(3, 3, degree=degree)]
+    table = Table(
+        {name: torch.cat([p[name] for p in parts]) for name in parts[0]},
+        {"node": torch.tensor([0] * 5 + [1] * 4 + [2] * 3, dtype=torch.int32)},
+    )
+    objects = (RigidNode.from_track(track("car"), learn_poses), RigidNode.from_track(track("van", 5.0), learn_poses))
+    return SceneModel(table, (StaticNode(), *objects), SkyNode.uniform(16), (ID["road"], ID["sky"], ID["car"]), degree, {"method": "test"})
+
+
+# ---- poses ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("time_s", [0.0, 0.2, 0.5, 0.77, 1.0, 1.5, 2.0])
+def test_pose_agrees_with_the_track(time_s):
+    """Torch and float64 numpy interpolate alike: at keys, between keys, across the -pi/pi seam of the last pair."""
+    position, quat = RigidNode.from_track(track()).pose_at(time_s)
+    expected = track().pose_at(time_s)
+    assert np.abs(position.detach().numpy() - expected[:3, 3]).max() < 1e-5
+    assert np.abs(nodes.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
+
+
+@pytest.mark.parametrize("time_s", [-0.01, 2.01, 50.0])
+def test_no_pose_outside_the_span(time_s):
+    assert RigidNode.from_track(track()).pose_at(time_s) is None
+
+
+def test_both_neighbours_rotate():
+    """Half way between yaw 0.1 and 0.6 the heading is 0.35; a node that uses one key twice gives 0.1 or 0.6."""
+    flat = Track("flat", "car", [4, 2, 1.5], [0.0, 1.0], np.stack([pose(0, 0, 0, 0.1), pose(1, 0, 0, 0.6)]))
+    rotation = nodes.rotation_matrix(RigidNode.from_track(flat).pose_at(0.5)[1]).detach().numpy()
+    assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.35, abs=1e-6)
+
+
+def test_learnt_yaw_of_either_key_turns_the_pose_between_them():
+    flat = Track("flat", "car", [4, 2, 1.5], [0.0, 1.0], np.stack([pose(0, 0, 0, 0.0), pose(1, 0, 0, 0.0)]))
+    node = RigidNode.from_track(flat, learn_pose=True)
+    with torch.no_grad():
+        node.offsets["offsets"][1, 3] = 0.4
+    rotation = nodes.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
+    assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.1, abs=1e-6)
+    with torch.no_grad():
+        node.offsets["offsets"][0, 3] = 0.2
+    rotation = nodes.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
+    assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.25, abs=1e-6)
+
+
+def test_offsets_act_in_the_frame_of_the_box():
+    node = RigidNode.from_track(track())
+    with torch.no_grad():
+        node.offsets["offsets"][1] = torch.tensor([1.0, 0.2, -0.1, 0.3])
+    position, quat = node.pose_at(0.5)
+    expected = track().world_from_object[1] @ geometry.yaw_matrix(0.3, (1.0, 0.2, -0.1))
+    assert np.abs(position.detach().numpy() - expected[:3, 3]).max() < 1e-5
+    assert np.abs(nodes.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
+
+
+def test_pose_gradient_reaches_both_keys_and_only_when_learnt():
+    for learn in (True, False):
+        scene = model(learn_poses=learn)
+        compose(scene, 0.3).means.sum().backward()
+        gradient = scene.nodes[1].offsets["offsets"].grad
+        if learn:
+            assert (gradient[:2, :2].abs() > 0).all()
+            assert (gradient[2:] == 0).all()
+            assert "node.car" in scene.node_tables()
+        else:
+            assert gradient is None
+            assert list(scene.node_tables()) == ["sky"]
+
+
+def test_slerp_gradient_is_finite_for_equal_rotations():
+    q = torch.tensor([0.6, 0.0, 0.0, 0.8], requires_grad=True)
+    mixed = nodes.slerp(q, q.detach().clone(), 0.3)
+    mixed.sum().backward()
+    assert torch.isfinite(q.grad).all()
+
+
+def test_pose_gradient_by_finite_differences():
+    node = RigidNode.from_track(track(), learn_pose=True)
+    for name in ("_quats", "_rotations", "_positions"):
+        setattr(node, name, getattr(node, name).double())
+    local = torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    quats = torch.randn(3, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def placed(offsets):
+        node.offsets.columns["offsets"] = offsets
+        means, turned = node.place(local, quats, 0.8)
+        return torch.cat([means.flatten(), turned.flatten()])
+
+    assert torch.autograd.gradcheck(placed, [(0.1 * torch.randn(4, 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)).requires_grad_()])
+
+
+@settings(max_examples=25)
+@given(st.lists(st.floats(-1, 1), min_size=8, max_size=8))
+def test_left_product_matrix_is_the_rotation_product(values):
+    a, b = torch.tensor(values[:4], dtype=torch.float64), torch.tensor(values[4:], dtype=torch.float64)
+    if a.norm() < 0.1 or b.norm() < 0.1:
+        return
+    product = nodes.left_product_matrix(a) @ b
+    assert torch.allclose(nodes.rotation_matrix(product), nodes.rotation_matrix(a) @ nodes.rotation_matrix(b), atol=1e-10)
+
+
+# ---- composing ------------------------------------------------------------------------------------------------------
+
+
+def test_compose_places_objects_and_hides_absent_ones():
+    scene = model()
+    g = compose(scene, 0.3)
+    table = scene.table
+    assert torch.equal(g.means[:5], table["means"][:5])
+    world = geometry.transform_points(track().pose_at(0.3), table["means"][5:9].detach().numpy())
+    assert np.abs(g.means[5:9].detach().numpy() - world).max() < 1e-5
+    assert torch.equal(g.opacity[:9], torch.sigmoid(table["logits"][:9]))
+    assert (g.opacity[9:] == 0).all()  # the van's track begins at 5 s
+    assert torch.equal(g.scales, torch.exp(table["log_scales"]))
+    assert g.node.tolist() == [0] * 5 + [1] * 4 + [2] * 3
+    assert (compose(scene, 5.3).opacity[5:9] == 0).all()
+    assert (compose(scene, 5.3).opacity[9:] > 0).all()
+
+
+def test_composed_rotations_turn_the_axes_with_the_box():
+    scene = model()
+    g = compose(scene, 0.7)
+    turned = track().pose_at(0.7)[:3, :3] @ geometry.matrix_from_quaternion(scene.table["quats"][6].detach().numpy())
+    assert np.abs(geometry.matrix_from_quaternion(g.quats[6].detach().numpy()) - turned).max() < 1e-5
+
+
+def test_colour_bands():
+    scene = model(degree=2)
+    assert compose(scene, 0.3).sh.shape == (12, 9, 3)
+    assert torch.equal(compose(scene, 0.3, sh_degree=1).sh[:, 1:], scene.table["sh_rest"][:, :3])
+    assert compose(scene, 0.3, sh_degree=0).sh.shape == (12, 1, 3)
+    assert compose(scene, 0.3, semantics=False).extra is None
+
+
+def test_gradients_reach_every_column_of_present_rows():
+    scene = model(degree=1)
+    g = compose(scene, 0.3)
+    sum(x.square().sum() for x in (g.means, g.quats, g.scales, g.opacity, g.sh, g.extra)).backward()
+    for name, gradient in scene.table.gradients().items():
+        assert (gradient[:9].flatten(1).abs().sum(1) if gradient.ndim > 1 else gradient[:9].abs()).min() > 0, name
+    assert set(scene.table.gradients()) == set(scene.table.columns)
+    assert (scene.table["logits"].grad[9:] == 0).all()
+
+
+def test_removing_a_track_equals_composing_without_it():
+    scene = model()
+    edited = without_tracks(scene, ["car"])
+    assert edited.node_names() == ("van",)
+    full, cut = compose(scene, 5.4), compose(edited, 5.4)
+    keep = scene.table.labels["node"] != 1
+    assert torch.equal(cut.means, full.means[keep])
+    assert cut.node.tolist() == [0] * 5 + [1] * 3
+    assert len(scene.table) == 12
+    with pytest.raises(UsageError, match="no moving object 'tram'"):
+        without_tracks(scene, ["tram"])
+
+
+# ---- sky ------------------------------------------------------------------------------------------------------------
+
+
+def looking(yaw: float, width: int = 40, height: int = 30) -> View:
+    cam = Camera("c", width, height, 30.0, 30.0, width / 2, height / 2)
+    return View(cam, geometry.yaw_matrix(yaw, (100.0, -50.0, 2.0)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.5, math.pi, -2.0])
+def test_sky_shows_the_colour_of_the_direction(yaw):
+    """Paint each texel with its own direction; every pixel must then show its own ray, also across the seam at pi."""
+    sky = SkyNode.uniform(90)
+    rows, cols = 90, 180
+    elevation = math.pi / 2 - (np.arange(rows) + 0.5) * math.pi / rows
+    longitude = -math.pi + (np.arange(cols) + 0.5) * 2 * math.pi / cols
+    painted = np.stack([
+        np.cos(elevation)[:, None] * np.cos(longitude), np.cos(elevation)[:, None] * np.sin(longitude),
+        np.repeat(np.sin(elevation)[:, None], cols, 1),
+    ])  # fmt: skip
+    sky.table.columns["panorama"].detach().copy_(torch.from_numpy(painted).float()[None])
+    view = looking(yaw)
+    shown = sky.at(view).detach().numpy()
+    u, v = np.meshgrid(np.arange(40) + 0.5, np.arange(30) + 0.5)
+    rays = np.stack([(u - 20) / 30, (v - 15) / 30, np.ones_like(u)], -1) @ view.world_from_cam[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    assert np.abs(shown.transpose(1, 2, 0) - rays).max() < 0.03
+
+
+def test_sky_does_not_depend_on_where_the_camera_stands():
+    sky = SkyNode.uniform(16)
+    with torch.no_grad():
+        sky.table["panorama"].copy_(torch.rand(1, 3, 16, 32, generator=torch.Generator().manual_seed(0)))
+    near = looking(0.4)
+    far = View(near.camera, geometry.from_rotation_translation(near.world_from_cam[:3, :3], [0.0, 0.0, 0.0]), 3.0)
+    assert torch.equal(sky.at(near), sky.at(far))
+
+
+def test_sky_filled_from_measured_colours():
+    sky = SkyNode.uniform(32)
+    generator = np.random.Generator(np.random.PCG64(0))
+    directions = generator.normal(size=(4000, 3))
+    directions[:, 2] = np.abs(directions[:, 2])
+    red = directions[:, 1] > 0
+    sky.fill(directions, np.where(red[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]).astype(np.float32))
+    left, right = sky.at(looking(math.pi / 2)), sky.at(looking(-math.pi / 2))
+    assert left[0, 5, 20] > 0.95
+    assert right[2, 5, 20] > 0.95
+
+
+def test_semantics_of_uncovered_pixels_are_sky():
+    scene = model()
+    logits = torch.zeros(3, 2, 2)
+    logits[0] = 3.0
+    alpha = torch.tensor([[[1.0, 0.0], [0.9, 0.1]]])
+    channel = nodes.composite_semantics(scene, logits, alpha).argmax(0)
+    assert [[scene.classes[c] for c in row] for row in channel.tolist()] == [[ID["road"], ID["sky"]], [ID["road"], ID["sky"]]]
+
+
+# ---- state ----------------------------------------------------------------------------------------------------------
+
+
+def test_state_round_trip_keeps_everything():
+    scene = model(learn_poses=True, degree=1)
+    with torch.no_grad():
+        scene.nodes[1].offsets["offsets"].fill_(0.05)
+        scene.table.moment1["means"].fill_(0.5)
+    values, groups = scene.state()
+    again = SceneModel.from_state(values, groups)
+    for time_s in (0.3, 5.7):
+        before, after = compose(scene, time_s), compose(again, time_s)
+        for name in ("means", "quats", "scales", "opacity", "sh", "extra", "node"):
+            assert torch.equal(getattr(before, name), getattr(after, name)), name
+    assert torch.equal(scene.sky.at(looking(0.2)), again.sky.at(looking(0.2)))
+    assert torch.equal(again.table.moment1["means"], scene.table.moment1["means"])
+    assert again.nodes[1].learn_pose
+    assert again.facts == {"method": "test"}
+
+
+def test_damaged_state_is_refused():
+    values, groups = model().state()
+    with pytest.raises(InputError, match="unknown kind"):
+        SceneModel.from_state({**values, "nodes": [{"kind": "ghost"}]}, groups)
+    with pytest.raises(InputError, match="does not exist"):
+        SceneModel.from_state({**values, "classes": [0, 40, 1]}, groups)
+    with pytest.raises(InputError, match="belongs to no node"):
+        SceneModel.from_state({**values, "nodes": values["nodes"][:1]}, groups)
+
+
+# ---- the table -------------------------------------------------------------------------------------------------------
+
+
+def tagged_table(count: int = 6) -> Table:
+    """Every column, moment and label of row i holds the number i."""
+    number = torch.arange(count, dtype=torch.float32)
+    table = Table({"a": number.clone(), "b": number[:, None].repeat(1, 3)}, {"node": torch.arange(count, dtype=torch.int32)})
+    for moments, factor in ((table.moment1, 10), (table.moment2, 100)):
+        moments["a"] = factor * number
+        moments["b"] = factor * number[:, None].repeat(1, 3)
+    return table
+
+
+def rows_agree(table: Table) -> bool:
+    tag = table.labels["node"].float()
+    return all(
+        torch.equal(x, f * (tag if x.ndim == 1 else tag[:, None].expand_as(x)))
+        for f, group in ((1, table.columns), (10, table.moment1), (100, table.moment2))
+        for x in group.values()
+    )
+
+
+@settings(max_examples=40)
+@given(st.lists(st.integers(0, 5), max_size=12))
+def test_take_moves_everything_together(rows):
+    table = tagged_table()
+    table.take(torch.tensor(rows, dtype=torch.long))
+    assert table.labels["node"].tolist() == rows
+    assert rows_agree(table)
+    assert all(value.is_leaf and value.requires_grad for value in table.columns.values())
+
+
+def test_append_gives_zero_moments_and_wants_every_column():
+    table = tagged_table(2)
+    table.append({"a": torch.tensor([7.0]), "b": torch.full((1, 3), 7.0)}, {"node": torch.tensor([7], dtype=torch.int32)})
+    assert table["a"].tolist() == [0, 1, 7]
+    assert table.moment1["a"].tolist() == [0, 10, 0]
+    assert table.labels["node"].tolist() == [0, 1, 7]
+    with pytest.raises(InputError, match="fill every column"):
+        table.append({"a": torch.tensor([7.0])}, {"node": torch.tensor([7])})
+
+
+def test_adam_kernel_equals_torch_optim():
+    g = torch.Generator().manual_seed(0)
+    start = torch.randn(20, 3, generator=g)
+    table, reference = Table({"x": start}), start.clone().requires_grad_()
+    optimiser = torch.optim.Adam([reference], lr=0.02, eps=1e-15)
+    for step in range(1, 6):
+        gradient = torch.randn(20, 3, generator=g)
+        table["x"].grad, reference.grad = gradient.clone(), gradient.clone()
+        table.adam_step(step, {"x": 0.02}, torch_adam)
+        optimiser.step()
+    assert torch.allclose(table["x"], reference, atol=1e-6)
+
+
+def test_sparse_adam_leaves_unseen_rows_alone():
+    table = tagged_table(4)
+    before = table.state()
+    before = {name: value.clone() for name, value in before.items()}
+    for value in table.columns.values():
+        value.grad = torch.ones_like(value)
+    table.adam_step(1, {"a": 0.1, "b": 0.1}, torch_adam, visible=torch.tensor([True, False, True, False]))
+    for name, value in table.state().items():
+        same = (value == before[name]).reshape(4, -1).all(1).tolist()
+        assert same[1], name
+        assert same[3], name
+        assert not same[2] or name.startswith("label"), name
+
+
+# ---- starting values -------------------------------------------------------------------------------------------------
+
+
+def test_voxel_filter_keeps_one_per_cell():
+    xyz = np.array([[0.01, 0, 0], [0.02, 0, 0], [0.2, 0, 0], [-0.01, 0, 0]], np.float32)
+    assert nodes.voxel_filter(xyz, 0.1).tolist() == [0, 2, 3]
+    mixed = nodes.voxel_filter(np.repeat(xyz, 2, 0) + np.array([0, 50.0, 0]), np.array([0.1, 2.0] * 4))
+    assert 3 < len(mixed) <= 6
+
+
+def test_starting_columns_show_the_points_colours():
+    xyz = np.random.Generator(np.random.PCG64(0)).normal(size=(50, 3)).astype(np.float32)
+    rgb = np.random.Generator(np.random.PCG64(1)).integers(0, 256, (50, 3)).astype(np.uint8)
+    made = nodes.columns_from_points(xyz, rgb, np.full(50, ID["car"], np.uint8), (ID["road"], ID["car"]), 1)
+    shown = made["sh_dc"][:, 0] * nodes.SH_C0 + 0.5
+    assert np.abs(shown.numpy() * 255 - rgb).max() < 1e-3
+    assert (made["semantics"].argmax(1) == 1).all()
+    assert torch.allclose(torch.sigmoid(made["logits"]), torch.tensor(0.1))
+    assert made["sh_rest"].shape == (50, 3, 3)
+
+
+def test_neighbour_scale_of_a_grid_is_its_pitch():
+    axis = np.arange(6) * 0.25
+    grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
+    assert nodes.neighbour_scale(grid) == pytest.approx(0.25, abs=1e-5)
+
+
+def test_box_grid_lies_on_the_box():
+    xyz, rgb = nodes.box_grid((4.0, 2.0, 1.5), (10, 20, 30))
+    assert (np.abs(xyz) <= 0.5 * np.array([4.0, 2.0, 1.5])).all()
+    assert (rgb == [10, 20, 30]).all()

@@ -1,0 +1,125 @@
+"""Rendering a fitted scene: trajectories by configuration, folders, videos, resuming, edits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_world import CAR_SIZE, car_pose, fused_cloud, write_scene
+
+from mudg.base import geometry, store
+from mudg.base.errors import UsageError
+from mudg.base.palette import ID
+from mudg.data.cloudfile import write_fused
+from mudg.data.exporters.video import read_mp4
+from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.data.scenefile import read_scene
+from mudg.stages import fit, render
+from mudg.stages.config import FitConfig, RenderConfig
+
+FRAMES = 4
+SHIFTS = (0.0, 2.0, -3.0)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("world")
+    write_scene(root / "scene", frames=FRAMES, cameras=("front", "left"), width=60, height=40)
+    write_fused(root / "fuse", fused_cloud(FRAMES), {})
+    config = FitConfig(method="street_gaussians", iterations=60, initial_gaussians=900, max_gaussians=1500)
+    fit.run(config, root / "scene", root / "fuse", root / "fit")
+    return {"scene": root / "scene", "model": root / "fit"}
+
+
+@pytest.fixture(scope="module")
+def rendered(world, tmp_path_factory) -> Path:
+    return render.run(RenderConfig(shifts_m=SHIFTS), world["scene"], world["model"], tmp_path_factory.mktemp("r") / "out")
+
+
+def test_one_folder_and_video_per_trajectory(rendered):
+    names = {"front_recorded", "front_shift+2.0", "front_shift-3.0"}
+    assert set(list_observation_sets(rendered)) == names
+    for name in names:
+        assert len(read_observations(rendered / name)) == FRAMES
+        assert read_mp4(rendered / f"{name}.mp4").shape == (FRAMES, 40, 3 * 60 + 4, 3)
+    store.verify_manifest(rendered)
+
+
+def test_observations_hold_all_modalities(rendered):
+    seen = read_observations(rendered / "front_shift+2.0")[1]
+    assert seen.kind == "virtual"
+    assert seen.source == "street_gaussians"
+    sky = seen.semantics == ID["sky"]
+    assert 0.05 < sky.float().mean() < 0.6
+    assert torch.equal(sky, torch.isnan(seen.depth[0]))
+    covered = torch.isfinite(seen.depth)
+    assert ((seen.depth > 0.1) & (seen.depth < 200))[covered].all()
+    assert ((seen.confidence >= 0) & (seen.confidence <= 1)).all()
+    assert seen.confidence[covered].mean() > 0.8
+
+
+def test_views_lie_where_the_trajectory_says(rendered):
+    recorded, left = read_observations(rendered / "front_recorded").views, read_observations(rendered / "front_shift+2.0").views
+    for a, b in zip(recorded, left):
+        assert np.linalg.norm(b.center_world - a.center_world) == pytest.approx(2.0, abs=1e-9)
+        assert b.time_s == a.time_s
+
+
+def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_path, monkeypatch):
+    config = RenderConfig(shifts_m=(0.0, 2.0), video=False)
+    whole = render.run(config, world["scene"], world["model"], tmp_path / "whole")
+    real, calls = render.render_view, []
+
+    def stop_at_third(*arguments):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(render, "render_view", stop_at_third)
+    with pytest.raises(KeyboardInterrupt):
+        render.run(config, world["scene"], world["model"], tmp_path / "parts")
+    parts = render.run(config, world["scene"], world["model"], tmp_path / "parts")
+    assert len(calls) == 3 + 2 * FRAMES - 2
+    for name in ("front_recorded", "front_shift+2.0"):
+        first, second = read_observations(whole / name), read_observations(parts / name)
+        for index in range(FRAMES):
+            for field in ("rgb", "depth", "semantics", "confidence"):
+                assert torch.equal(*(torch.nan_to_num(getattr(o[index], field)) for o in (first, second))), (name, index, field)
+    calls.clear()
+    assert render.run(config, world["scene"], world["model"], tmp_path / "parts") == parts
+    assert not calls
+
+
+def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
+    folder = render.run(RenderConfig(shifts_m=(0.0,), remove_tracks=("car",), video=False), world["scene"], world["model"], tmp_path / "out")
+    seen = read_observations(folder / "front_recorded")[1]
+    with_car = fit.render_view(fit.load_model(world["model"]), seen.view, render.RasterConfig())
+    uv, _ = geometry.project(seen.view, (car_pose(seen.view.time_s)[:3, 3] - [0, 0, CAR_SIZE[2] / 4])[None])
+    row, column = int(uv[0, 1]), int(uv[0, 0])
+    assert with_car.semantics[row, column] == ID["car"]
+    assert seen.semantics[row, column] != ID["car"]
+    with pytest.raises(UsageError, match="no moving object 'tram'"):
+        render.run(RenderConfig(remove_tracks=("tram",)), world["scene"], world["model"], tmp_path / "other")
+
+
+def test_any_camera_any_width(world):
+    scene = read_scene(world["scene"])
+    paths = render.trajectories(scene, RenderConfig(cameras=("left",), shifts_m=(0.0, -1.5), width_px=30, height_m=0.5))
+    assert [path.name for path in paths] == ["left_shift+0.0_up+0.5", "left_shift-1.5_up+0.5"]
+    assert paths[0].views[0].camera.width == 30
+    assert paths[0].views[0].camera.height == 20
+    with pytest.raises(UsageError, match="no camera named 'rear'"):
+        render.trajectories(scene, RenderConfig(cameras=("rear",)))
+    with pytest.raises(UsageError, match="no shifts"):
+        render.trajectories(scene, RenderConfig(shifts_m=()))
+
+
+def test_writer_and_render_agree_on_finished(rendered):
+    """An observation folder counts as finished by its index only."""
+    with ObservationWriter(rendered / "front_recorded", "front_recorded", "x") as writer:
+        assert writer.done == FRAMES
+        for view in read_observations(rendered / "front_recorded").views:
+            writer.skip(view)

@@ -1,0 +1,187 @@
+"""Trajectories: which left, exact distances on a curve, side cameras, a standing car, resampling, splines."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, View
+from mudg.core import trajectory
+
+RADIUS_M = 30.0
+YAWS = {"front": 0.0, "left": 1.0, "back": math.pi}
+
+
+def drive(poses: list[np.ndarray], cameras: dict[str, float] = YAWS) -> Scene:
+    """A scene without files: cameras mounted 1 m ahead and 1.5 m up, turned left by the given yaw."""
+    times = np.arange(len(poses)) * 0.1
+    mounted = {name: Camera(name, 64, 48, 50.0, 50.0, 32.0, 24.0) for name in cameras}
+    frames = []
+    for name, yaw in cameras.items():
+        ego_from_cam = geometry.yaw_matrix(yaw, (1.0, 0.0, 1.5)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
+        for index, pose in enumerate(poses):
+            frames.append(Frame(f"{name}/{index:06d}", View(mounted[name], pose @ ego_from_cam, times[index]), Ref(f"images/{name}/{index}.png")))
+    return Scene("drive", ".", mounted, tuple(frames), (), (), EgoPath(times, np.stack(poses)), {}, Source("test", "none"))
+
+
+def circle(count: int = 20) -> Scene:
+    """A left turn of 30 m radius about (0, 30), heading along the tangent."""
+    angles = np.linspace(0, 1.2, count)
+    return drive([geometry.yaw_matrix(a, (RADIUS_M * math.sin(a), RADIUS_M * (1 - math.cos(a)), 0.3)) for a in angles])
+
+
+@pytest.mark.parametrize("shift_m", [2.0, -3.0, 4.0])
+def test_on_a_circle_the_ego_stays_on_a_concentric_circle(shift_m):
+    """Left of a left turn is inside: the radius shrinks by exactly the shift, at every frame."""
+    scene = circle()
+    for ego, old, new in zip(scene.ego.world_from_ego, trajectory.recorded(scene, "front").views, trajectory.shifted(scene, "front", shift_m).views):
+        moved = ego[:3, 3] + new.center_world - old.center_world
+        assert np.hypot(moved[0], moved[1] - RADIUS_M) == pytest.approx(RADIUS_M - shift_m, abs=1e-9)
+        assert moved[2] == pytest.approx(0.3, abs=1e-12)
+
+
+@pytest.mark.parametrize("camera", list(YAWS))
+@pytest.mark.parametrize("shift_m", [2.0, -2.5])
+def test_every_camera_moves_by_the_distance_to_the_left_of_travel(camera, shift_m):
+    scene = circle()
+    path = scene.ego.world_from_ego[:, :3, 3]
+    for index, (old, new) in enumerate(zip(trajectory.recorded(scene, camera).views, trajectory.shifted(scene, camera, shift_m).views)):
+        move = new.center_world - old.center_world
+        assert np.linalg.norm(move) == pytest.approx(abs(shift_m), abs=1e-12)
+        if 0 < index < len(path) - 1:
+            tangent = path[index + 1] - path[index - 1]
+            assert np.cross(tangent, move)[2] * shift_m > 0  # counter-clockwise of travel = left
+            assert abs(tangent @ move) < 1e-3 * np.linalg.norm(tangent) * abs(shift_m)
+        assert np.array_equal(new.world_from_cam[:3, :3], old.world_from_cam[:3, :3])
+
+
+def test_a_side_camera_does_not_slide_along_its_own_x_axis():
+    """The camera looking left has its x axis along the road; a lateral shift must not follow it."""
+    scene = drive([geometry.yaw_matrix(0.0, (float(i), 0.0, 0.0)) for i in range(3)], {"side": math.pi / 2})
+    old, new = trajectory.recorded(scene, "side").views[1], trajectory.shifted(scene, "side", 2.0).views[1]
+    assert abs(old.world_from_cam[:3, 0] @ (new.center_world - old.center_world)) < 1e-12
+    assert (new.center_world - old.center_world).tolist() == pytest.approx([0.0, 2.0, 0.0])
+
+
+def test_a_standing_car_still_has_a_left():
+    scene = drive([geometry.yaw_matrix(0.7, (5.0, 1.0, 0.0))] * 4)
+    move = trajectory.shifted(scene, "front", 3.0).views[2].center_world - trajectory.recorded(scene, "front").views[2].center_world
+    assert move.tolist() == pytest.approx([-3 * math.sin(0.7), 3 * math.cos(0.7), 0.0])
+
+
+def test_reversing_keeps_the_vehicles_left():
+    scene = drive([geometry.yaw_matrix(0.0, (-float(i), 0.0, 0.0)) for i in range(4)])
+    move = trajectory.shifted(scene, "front", 1.0).views[1].center_world - trajectory.recorded(scene, "front").views[1].center_world
+    assert move.tolist() == pytest.approx([0.0, 1.0, 0.0])
+    assert np.abs(trajectory.heading_against_path_rad(scene.ego)).tolist() == pytest.approx([math.pi] * 4)
+
+
+def test_a_banked_road_shifts_horizontally():
+    roll = np.eye(4)
+    roll[:3, :3] = [[1, 0, 0], [0, math.cos(0.2), -math.sin(0.2)], [0, math.sin(0.2), math.cos(0.2)]]
+    scene = drive([roll] * 2)
+    move = trajectory.shifted(scene, "front", 2.0).views[0].center_world - trajectory.recorded(scene, "front").views[0].center_world
+    assert move.tolist() == pytest.approx([0.0, 2.0, 0.0])
+
+
+def test_height_and_yaw():
+    scene = circle()
+    old, new = trajectory.recorded(scene, "front").views[3], trajectory.shifted(scene, "front", 0.0, height_m=0.5, yaw_rad=0.3).views[3]
+    assert (new.center_world - old.center_world).tolist() == pytest.approx([0, 0, 0.5])
+    forward_old, forward_new = old.world_from_cam[:3, 2], new.world_from_cam[:3, 2]
+    turned = math.atan2(forward_new[1], forward_new[0]) - math.atan2(forward_old[1], forward_old[0])
+    assert turned == pytest.approx(0.3, abs=1e-9)
+
+
+def test_names_and_origin():
+    scene = circle(3)
+    assert trajectory.recorded(scene, "front").name == "front_recorded"
+    assert trajectory.shifted(scene, "front", 2.0).name == "front_shift+2.0"
+    assert trajectory.shifted(scene, "front", -4.0).name == "front_shift-4.0"
+    assert trajectory.shifted(scene, "front", -4.0).origin == "shifted"
+
+
+def test_heading_follows_the_path_on_the_circle():
+    angles = trajectory.heading_against_path_rad(circle().ego)
+    assert np.abs(angles[1:-1]).max() < 1e-9
+
+
+def test_errors_in_words():
+    scene = circle(3)
+    with pytest.raises(UsageError, match="no camera named 'rear'"):
+        trajectory.recorded(scene, "rear")
+    with pytest.raises(UsageError, match="shift_m"):
+        trajectory.shifted(scene, "front", math.nan)
+    side = np.eye(4)
+    side[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    with pytest.raises(InputError, match="left axis is vertical"):
+        trajectory.shifted(drive([side]), "front", 1.0)
+
+
+def test_no_ego_pose_at_a_frame():
+    scene = circle(12)
+    short = EgoPath(scene.ego.times_s[:3], scene.ego.world_from_ego[:3])
+    cut = Scene(scene.id, ".", scene.cameras, scene.frames, (), (), short, {}, scene.source)
+    with pytest.raises(InputError, match="no ego pose"):
+        trajectory.shifted(cut, "front", 1.0)
+
+
+def test_resampling_by_count_and_speed():
+    recorded = trajectory.recorded(circle(21), "front")
+    double = trajectory.resampled(recorded, count=41)
+    assert len(double) == 41
+    for index in (0, 7, 20):
+        assert np.array_equal(double.views[2 * index].world_from_cam, recorded.views[index].world_from_cam)
+    fast = trajectory.resampled(recorded, speed_factor=2.0)
+    assert [view.time_s for view in fast.views] == pytest.approx([view.time_s for view in recorded.views[::2]])
+    slow = trajectory.resampled(recorded, speed_factor=0.5)
+    assert len(slow) == 41
+    assert len(trajectory.resampled(recorded, count=1)) == 1
+    for wrong in ({}, {"count": 2, "speed_factor": 1.0}, {"speed_factor": 0.0}, {"count": 0}):
+        with pytest.raises(UsageError):
+            trajectory.resampled(recorded, **wrong)
+
+
+def test_spline_passes_through_its_keys_and_is_smooth():
+    recorded = trajectory.recorded(circle(6), "front")
+    keys = [view.world_from_cam for view in recorded.views]
+    times = [view.time_s for view in recorded.views]
+    fine = np.linspace(times[0], times[-1], 101)
+    path = trajectory.spline_through(keys, recorded.views[0].camera, times, fine)
+    assert path.origin == "planned"
+    for key, time_s in zip(keys, times):
+        near = path.views[int(round((time_s - times[0]) / (fine[1] - fine[0])))]
+        assert np.abs(near.world_from_cam - key).max() < 1e-9
+    centers = np.stack([view.center_world for view in path.views])
+    turn = np.diff(centers, 2, axis=0)
+    assert np.linalg.norm(np.diff(turn, axis=0), axis=1).max() < 0.05 * np.linalg.norm(np.diff(centers, axis=0), axis=1).mean()
+
+
+def test_spline_of_one_and_two_poses_and_its_refusals():
+    pose = geometry.yaw_matrix(0.2, (1.0, 2.0, 3.0))
+    cam = Camera("c", 8, 8, 8.0, 8.0, 4.0, 4.0)
+    assert len(trajectory.spline_through([pose], cam, [1.0])) == 1
+    middle = trajectory.spline_through([np.eye(4), pose], cam, [0.0, 1.0], [0.5]).views[0]
+    assert np.abs(middle.world_from_cam - geometry.interpolate_pose(np.eye(4), pose, 0.5)).max() < 1e-9
+    with pytest.raises(InputError, match="extrapolated"):
+        trajectory.spline_through([np.eye(4), pose], cam, [0.0, 1.0], [1.5])
+    with pytest.raises(InputError, match="increasing times"):
+        trajectory.spline_through([np.eye(4), pose], cam, [1.0, 1.0])
+    with pytest.raises(InputError, match="not rigid"):
+        trajectory.spline_through([2 * np.eye(4), pose], cam, [0.0, 1.0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-10, 10), st.floats(-3, 3), st.floats(-1, 1))
+def test_shifting_there_and_back_returns(shift_m, height_m, yaw_rad):
+    scene = drive([geometry.yaw_matrix(yaw_rad, (1.0, 2.0, 0.0))])
+    there = trajectory.shifted(scene, "front", shift_m, height_m=height_m).views[0].center_world
+    back = trajectory.shifted(scene, "front", -shift_m, height_m=-height_m).views[0].center_world
+    start = trajectory.recorded(scene, "front").views[0].center_world
+    assert np.abs((there + back) / 2 - start).max() < 1e-9

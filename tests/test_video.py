@@ -1,0 +1,88 @@
+"""MP4 writing and the pictures that go into it."""
+
+from __future__ import annotations
+
+import io
+
+import av
+import numpy as np
+import pytest
+
+from mudg.base import palette
+from mudg.base.errors import InputError
+from mudg.data.exporters import video
+
+
+def clip(count: int = 5, height: int = 32, width: int = 48) -> list[np.ndarray]:
+    """A bright square that moves to the right over a gradient."""
+    frames = []
+    for index in range(count):
+        frame = np.zeros((height, width, 3), np.uint8)
+        frame[..., 0] = np.linspace(20, 120, width)
+        frame[8:20, 4 + 6 * index : 14 + 6 * index] = (240, 230, 40)
+        frames.append(frame)
+    return frames
+
+
+def test_round_trip_keeps_number_size_and_look(tmp_path):
+    frames = clip()
+    path = video.write_mp4(tmp_path / "a.mp4", iter(frames), fps=7)
+    back = video.read_mp4(path)
+    assert back.shape == (5, 32, 48, 3)
+    error = np.abs(back.astype(float) - np.stack(frames)).mean()
+    assert error < 8
+    with av.open(str(path)) as container:
+        assert float(container.streams.video[0].average_rate) == pytest.approx(7)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mp4"]
+
+
+def test_odd_sizes_are_padded(tmp_path):
+    frames = [frame[:31, :47] for frame in clip()]
+    assert video.read_mp4(video.write_mp4(tmp_path / "a.mp4", frames)).shape == (5, 32, 48, 3)
+
+
+def test_same_frames_same_bytes(tmp_path):
+    assert video.mp4_bytes(clip()) == video.mp4_bytes(clip())
+    with av.open(io.BytesIO(video.mp4_bytes(clip()))) as container:
+        assert len(list(container.decode(video=0))) == 5
+
+
+def test_refusals_leave_no_file(tmp_path):
+    for frames, words in (
+        ([], "at least one frame"), ([*clip(2), clip(1, 16)[0]], "differ in size"), ([np.zeros((4, 4), np.uint8)], "must be u8"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            video.write_mp4(tmp_path / "a.mp4", frames)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(InputError, match="not a readable video"):
+        video.read_mp4(tmp_path / "text.mp4")
+
+
+def test_depth_colours_are_ordered_and_missing_is_black():
+    depth = np.array([[1.0, 4.0, 15.0, 60.0, 500.0, np.nan, 0.0, -3.0]])
+    colors = video.depth_colors(depth)[0].astype(int)
+    brightness = colors[:5].sum(1)
+    assert (np.diff(brightness) < 0).all()
+    assert (colors[5:] == 0).all()
+    assert brightness[4] > 0
+
+
+def test_semantic_colours():
+    ids = np.array([[palette.ID["road"], palette.UNLABELLED]], np.uint8)
+    assert video.semantic_colors(ids)[0].tolist() == [[128, 64, 128], [0, 0, 0]]
+
+
+def test_side_by_side_places_panels_in_reading_order():
+    panels = [np.full((20, 30, 3), value, np.uint8) for value in (10, 20, 30)]
+    sheet = video.side_by_side(panels, columns=2, gap_px=2)
+    assert sheet.shape == (42, 62, 3)
+    assert sheet[0, 0, 0] == 10
+    assert sheet[0, 32, 0] == 20
+    assert sheet[22, 0, 0] == 30
+    assert sheet[22, 40, 0] == 255
+    titled = video.side_by_side(panels, ["truth", "", "x"])
+    assert (titled[:, :30] != 10).any()
+    assert (titled[:, 32:62] == 20).all()
+    with pytest.raises(InputError, match="one size"):
+        video.side_by_side([panels[0], panels[1][:10]])
