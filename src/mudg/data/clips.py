@@ -1,0 +1,289 @@
+"""Conditions and training clips for the diffusion model.
+
+`build_condition` turns a fused cloud and recorded images into what the model is given for a path of views:
+
+1. the cloud is projected into every view (z-buffer);
+2. far points that shine through gaps between near ones are removed (`remove_shine_through`);
+3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
+4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
+   falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
+5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR.
+
+Steps 2 to 5 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
+only, zero where nothing is known, the reference image in frame 0 being put in by the model.
+
+The generated cities as training data are in `city_clips`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+from torch import Tensor
+from torch.nn import functional
+
+from mudg.base.errors import InputError
+from mudg.base.types import Condition, FusedCloud, Track, View
+from mudg.core.project import ProjectConfig, project_cloud
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionRules:
+    """How a condition is made. Sizes are those of the model's images, distances metres, times seconds."""
+
+    width: int
+    height: int
+    near_m: float = 1.0
+    far_m: float = 100.0
+    point_px: float = 1.0
+    """Side of the square a point covers, at the condition's resolution."""
+    same_time_s: float = 0.06
+    """Recorded images nearer in time than this may also colour moving things."""
+    images_per_view: int = 4
+    """How many recorded images are tried per view, nearest in time (then in place) first."""
+    hidden_share: float = 0.08
+    """A pixel is hidden in a recorded image if a surface there is nearer by this share of its depth plus 0.3 m."""
+    warp: bool = True
+    """Warp recorded images in; otherwise holes keep the nearest point's colour."""
+    backdrop_m: float = 80.0
+    """Distance at which the nearest recorded image is put up as a backdrop."""
+    occluder_m: float = 0.2
+    """Side of the square with which points hide what lies behind them."""
+    published: bool = False
+    """The published system's condition: points only, 0 where nothing was seen, no filling, no warping."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """A recorded image: `rgb` u8[H,W,3] of `view`, any size."""
+
+    view: View
+    rgb: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sparse:
+    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects)."""
+
+    rgb: Tensor
+    depth: Tensor
+    valid: Tensor
+    moving: Tensor
+
+
+def remove_shine_through(depth: NDArray[np.float32], valid: NDArray[np.bool_], reach_px: int = 3) -> NDArray[np.bool_]:
+    """Valid pixels that are not seen through a gap in a nearer surface, bool[H,W].
+
+    A pixel is dropped when clearly nearer (by 15 % and 0.5 m) measured pixels lie within `reach_px` on two opposite
+    sides of it, left and right or above and below. One-sided neighbours are an ordinary edge and stay.
+    """
+    nearest = np.where(valid, depth, np.inf).astype(np.float32)
+    sides = []
+    for axis in (0, 1):
+        for direction in (1, -1):
+            lowest = np.full_like(nearest, np.inf)
+            for step in range(1, reach_px + 1):
+                moved = np.full_like(nearest, np.inf)
+                source = [slice(None), slice(None)]
+                target = [slice(None), slice(None)]
+                source[axis] = slice(None, -step) if direction > 0 else slice(step, None)
+                target[axis] = slice(step, None) if direction > 0 else slice(None, -step)
+                moved[tuple(target)] = nearest[tuple(source)]
+                lowest = np.minimum(lowest, moved)
+            sides.append(lowest)
+    limit = 0.85 * depth - 0.5
+    through = (np.maximum(sides[0], sides[1]) < limit) | (np.maximum(sides[2], sides[3]) < limit)
+    return valid & ~through
+
+
+def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the nearest valid pixel for every pixel; the pixel itself where nothing at all is valid."""
+    if not valid.any():
+        rows, columns = np.indices(valid.shape)
+        return rows, columns
+    rows, columns = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    return rows, columns
+
+
+def resize_image(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """Area-averaged resize of u8[H,W,3] (the same array if the size is right already)."""
+    if rgb.shape[:2] == (height, width):
+        return rgb
+    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BOX))
+
+
+def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the pixels of `view`, at `depth` f32[K,H,W] metres, lie in another view.
+
+    Returns x, y f32[K,H,W] in pixels of the other view and z f32[K,H,W] metres (not positive = behind it).
+    """
+    camera, target = view.camera, other.camera
+    u = (torch.arange(camera.width, dtype=torch.float32) + 0.5 - camera.cx) / camera.fx
+    v = (torch.arange(camera.height, dtype=torch.float32) + 0.5 - camera.cy) / camera.fy
+    m = torch.from_numpy((other.cam_from_world @ view.world_from_cam).astype(np.float32))
+    turned = [m[i, 0] * u[None, :] + m[i, 1] * v[:, None] + m[i, 2] for i in range(3)]
+    px, py, pz = (turned[i] * depth + m[i, 3] for i in range(3))
+    safe = pz.clamp(min=0.1)
+    return target.fx * px / safe + target.cx, target.fy * py / safe + target.cy, pz
+
+
+def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> Tensor:
+    """Values of `image` f32[C,h,w] at pixel coordinates f32[K,H,W] -> f32[K,C,H,W]; the border is repeated outside."""
+    grid = torch.stack([x * (2.0 / image.shape[-1]) - 1, y * (2.0 / image.shape[-2]) - 1], -1)
+    rows = grid.flatten(0, 1)[None]
+    found = functional.grid_sample(image[None], rows, mode=mode, padding_mode="border", align_corners=False)
+    return found[0].unflatten(1, grid.shape[:2]).movedim(0, 1)
+
+
+def inside(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Which of the carried pixels lie in front of and inside the other view, bool of their shape."""
+    return (z > 0.1) & (x >= 0.5) & (x <= view.camera.width - 0.5) & (y >= 0.5) & (y <= view.camera.height - 0.5)
+
+
+def warp(view: View, depth: Tensor, source: Source, surface: Tensor, hidden_share: float) -> tuple[Tensor, Tensor]:
+    """Colours that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
+
+    `surface` f32[h,w]: depth of the nearest surface at the pixels of the recorded image.
+    Returns rgb f32[3,H,W] (bilinear) and found bool[H,W]: inside the image and not hidden in it.
+    """
+    x, y, z = carry(view, depth[None], source.view)
+    in_front = look_up(surface[None], x, y, "nearest")[0, 0]
+    found = inside(source.view, x, y, z)[0] & (in_front >= z[0] * (1 - hidden_share) - 0.3)
+    return look_up(source.rgb, x, y)[0], found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """A recorded image made ready for warping: rgb f32[3,h,w] in [0,1], depth f32[h,w] m (filled), moving bool[h,w]."""
+
+    view: View
+    rgb: Tensor
+    depth: Tensor
+    moving: Tensor
+
+
+def build_condition(
+    cloud: FusedCloud,
+    tracks: Sequence[Track],
+    views: Sequence[View],
+    recorded: Sequence[Recorded],
+    rules: ConditionRules,
+    sources: dict[int, Source] | None = None,
+) -> Condition:
+    """The model's condition for `views` (any path, any size; resized to the rules' size).
+
+    cloud      fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time
+    recorded   images of any cameras; the ones nearest in time to a view are warped into it; may be empty
+    sources    cache of prepared images (index into `recorded` -> Source); pass the same dict again for further views
+    Returns colour and depth filled everywhere (zeros with `published`), `valid` where a point was seen and kept,
+    `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as reference the recorded image of the first view's
+    camera that is nearest in time (black if there is none).
+    Raises InputError for an empty list of views.
+    """
+    if not views:
+        raise InputError("a condition needs at least one view", where="clips.build_condition")
+    small = [view.resized(rules.width, rules.height) for view in views]
+    reference = _reference(small[0], recorded, rules)
+    if rules.published:
+        return _published_condition(cloud, tracks, small, reference, rules)
+    sources = {} if sources is None else sources
+
+    def source(number: int) -> Source:
+        if number not in sources:
+            sources[number] = _prepare_source(cloud, tracks, recorded[number], rules)
+        return sources[number]
+
+    columns: list[tuple[Tensor, ...]] = []
+    for view in small:
+        sparse = project_sparse(cloud, tracks, view, rules)
+        colour, depth, moving = _filled(sparse, rules)
+        found = torch.zeros_like(sparse.valid)
+        backdrop = colour
+        if rules.warp and recorded:
+            order = _order_of_images(view, recorded, rules)
+            far = torch.full((1, *depth.shape), rules.backdrop_m)
+            x, y, _ = carry(view, far, source(order[0]).view)
+            backdrop = look_up(source(order[0]).rgb, x, y)[0]
+            for number in order:
+                image = source(number)
+                fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
+                surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
+                rgb, new = warp(view, depth, image, surface, rules.hidden_share)
+                new = new & ~found if fresh else new & ~found & ~moving
+                colour = torch.where(new, rgb, colour)
+                found = found | new
+        columns.append((colour, depth[None], sparse.valid[None], found[None], backdrop))
+    color, depths, valid, warped, backdrops = (torch.stack(column) for column in zip(*columns))
+    return Condition(tuple(small), color, depths, valid, reference, warped, backdrops)
+
+
+def _filled(sparse: Sparse, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour f32[3,H,W], depth f32[H,W] and moving bool[H,W] of the nearest valid pixel, for every pixel."""
+    if not bool(sparse.valid.any()):
+        return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving
+    rows, columns = (torch.from_numpy(i.astype(np.int64)) for i in nearest_valid(sparse.valid.numpy()))
+    return sparse.rgb[:, rows, columns], sparse.depth[rows, columns], sparse.moving[rows, columns]
+
+
+def _published_condition(
+    cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules
+) -> Condition:
+    sparse = [project_sparse(cloud, tracks, view, rules) for view in views]
+    valid = torch.stack([s.valid for s in sparse])[:, None]
+    color = torch.stack([s.rgb for s in sparse]) * valid
+    return Condition(tuple(views), color, torch.stack([s.depth for s in sparse])[:, None] * valid, valid, reference)
+
+
+def _reference(view: View, recorded: Sequence[Recorded], rules: ConditionRules) -> Tensor:
+    own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
+    if not own:
+        return torch.zeros(3, rules.height, rules.width)
+    nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
+    return _tensor(resize_image(nearest.rgb, rules.width, rules.height))
+
+
+def _tensor(rgb: NDArray[np.uint8]) -> Tensor:
+    return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
+
+
+def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionRules) -> list[int]:
+    """The images to try for a view: nearest in time first (steps of 20 ms), the same camera before others, then by distance."""
+
+    def rank(number: int) -> tuple[float, bool, float]:
+        other = recorded[number].view
+        gap = round(abs(other.time_s - view.time_s) / 0.02)
+        return (gap, other.camera.name != view.camera.name, float(np.linalg.norm(other.center_world - view.center_world)))
+
+    return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
+
+
+def _prepare_source(cloud: FusedCloud, tracks: Sequence[Track], recorded: Recorded, rules: ConditionRules) -> Source:
+    camera = recorded.view.camera
+    scale = (rules.width * rules.height / (camera.width * camera.height)) ** 0.5
+    width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
+    view = recorded.view.resized(width, height)
+    _, depth, moving = _filled(project_sparse(cloud, tracks, view, rules), rules)
+    return Source(view, _tensor(resize_image(recorded.rgb, width, height)), depth, moving)
+
+
+def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules: ConditionRules) -> Sparse:
+    """Project a fused cloud into a view of the condition's resolution (see `Sparse`)."""
+    poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
+    config = ProjectConfig(
+        static_splat_px=rules.point_px,
+        object_splat_px=rules.point_px,
+        near_m=rules.near_m,
+        far_m=rules.far_m,
+        occluder_m=0.0 if rules.published else rules.occluder_m,
+    )
+    seen = project_cloud(cloud, {name: pose for name, pose in poses.items() if pose is not None}, view, config)
+    valid = seen.valid[0]
+    if not rules.published:
+        valid = torch.from_numpy(remove_shine_through(seen.depth[0].numpy(), valid.numpy()))
+    return Sparse(seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid)

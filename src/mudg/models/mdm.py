@@ -1,0 +1,725 @@
+"""The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
+
+Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to do,
+`encode_condition`, `loss` and `sample`. `UNet` is the network. `MDMConfig` is all that distinguishes one model from another.
+
+The network's input is, per latent cell, [noisy latent | latent of the colour condition | latent of the depth condition],
+12 channels in the published model, with optional mask planes after them. What it denoises is chosen by the modality label
+(colour 0, semantics 1, depth 500, as published), or, with `joint`, all modalities at once.
+
+Layouts: conditions and samples [T,C,H,W] of one clip; inside the model [B,T,C,h,w], with (h, w) the latent size; inside
+the UNet [B*T,C,h,w] stored channels-last.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mudg.base import palette, seeds, store
+from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base.types import Condition
+from mudg.core import noise
+from mudg.core.noise import Schedule, ScheduleConfig
+from mudg.models.vae import CLASSES, MODALITIES, ChannelNorm, CodecConfig, Modality, build_codec, semantic_shares
+
+SKY = palette.ID["sky"]
+LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
+"""Modality labels of the published checkpoints; fed through a sinusoid like a time step."""
+
+SHOWN_LABEL_JOINT = 0
+
+
+@dataclass(frozen=True)
+class MDMConfig:
+    """Everything that fixes a model's function except its weights."""
+
+    codec: CodecConfig = CodecConfig()
+    schedule: ScheduleConfig = ScheduleConfig()
+    joint: bool = True
+    """One pass denoises all modalities together; otherwise one pass per modality, told apart by its label."""
+    head: Literal["x0", "v"] = "x0"
+    """Meaning of the network's output."""
+    copy_condition: bool = True
+    """x0 head only: the output is added to the condition's own latent, times a gate that the network predicts."""
+    backdrop: bool = True
+    """Four more input channels: a recorded image carried over as if far away; it can be copied like the condition."""
+    mask_planes: Literal["none", "valid", "valid_image"] = "valid_image"
+    """Extra input planes: none (12 channels, published), where points were seen, and where a recorded image was warped."""
+    reference: Literal["first_frame", "warped"] = "warped"
+    """first_frame: the dense reference replaces frame 0 of the colour condition (published); warped: the condition
+    builder has already warped recorded images into every frame."""
+    patch: int = 2
+    """Latent cells per side of one network cell."""
+    widths: tuple[int, ...] = (64, 128, 224)
+    blocks: tuple[int, ...] = (1, 1, 2)
+    spatial_attention: tuple[bool, ...] = (False, True, True)
+    temporal_attention: tuple[bool, ...] = (False, False, True)
+    head_width: int = 32
+    embed_width: int = 192
+    window: int = 8
+    """Frames per clip the model was made for; other numbers work, only this one is tested."""
+    shared_noise: float = 0.3
+    """Share of the noise variance common to all frames, in training and sampling."""
+
+    def __post_init__(self) -> None:
+        levels = {len(self.widths), len(self.blocks), len(self.spatial_attention), len(self.temporal_attention)}
+        if len(levels) != 1:
+            raise UsageError(
+                "widths, blocks and attention switches must have one entry per level", got=f"{sorted(levels)}"
+            )
+        attended = zip(self.widths, self.spatial_attention, self.temporal_attention)
+        if any((spatial or temporal) and width % self.head_width for width, spatial, temporal in attended):
+            raise UsageError("a width is no multiple of the attention head width", got=f"{self.widths}")
+        if self.joint is False and self.codec.semantics_code != "palette":
+            raise UsageError(
+                "separate passes need all modalities in the same latent shape",
+                expected="codec.semantics_code = palette",
+                got=self.codec.semantics_code,
+            )
+        if self.backdrop and not self.copy_condition:
+            raise UsageError("a backdrop is only used together with copy_condition")
+        if self.head == "v" and (self.copy_condition or self.codec.semantics_code != "palette"):
+            raise UsageError("a v head can neither copy the condition nor give class scores", expected="head = x0")
+
+    @property
+    def pixel_multiple(self) -> int:
+        """Image sides must be multiples of this many pixels."""
+        return 2 * self.patch * 2 ** (len(self.widths) - 1)
+
+
+def config_to_dict(config: MDMConfig) -> dict[str, Any]:
+    """Plain JSON values of a configuration."""
+    return dataclasses.asdict(config)
+
+
+def config_from_dict(values: Mapping[str, Any], where: str = "model configuration") -> MDMConfig:
+    """Inverse of `config_to_dict`; unknown or missing keys are an InputError that names them."""
+
+    def strict(cls: Any, given: Any, path: str) -> dict[str, Any]:
+        known = {f.name for f in dataclasses.fields(cls)}
+        if not isinstance(given, Mapping) or set(given) != known:
+            names = set(given) if isinstance(given, Mapping) else set()
+            raise InputError(
+                "a model configuration has other fields than this version knows",
+                where=f"{where}: {path}",
+                expected=", ".join(sorted(known)),
+                got="missing " + ", ".join(sorted(known - names)) + "; unknown " + ", ".join(sorted(names - known)),
+            )
+        return {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+
+    top = strict(MDMConfig, values, "top")
+    top["codec"] = CodecConfig(**strict(CodecConfig, top["codec"], "codec"))
+    top["schedule"] = ScheduleConfig(**strict(ScheduleConfig, top["schedule"], "schedule"))
+    try:
+        return MDMConfig(**top)
+    except TypeError as error:
+        raise InputError("a model configuration has a value of a wrong type", where=where, got=str(error)) from error
+
+
+# network --------------------------------------------------------------------------------------------------------------
+
+
+def sinusoid(t: Tensor, width: int) -> Tensor:
+    """[cos, sin] features f32[N,width] of `t` [N], frequencies 10000^(-i / (width/2))."""
+    half = width // 2
+    frequencies = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device) / half)
+    angles = t.float()[:, None] * frequencies
+    return torch.cat([angles.cos(), angles.sin()], 1)
+
+
+def temporal_shift(x: Tensor, frames: int, share: int = 8) -> Tensor:
+    """Move 1/share of the channels one frame later and as many one frame earlier; ends keep their own.
+
+    `x` [B*T,C,h,w]. The following convolution then mixes neighbouring frames at no cost (Lin et al., "TSM").
+    """
+    n, c, h, w = x.shape
+    if frames == 1:
+        return x
+    k = c // share
+    y = x.permute(0, 2, 3, 1).unflatten(0, (n // frames, frames))
+    late = torch.cat([y[:, :1, ..., :k], y[:, :-1, ..., :k]], 1)
+    early = torch.cat([y[:, 1:, ..., k : 2 * k], y[:, -1:, ..., k : 2 * k]], 1)
+    return torch.cat([late, early, y[..., 2 * k :]], -1).flatten(0, 1).permute(0, 3, 1, 2)
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """Softmax attention of `q` [..,N,C] over `k`, `v` [..,M,C] -> [..,N,C].
+
+    In training as two matrix products (on CPUs the backward pass of the fused kernel costs several times more at these
+    sizes), otherwise through the fused kernel, which never stores the N x M scores.
+    """
+    if torch.is_grad_enabled():
+        scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
+        return scores.softmax(-1).to(v.dtype) @ v
+    return functional.scaled_dot_product_attention(q, k, v)
+
+
+class ResBlock(nn.Module):
+    """norm - temporal shift - conv - norm scaled and moved by the embedding - SiLU - conv, around a residual."""
+
+    def __init__(self, inside: int, outside: int, embed: int) -> None:
+        super().__init__()
+        self.norm1 = ChannelNorm(inside)
+        self.conv1 = nn.Conv2d(inside, outside, 3, padding=1)
+        self.norm2 = ChannelNorm(outside, elementwise_affine=False)
+        self.modulate = nn.Linear(embed, 2 * outside)
+        self.conv2 = nn.Conv2d(outside, outside, 3, padding=1)
+        self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
+        nn.init.zeros_(self.conv2.weight)
+        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
+        scale, move = self.modulate(embedding)[:, :, None, None].chunk(2, 1)
+        h = self.conv1(temporal_shift(self.norm1(x), frames))
+        h = functional.silu(torch.addcmul(move, self.norm2(h), 1 + scale))
+        return self.skip(x) + self.conv2(h)
+
+
+class SpatialAttention(nn.Module):
+    """Self-attention over the cells of a frame; keys and values also come from frame 0 of the clip."""
+
+    def __init__(self, width: int, head_width: int) -> None:
+        super().__init__()
+        self.heads = width // head_width
+        self.norm = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.out = nn.Linear(width, width)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same."""
+        n, c, height, width = x.shape
+        tokens = x.permute(0, 2, 3, 1).reshape(n, height * width, c)
+        normed = self.norm(tokens)
+        key_value = self.key_value(normed)
+        if frames > 1:
+            per_clip = key_value.unflatten(0, (n // frames, frames))
+            first = per_clip[:, :1].expand(-1, frames, -1, -1)
+            key_value = torch.cat([per_clip, first], 2).flatten(0, 1)
+        key, value = key_value.chunk(2, -1)
+        q, k, v = (y.unflatten(-1, (self.heads, -1)).transpose(1, 2) for y in (self.query(normed), key, value))
+        mixed = attend(q, k, v).transpose(1, 2).flatten(2)
+        return (tokens + self.out(mixed)).reshape(n, height, width, c).permute(0, 3, 1, 2)
+
+
+class TemporalAttention(nn.Module):
+    """Self-attention over the frames of a clip at each cell."""
+
+    def __init__(self, width: int, head_width: int) -> None:
+        super().__init__()
+        self.heads = width // head_width
+        self.norm = nn.LayerNorm(width)
+        self.mix = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same."""
+        n, c, height, width = x.shape
+        y = x.permute(0, 2, 3, 1).reshape(n // frames, frames, height * width, c).transpose(1, 2)
+        place = sinusoid(torch.arange(frames, device=x.device), c).to(y.dtype)
+        q, k, v = self.mix(self.norm(y) + place).unflatten(-1, (3, self.heads, -1)).movedim(-3, 0)
+        q, k, v = (z.transpose(-3, -2).flatten(0, 1) for z in (q, k, v))
+        mixed = attend(q, k, v)
+        mixed = mixed.unflatten(0, y.shape[:2]).transpose(-3, -2).flatten(-2)
+        y = (y + self.out(mixed)).transpose(1, 2).reshape(n, height, width, c)
+        return y.permute(0, 3, 1, 2)
+
+
+class Stage(nn.Module):
+    """One residual block and the attentions that its level has."""
+
+    def __init__(self, inside: int, outside: int, config: MDMConfig, level: int) -> None:
+        super().__init__()
+        self.block = ResBlock(inside, outside, config.embed_width)
+        spatial, temporal = config.spatial_attention[level], config.temporal_attention[level]
+        self.spatial = SpatialAttention(outside, config.head_width) if spatial else None
+        self.temporal = TemporalAttention(outside, config.head_width) if temporal else None
+
+    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
+        x = self.block(x, embedding, frames)
+        if self.spatial is not None:
+            x = self.spatial(x, frames)
+        if self.temporal is not None:
+            x = self.temporal(x, frames)
+        return x
+
+
+class UNet(nn.Module):
+    """The denoising network of the small models: a U of `Stage`s over the cells of a patched latent video."""
+
+    def __init__(self, config: MDMConfig, planes_in: int, planes_out: int) -> None:
+        super().__init__()
+        widths, embed, area = config.widths, config.embed_width, config.patch**2
+        self.patch = config.patch
+        self.time = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
+        self.label = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
+        self.enter = nn.Conv2d(planes_in * area, widths[0], 1)
+        width, skips = widths[0], [widths[0]]
+        self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
+        for level, outside in enumerate(widths):
+            stages = nn.ModuleList()
+            for _ in range(config.blocks[level]):
+                stages.append(Stage(width, outside, config, level))
+                width = outside
+                skips.append(width)
+            self.down.append(stages)
+            if level + 1 < len(widths):
+                self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
+                width = widths[level + 1]
+                skips.append(width)
+        self.middle = Stage(width, width, config, len(widths) - 1)
+        self.up, self.grow = nn.ModuleList(), nn.ModuleList()
+        for level in reversed(range(len(widths))):
+            stages = nn.ModuleList()
+            for _ in range(config.blocks[level] + 1):
+                stages.append(Stage(width + skips.pop(), widths[level], config, level))
+                width = widths[level]
+            self.up.append(stages)
+            if level:
+                self.grow.append(nn.Conv2d(width, 4 * widths[level - 1], 1))
+                width = widths[level - 1]
+        self.norm = ChannelNorm(width)
+        self.leave = nn.Conv2d(width, planes_out * area, 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, t: Tensor, label: Tensor) -> Tensor:
+        """`x` [B,T,planes_in,h,w], `t` and `label` i64[B] -> f32 [B,T,planes_out,h,w]."""
+        batch, frames = x.shape[:2]
+        embedding = self.time(sinusoid(t, 64)) + self.label(sinusoid(label, 64))
+        embedding = functional.silu(embedding).repeat_interleave(frames, 0)
+        h = functional.pixel_unshuffle(x.flatten(0, 1), self.patch)
+        h = self.enter(h.contiguous(memory_format=torch.channels_last))
+        skips = [h]
+        for level, stages in enumerate(self.down):
+            for stage in stages:
+                h = stage(h, embedding, frames)
+                skips.append(h)
+            if level < len(self.shrink):
+                h = self.shrink[level](h)
+                skips.append(h)
+        h = self.middle(h, embedding, frames)
+        for index, stages in enumerate(self.up):
+            for stage in stages:
+                h = stage(torch.cat([h, skips.pop()], 1), embedding, frames)
+            if index < len(self.grow):
+                h = functional.pixel_shuffle(self.grow[index](h), 2).contiguous(memory_format=torch.channels_last)
+        h = self.leave(functional.silu(self.norm(h)))
+        return functional.pixel_shuffle(h.float(), self.patch).unflatten(0, (batch, frames))
+
+
+# model ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A batch of conditions as the network wants them.
+
+    planes f32[B,T,8+backdrop+masks,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth; backdrop: the
+    same of the backdrop or None; seen: share of the cell that is trustworthy, [B,T,1,h,w] in [0,1], per modality.
+    """
+
+    planes: Tensor
+    copy: dict[Modality, Tensor]
+    backdrop: Tensor | None
+    seen: dict[Modality, Tensor]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A generated clip.
+
+    rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1]; modalities not asked
+    for are None. `latents`: modality -> [T,C,h,w], to be handed to the next window as `known`.
+    """
+
+    rgb: Tensor | None
+    depth: Tensor | None
+    semantics: Tensor | None
+    confidence: Tensor
+    latents: dict[Modality, Tensor] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Loss of a batch: `total` scalar with gradient; `terms` the weighted parts as floats."""
+
+    total: Tensor
+    terms: dict[str, float]
+
+
+COPY_BIAS = 4.0
+"""Start value of the copy gates' logits where the cell is seen (minus this for the backdrop); 0 where it is not."""
+
+LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
+"""Weights of the modalities in the joint loss."""
+
+
+class MDM(nn.Module):
+    """The multi-modal diffusion model (see the module text). Weights are random until `load` or `learn` sets them."""
+
+    def __init__(self, config: MDMConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.codec = build_codec(config.codec)
+        self.schedule = Schedule(config.schedule)
+        self.passes: tuple[tuple[Modality, ...], ...] = (MODALITIES,) if config.joint else tuple((m,) for m in MODALITIES)
+        masks = {"none": 0, "valid": 1, "valid_image": 2}[config.mask_planes] * self.codec.factor**2
+        noisy = sum(self.codec.channels[m] for m in self.passes[0])
+        self.gates = (2 if config.copy_condition else 0) + (1 if config.backdrop else 0)
+        planes = noisy + 8 + (4 if config.backdrop else 0) + masks
+        self.net = UNet(config, planes, noisy + self.gates).to(memory_format=torch.channels_last)
+
+    # inputs -----------------------------------------------------------------------------------------------------------
+
+    def check_size(self, height: int, width: int) -> None:
+        """UsageError unless an image of this size fits the network's strides."""
+        multiple = self.config.pixel_multiple
+        if height % multiple or width % multiple or height < multiple or width < multiple:
+            raise UsageError(
+                "image size does not fit the diffusion model",
+                expected=f"multiples of {multiple} pixels",
+                got=f"{width}x{height}",
+            )
+
+    def encode_condition(self, condition: Condition | Sequence[Condition]) -> Encoded:
+        """Latents and mask planes of one clip's condition, or of several of the same shape (see `Encoded`)."""
+        batch = [condition] if isinstance(condition, Condition) else list(condition)
+        stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
+        warped = torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch])
+        backdrop = torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch])
+        return self.encode_planes(stack("color"), stack("depth"), stack("valid"), warped, backdrop, stack("reference"))
+
+    def encode_planes(
+        self, color: Tensor, depth: Tensor, valid: Tensor, warped: Tensor, backdrop: Tensor, reference: Tensor
+    ) -> Encoded:
+        """As `encode_condition`, from stacked tensors.
+
+        color, backdrop f32[B,T,3,H,W]; depth f32[B,T,1,H,W] metres; valid, warped bool[B,T,1,H,W]; reference f32[B,3,H,W], used
+        only with `reference = "first_frame"`.
+        """
+        self.check_size(*color.shape[-2:])
+        valid, warped = valid.float(), warped.float()
+        if self.config.reference == "first_frame":
+            color = torch.cat([reference[:, None], color[:, 1:]], 1)
+            warped = torch.cat([torch.ones_like(warped[:, :1]), warped[:, 1:]], 1)
+        copy: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth)}
+        factor = self.codec.factor
+        masks = {"none": [], "valid": [valid], "valid_image": [valid, warped]}[self.config.mask_planes]
+        far = self.codec.encode_rgb(backdrop) if self.config.backdrop else None
+        planes = [copy["rgb"], copy["depth"], *([] if far is None else [far]), *(functional.pixel_unshuffle(m, factor) for m in masks)]
+        pool = lambda m: functional.avg_pool2d(m.flatten(0, 1), factor).unflatten(0, m.shape[:2])  # noqa: E731
+        seen: dict[Modality, Tensor] = {"rgb": pool(torch.maximum(valid, warped)), "depth": pool(valid)}
+        return Encoded(torch.cat(planes, 2), copy, far, seen)
+
+    # network ----------------------------------------------------------------------------------------------------------
+
+    def predict(
+        self, x: dict[Modality, Tensor], encoded: Encoded, t: Tensor
+    ) -> tuple[dict[Modality, Tensor], Tensor | None]:
+        """One pass of the network over the modalities in `x` (noisy latents [B,T,C,h,w]) at steps `t` i64[B].
+
+        Returns the network's statement per modality (x0, or v with a v head), and the log-shares of the classes
+        [B,T,19,h,w] if semantics were among them and are coded as shares.
+        """
+        names = tuple(x)
+        sizes = [x[m].shape[2] for m in names]
+        label = torch.full_like(t, SHOWN_LABEL_JOINT if len(names) > 1 else LABELS[names[0]])
+        out = self.net(torch.cat([*x.values(), encoded.planes], 2), t, label)
+        gates = None
+        if self.config.copy_condition:
+            out, gates = out.split([sum(sizes), self.gates], 2)
+        stated = dict(zip(names, out.split(sizes, 2)))
+        if gates is not None:
+            for channel, m in enumerate(("rgb", "depth")):
+                if m in stated:
+                    gate = (gates[:, :, channel : channel + 1] + COPY_BIAS * encoded.seen[m]).sigmoid()
+                    stated[m] = stated[m] + gate * encoded.copy[m]
+            if encoded.backdrop is not None and "rgb" in stated:
+                gate = (gates[:, :, 2:] - COPY_BIAS * encoded.seen["rgb"]).sigmoid()
+                stated["rgb"] = stated["rgb"] + gate * encoded.backdrop
+        log_shares = None
+        if "semantics" in stated and self.config.codec.semantics_code == "shares":
+            log_shares = stated["semantics"].log_softmax(2)
+            stated["semantics"] = self.codec.shares_to_latent(log_shares.exp())
+        return stated, log_shares
+
+    # training ---------------------------------------------------------------------------------------------------------
+
+    def encode_truth(self, rgb: Tensor, depth: Tensor, semantics: Tensor) -> dict[Modality, Tensor]:
+        """Latents of a clip's truth: rgb [B,T,3,H,W], depth [B,T,1,H,W] m, semantics i64[B,T,H,W]."""
+        return {
+            "rgb": self.codec.encode_rgb(rgb),
+            "depth": self.codec.encode_depth(depth),
+            "semantics": self.codec.encode_semantics(semantics),
+        }
+
+    def loss(
+        self,
+        truth: dict[Modality, Tensor],
+        encoded: Encoded,
+        generator: torch.Generator,
+        *,
+        shares: Tensor | None = None,
+        depth_known: Tensor | None = None,
+    ) -> Losses:
+        """Denoising loss of a batch, steps and noise drawn from `generator`.
+
+        truth        latents of `encode_truth`
+        shares       class shares [B,T,19,h,w]; needed when semantics are coded as shares
+        depth_known  f32[B,T,1,h,w] share of the cell with true depth; None = everywhere
+
+        x0 head: squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a
+        clip; cross-entropy for class shares. v head: squared error of v. Steps are stratified over the batch.
+        """
+        batch = next(iter(truth.values())).shape[0]
+        t = noise.stratified_steps(batch, len(self.schedule), generator)
+        weight = noise.loss_weight(self.schedule, t).view(-1, 1, 1, 1, 1)
+        total: Tensor | float = 0.0
+        terms: dict[str, float] = {}
+        for names in self._drawn_passes(generator):
+            eps = {m: noise.video_noise(truth[m].shape, generator, self.config.shared_noise) for m in names}
+            x = {m: self.schedule.add_noise(truth[m], eps[m], t) for m in names}
+            stated, log_shares = self.predict(x, encoded, t)
+            for m in names:
+                if m == "semantics" and log_shares is not None:
+                    if shares is None:
+                        raise UsageError("class shares are needed for the semantic loss", where="MDM.loss")
+                    part = -(shares * log_shares).sum(2).mean()
+                elif self.config.head == "v":
+                    part = (stated[m] - self.schedule.velocity(truth[m], eps[m], t)).square().mean()
+                elif m == "depth":
+                    error = functional.huber_loss(stated[m], truth[m], reduction="none", delta=0.2) * 5.0
+                    known = torch.ones_like(error[:, :, :1]) if depth_known is None else depth_known
+                    part = (weight * error * known).mean()
+                else:
+                    part = (weight * (stated[m] - truth[m]).square()).mean()
+                terms[m] = float(part.detach())
+                total = total + LOSS_SHARES[m] * part
+        if not isinstance(total, Tensor):
+            raise UsageError("nothing to train on", where="MDM.loss")
+        return Losses(total, terms)
+
+    def _drawn_passes(self, generator: torch.Generator) -> Sequence[tuple[Modality, ...]]:
+        """Joint: the one pass. Separate: one modality per batch, colour half of the time, as published."""
+        if self.config.joint:
+            return self.passes
+        u = float(torch.rand((), generator=generator))
+        return [self.passes[0 if u < 0.5 else 1 if u < 0.75 else 2]]
+
+    # sampling ---------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def sample(
+        self,
+        condition: Condition,
+        *,
+        steps: int = 8,
+        seed: int = 0,
+        index: int = 0,
+        sampler: str = "ddim",
+        eta: float = 1.0,
+        modalities: Sequence[Modality] = MODALITIES,
+        n_samples: int = 1,
+        known: Mapping[Modality, Tensor] | None = None,
+        bf16: bool = False,
+    ) -> Sample:
+        """Generate one clip.
+
+        condition   T views; H and W multiples of `config.pixel_multiple`
+        steps       denoiser passes (per modality unless joint); 1 is the regression of the clip on its condition
+        seed, index all noise is drawn from (seed, index): same in, same out
+        sampler     a row of `noise.SAMPLERS`
+        known       latents [k,C,h,w] of the clip's first k frames, from the previous window: they are kept
+        n_samples   > 1: the first sample is returned, the spread of all sets the confidence
+        bf16        run the network in bfloat16
+
+        Measured depth (`condition.valid`) replaces generated depth where the two agree to a quarter; sky is set to the
+        codec's far distance. See `confidence_of` for the confidence.
+        """
+        if sampler not in noise.SAMPLERS:
+            raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
+        unknown = [m for m in modalities if m not in MODALITIES]
+        if unknown or not modalities:
+            raise UsageError("unknown or no modality", expected=", ".join(MODALITIES), got=str(list(modalities)))
+        encoded = self.encode_condition(condition)
+        passes = self.passes if self.config.joint else tuple((m,) for m in MODALITIES if m in modalities)
+        drawn: list[dict[Modality, Tensor]] = []
+        change = torch.zeros_like(encoded.seen["rgb"])
+        for number in range(n_samples):
+            latents: dict[Modality, Tensor] = {}
+            for names in passes:
+                part, moved = self._denoise(encoded, names, steps, seeds.key(seed, index * 64 + number, "sample"), sampler,
+                                            eta, known, bf16)  # fmt: skip
+                latents |= part
+                change = torch.maximum(change, moved)
+            drawn.append(latents)
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            decoded = self.codec.decode({m: z[0] for m, z in drawn[0].items() if m in modalities})
+        if n_samples > 1:
+            stacked = torch.stack([d.get("rgb", next(iter(d.values()))) for d in drawn])
+            change = stacked.std(0).mean(2, keepdim=True) * 2
+        confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
+        depth = decoded.depth
+        if depth is not None:
+            depth = settle_depth(depth, condition, decoded.semantics, self.config.codec.far_m)
+        return Sample(decoded.rgb, depth, decoded.semantics, confidence, {m: z[0] for m, z in drawn[0].items()})
+
+    def _denoise(
+        self,
+        encoded: Encoded,
+        names: tuple[Modality, ...],
+        steps: int,
+        noise_seed: int,
+        sampler: str,
+        eta: float,
+        known: Mapping[Modality, Tensor] | None,
+        bf16: bool,
+    ) -> tuple[dict[Modality, Tensor], Tensor]:
+        """Run the sampler for the modalities of one pass; returns latents [1,T,C,h,w] and the change over the late steps."""
+        lead = encoded.planes.shape[:2]
+        cell = encoded.planes.shape[-2:]
+        sizes = [self.codec.channels[m] for m in names]
+        generator = torch.Generator().manual_seed(noise_seed)
+        shape = (*lead, sum(sizes), *cell)
+        draw = lambda: noise.video_noise(shape, generator, self.config.shared_noise)  # noqa: E731
+        estimates: list[Tensor] = []
+        indices = noise.trailing_steps(len(self.schedule), steps)
+
+        def denoise(x: Tensor, t: int) -> Tensor:
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                stated, _ = self.predict(dict(zip(names, x.split(sizes, 2))), encoded, torch.full((lead[0],), t))
+            out = torch.cat([stated[m].float() for m in names], 2)
+            if known and self.config.head == "x0":
+                kept = torch.cat([known[m] for m in names], 1)
+                out = torch.cat([kept[None], out[:, kept.shape[0] :]], 1)
+            return out
+
+        def watch(number: int, x0: Tensor) -> None:
+            if 2 * number >= len(indices) - 1:
+                estimates.append(x0[:, :, : sizes[0]])
+
+        x = noise.SAMPLERS[sampler](
+            denoise, draw(), self.schedule, indices, prediction=self.config.head, eta=eta, draw=draw, on_step=watch
+        )
+        moved = torch.stack([(e - x[:, :, : sizes[0]]).abs().mean(2, keepdim=True) for e in estimates]).mean(0)
+        return dict(zip(names, x.split(sizes, 2))), moved
+
+
+def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
+    """How far a generated pixel can be trusted, f32[T,1,H,W] in [0,1].
+
+    seen    [T,1,h,w] share of the latent cell that was measured or warped from a recorded image
+    change  [T,1,h,w] how much the colour latent still moved in the later half of sampling (or its spread over samples)
+    factor  pixels per cell
+
+    The product of a coverage term (1 where seen, 0.35 far from anything seen, smoothed over 5 cells) and exp(-2 change).
+    """
+    near = functional.avg_pool2d(seen, 5, stride=1, padding=2, count_include_pad=False)
+    coverage = 0.35 + 0.65 * torch.maximum(seen, near)
+    value = coverage * torch.exp(-2.0 * change)
+    return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
+
+
+def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, far_m: float) -> Tensor:
+    """Generated depth made to agree with what was measured, f32[T,1,H,W] metres.
+
+    Where a point was seen and the generated depth is within a quarter of it, the measured depth is taken; farther apart, the
+    generated depth is kept unless the pixel's neighbourhood of generated depths reaches the measured one (an edge that is a
+    pixel off). Sky pixels without a measurement get `far_m`.
+    """
+    measured = condition.depth
+    highest = functional.max_pool2d(depth, 3, stride=1, padding=1) * 1.25
+    lowest = -functional.max_pool2d(-depth, 3, stride=1, padding=1) / 1.25
+    agrees = condition.valid & (measured >= lowest) & (measured <= highest)
+    settled = torch.where(agrees, measured, depth)
+    if semantics is not None:
+        sky = (semantics == SKY).unsqueeze(1) & ~condition.valid
+        settled = torch.where(sky, torch.full_like(settled, far_m), settled)
+    return settled.clamp(max=far_m)
+
+
+# files ----------------------------------------------------------------------------------------------------------------
+
+MODEL_FILE = "model.json"
+EMBEDDED = Path(__file__).resolve().parent.parent / "assets" / "mdm_small"
+PART_BYTES = 15 * 1024 * 1024
+"""Weights are split into files of at most this size."""
+
+
+def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
+    """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and MODEL_CARD.md."""
+    parts: list[dict[str, Tensor]] = [{}]
+    size = 0
+    for name, value in model.state_dict().items():
+        half = value.half() if value.is_floating_point() else value
+        if size + half.nbytes > PART_BYTES and parts[-1]:
+            parts.append({})
+            size = 0
+        parts[-1][name] = half.contiguous()
+        size += half.nbytes
+    files = {}
+    for number, part in enumerate(parts):
+        name = f"weights_{number:02d}.safetensors"
+        store.write_safetensors(folder / name, part)
+        files[name] = store.sha256_file(folder / name)
+    store.write_text(folder / "MODEL_CARD.md", card)
+    store.write_json(
+        folder / MODEL_FILE, {"schema": 1, "config": config_to_dict(model.config), "files": files, "facts": dict(facts)}
+    )
+
+
+def load(path: Path | str = "embedded") -> MDM:
+    """Read a model folder written by `save`; "embedded" is the one shipped with the package.
+
+    Raises:
+        InputError: no model there, other fields or other weights than the configuration implies.
+        IntegrityError: a weight file does not match its recorded hash.
+    """
+    folder = EMBEDDED if str(path) == "embedded" else Path(path)
+    where = folder / MODEL_FILE
+    if not where.is_file():
+        raise InputError("no diffusion model here", where=str(folder), expected=f"a file {MODEL_FILE}")
+    content = store.parse_json(json.dumps(store.read_json(where)), str(where))
+    if not isinstance(content, dict) or content.get("schema") != 1 or not isinstance(content.get("files"), dict):
+        raise InputError("not a model description of this version", where=str(where))
+    model = MDM(config_from_dict(content.get("config", {}), str(where)))
+    state: dict[str, Tensor] = {}
+    for name, digest in content["files"].items():
+        file = folder / Path(name).name
+        if not file.is_file() or store.sha256_file(file) != digest:
+            raise IntegrityError("a weight file is missing or altered", where=str(file), expected=f"sha256 {digest[:16]}...")
+        state |= {k: torch.from_numpy(v.copy()) for k, v in store.read_safetensors(file).items()}
+    wanted = model.state_dict()
+    wrong = sorted(set(wanted) ^ set(state)) or [k for k in wanted if wanted[k].shape != state[k].shape]
+    if wrong:
+        raise InputError("weights do not fit the configuration", where=str(folder), got=", ".join(wrong[:6]))
+    model.load_state_dict({k: v.to(wanted[k].dtype) for k, v in state.items()})
+    return model.eval()
+
+
+def truth_shares(semantics: Tensor) -> Tensor:
+    """Class shares [B,T,19,h,w] of ids i64[B,T,H,W], as `MDM.loss` wants them."""
+    return semantic_shares(semantics)
+
+
+__all__ = [
+    "CLASSES", "EMBEDDED", "LABELS", "MDM", "MODALITIES", "Encoded", "Losses", "MDMConfig", "Sample", "UNet", "config_from_dict",
+    "config_to_dict", "load", "save", "truth_shares",
+]  # fmt: skip

@@ -1,0 +1,361 @@
+"""synthesize: dense colour, depth and semantics on trajectories that were never driven.
+
+For every trajectory: build the condition view by view from the fused cloud and the recorded images, run the diffusion
+model over windows of frames, write one folder of observations. Windows overlap; the shared frames are fixed in the later
+window, so that the video continues. The last window ends at the last frame: every frame of the trajectory is produced.
+
+OUT/<trajectory>/        observations (see `data/observations.py`) and overview.png
+OUT/<trajectory>/state/  what an interrupted run needs to continue after the last finished window; removed at the end
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import math
+import multiprocessing
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+from torch.nn import functional
+
+from mudg.base import log, store
+from mudg.base.config import to_dict
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
+from mudg.core import trajectory
+from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
+from mudg.data.cloudfile import read_fused
+from mudg.data.observations import ObservationWriter
+from mudg.data.scenefile import read_image, read_scene
+from mudg.models import mdm
+from mudg.models.mdm import MDM, Sample
+from mudg.models.vae import Modality
+from mudg.stages.config import SynthesizeConfig
+from mudg.stages.learn_score import class_image, depth_image, rgb_image
+from mudg.stages.precision import choose_bf16
+
+SOURCE = "mudg_r"
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One trajectory to make, in terms that another process understands."""
+
+    config: SynthesizeConfig
+    scene: Path
+    fused: Path
+    out: Path
+    camera: str
+    shift_m: float
+
+
+def run(config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, overwrite: bool = False) -> Path:
+    """Generate all trajectories of the configuration; returns `out`, one folder of observations per trajectory inside.
+
+    Args:
+        config: see `SynthesizeConfig`.
+        scene: scene directory or stored zip. fused: output of fuse for this scene.
+        out: a finished result of the same configuration and inputs is verified and reused.
+
+    Raises:
+        UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
+    """
+    model = mdm.load(config.model)
+    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": model_digest(config.model)}
+    directory = store.RunDir.open(out, "synthesize", to_dict(config), inputs, _VERSION, overwrite)
+    if directory.complete:
+        return directory.reused()
+    loaded = read_scene(scene)
+    cameras = config.cameras or tuple(loaded.cameras)[:1]
+    if not cameras or not config.shifts_m:
+        raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
+    jobs = [Job(config, Path(scene), Path(fused), Path(out), c, s) for c in cameras for s in config.shifts_m]
+    names = [trajectory_of(loaded, job).name for job in jobs]
+    if len(set(names)) < len(names):
+        raise UsageError("two shifts give the same trajectory", got=", ".join(names))
+    choose_bf16(config.precision)
+    started = time.monotonic()
+    frames = _run_jobs(jobs, names, config.processes or os.cpu_count() or 1)
+    seconds = time.monotonic() - started
+    log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
+    directory.finish({"trajectories": names, "views": frames})
+    return out
+
+
+def model_digest(name: str) -> str:
+    """Digest of the model's description, which holds the hashes of its weights."""
+    folder = mdm.EMBEDDED if name == "embedded" else Path(name)
+    return store.digest(folder / mdm.MODEL_FILE)
+
+
+def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
+    """Make the trajectories, each in one thread, several processes at a time; returns the number of views."""
+    processes = min(processes, len(jobs))
+    made = 0
+    with log.task("synthesize", len(jobs)) as bar:
+        if processes == 1:
+            threads = torch.get_num_threads()
+            torch.set_num_threads(1)
+            try:
+                for job, name in zip(jobs, names):
+                    bar.update(name)
+                    made += make_trajectory(job)
+                    bar.advance()
+            finally:
+                torch.set_num_threads(threads)
+            return made
+        log.info_once(f"synthesize: {processes} processes with one thread each")
+        context = multiprocessing.get_context("spawn")
+        with _quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
+            futures = {pool.submit(_make_in_process, job): name for job, name in zip(jobs, names)}
+            try:
+                for future in concurrent.futures.as_completed(futures):
+                    made += future.result()
+                    bar.update(futures[future])
+                    bar.advance()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+    return made
+
+
+class _quiet_openmp:  # noqa: N801 - used as a context manager
+    """Environment for child processes: one thread, and waiting without spinning."""
+
+    _wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": "1"}
+
+    def __enter__(self) -> None:
+        self._before = {name: os.environ.get(name) for name in self._wanted}
+        os.environ.update(self._wanted)
+
+    def __exit__(self, *_: object) -> None:
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _make_in_process(job: Job) -> int:
+    from mudg import native
+
+    log.set_quiet(True)
+    torch.set_num_threads(1)
+    native.set_threads(1)
+    return make_trajectory(job)
+
+
+# one trajectory -------------------------------------------------------------------------------------------------------
+
+
+def trajectory_of(scene: Scene, job: Job) -> Trajectory:
+    """The trajectory of a job; a shift of 0 is the recorded path."""
+    if job.shift_m == 0:
+        return trajectory.recorded(scene, job.camera)
+    return trajectory.shifted(scene, job.camera, job.shift_m)
+
+
+def windows(frames: int, window: int, overlap: int) -> list[range]:
+    """Frame ranges of the windows: all `frames` covered, each sharing at least `overlap` with the one before, the last
+    one ending at the last frame. Fewer frames than a window give one short window.
+
+    Raises:
+        UsageError: the overlap leaves no new frame per window.
+    """
+    if overlap >= window:
+        raise UsageError("windows overlap wholly", expected=f"overlap < {window}", got=str(overlap))
+    if frames <= window:
+        return [range(frames)]
+    starts = list(range(0, frames - window, window - overlap)) + [frames - window]
+    return [range(start, start + window) for start in starts]
+
+
+def model_size(width: int, height: int, multiple: int, area: int, width_px: int = 0) -> tuple[int, int]:
+    """Width and height for the model: multiples of `multiple` near `area` pixels in the aspect of width x height.
+
+    With `width_px` that width (rounded to the multiple) is used. Of the candidates the one with the least distortion
+    of aspect plus half the deviation of area, both as logarithms, wins.
+    """
+    aspect = width / height
+    if width_px:
+        w = max(multiple, round(width_px / multiple) * multiple)
+        return w, max(multiple, round(w / aspect / multiple) * multiple)
+    best, chosen = math.inf, (multiple, multiple)
+    for rows in range(1, 64):
+        for columns in range(1, 128):
+            w, h = columns * multiple, rows * multiple
+            cost = abs(math.log(w / h / aspect)) + 0.5 * abs(math.log(w * h / area))
+            if cost < best:
+                best, chosen = cost, (w, h)
+    return chosen
+
+
+def recorded_images(scene: Scene, held_out: bool) -> list[Recorded]:
+    """Recorded images that may be warped in, of all cameras."""
+    frames = scene.frames if held_out else scene.frames_in("train")
+    return [Recorded(frame.view, read_image(scene, frame)) for frame in frames]
+
+
+def make_trajectory(job: Job) -> int:
+    """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one."""
+    config = job.config
+    scene, cloud = read_scene(job.scene), read_fused(job.fused)
+    model = mdm.load(config.model)
+    path = trajectory_of(scene, job)
+    folder = job.out / path.name
+    if (folder / "observations.json").is_file():
+        return len(path)
+    camera = path.views[0].camera
+    area = TRAINED_AREA
+    width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
+    maker = ViewMaker(model, scene, cloud, recorded_images(scene, config.held_out_images), width, height, config)
+    spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
+    state = folder / "state"
+    first, tail = _read_state(state)
+    sheet: list[np.ndarray] = []
+    every = max(1, len(path) // 5)
+    with ObservationWriter(folder, path.name, SOURCE) as writer:
+        done = spans[first - 1].stop if first else 0
+        for view in path.views[:done]:
+            writer.skip(maker.sized(view))
+        for number in range(first, len(spans)):
+            span = spans[number]
+            shared = done - span.start
+            known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
+            views = [path.views[i] for i in span]
+            sample, condition, observations = maker.make(views, number, known)
+            for index, observation in zip(span, observations):
+                if index >= done:
+                    writer.add(observation)
+                if index >= done and index % every == 0:
+                    sheet.append(_sheet_row(condition, sample, index - span.start))
+            done, tail = span.stop, sample.latents
+            store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
+            (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
+        if sheet:
+            with store.atomic_path(folder / "overview.png") as temporary:
+                Image.fromarray(np.concatenate(sheet)).save(temporary)
+        shutil.rmtree(state, ignore_errors=True)
+    return len(path)
+
+
+TRAINED_AREA = 128 * 192
+"""Pixels per frame that the embedded model was trained at."""
+
+
+def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
+    """Number of finished windows and the latents of the last one."""
+    files = sorted(state.glob("[0-9]*.safetensors"))
+    if not files:
+        return 0, {}
+    arrays = store.read_safetensors(files[-1])
+    return int(files[-1].stem), {m: torch.from_numpy(a.copy()) for m, a in arrays.items()}  # type: ignore[misc]
+
+
+class ViewMaker:
+    """Conditions, samples and observations of one scene at one size."""
+
+    def __init__(
+        self,
+        model: MDM,
+        scene: Scene,
+        cloud: FusedCloud,
+        recorded: Sequence[Recorded],
+        width: int,
+        height: int,
+        config: SynthesizeConfig,
+    ) -> None:
+        model.check_size(height, width)
+        if not recorded:
+            log.warn("synthesize: no recorded image may be used; holes take the nearest point's colour")
+        self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
+        self._rules = ConditionRules(width, height)
+        self._sources: dict[int, Source] = {}
+        self._full_sources: dict[int, Source] = {}
+        self._config = config
+        self._bf16 = choose_bf16(config.precision)
+
+    def sized(self, view: View) -> View:
+        """The view at the size that is written."""
+        return view if self._config.full_size else view.resized(self._rules.width, self._rules.height)
+
+    def make(
+        self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
+    ) -> tuple[Sample, Condition, list[Observation]]:
+        """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
+        tracks = self._scene.tracks
+        condition = build_condition(self._cloud, tracks, views, self._recorded, self._rules, self._sources)
+        config = self._config
+        sample = self._model.sample(
+            condition, steps=config.steps, seed=config.seed, index=number, eta=config.eta, known=known, bf16=self._bf16
+        )
+        if sample.rgb is None or sample.depth is None or sample.semantics is None:
+            raise InputError("the model does not produce all modalities", where=config.model)
+        sky = (sample.semantics == mdm.SKY).unsqueeze(1) & ~condition.valid
+        depth = torch.where(sky, torch.nan, sample.depth)
+        if config.full_size:
+            return sample, condition, self._full(views, condition, sample, depth)
+        made = [
+            Observation(
+                view, sample.rgb[i], depth[i], sample.semantics[i], sample.confidence[i],
+                torch.ones_like(sample.confidence[i], dtype=torch.bool), "virtual", SOURCE,
+            )
+            for i, view in enumerate(condition.views)
+        ]  # fmt: skip
+        return sample, condition, made
+
+    def _full(self, views: Sequence[View], condition: Condition, sample: Sample, depth: Tensor) -> list[Observation]:
+        """Observations at the cameras' size: the sample enlarged, plus fine detail of the recorded images (see `add_detail`)."""
+        camera = views[0].camera
+        rules = ConditionRules(camera.width, camera.height, point_px=max(1.0, camera.width / self._rules.width))
+        tracks = self._scene.tracks
+        full = build_condition(self._cloud, tracks, views, self._recorded, rules, self._full_sources)
+        size = (camera.height, camera.width)
+        rgb = add_detail(sample.rgb, condition, full)  # type: ignore[arg-type]
+        near = {"size": size, "mode": "nearest-exact"}
+        big_depth = functional.interpolate(depth, **near)
+        known = functional.interpolate(depth.nan_to_num(nan=-1.0), **near)
+        close = full.valid & ((full.depth - known).abs() < 0.1 * known)
+        big_depth = torch.where(close, full.depth, big_depth)
+        ids = functional.interpolate(sample.semantics.unsqueeze(1).float(), **near)[:, 0].long()  # type: ignore[union-attr]
+        trust = functional.interpolate(sample.confidence, size=size, mode="bilinear", align_corners=False)
+        return [
+            Observation(view, rgb[i], big_depth[i], ids[i], trust[i], torch.ones_like(trust[i], dtype=torch.bool), "virtual", SOURCE)
+            for i, view in enumerate(full.views)
+        ]
+
+
+def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
+    """Enlarge generated colour f32[T,3,h,w] to the size of `full`, with the detail that the warped images have there.
+
+    Where the generated colour agrees with the small condition, the finer structure of the full condition (its difference
+    from its own reduced copy) is added; the weight falls with the disagreement, to nothing at a difference of 0.12.
+    """
+    size = full.color.shape[-2:]
+    enlarge = lambda x: functional.interpolate(x, size=size, mode="bicubic", align_corners=False)  # noqa: E731
+    reduced = functional.interpolate(full.color, size=rgb.shape[-2:], mode="area")
+    detail = full.color - enlarge(reduced)
+    apart = torch.maximum((rgb - small.color).abs(), (rgb - reduced).abs()).amax(1, keepdim=True)
+    seen = small.valid | (small.warped if small.warped is not None else small.valid)
+    weight = (1 - functional.max_pool2d(apart, 3, stride=1, padding=1) / 0.12).clamp(0, 1) * seen
+    weight = functional.interpolate(weight, size=size, mode="bilinear", align_corners=False)
+    return (enlarge(rgb) + weight * detail).clamp(0, 1)
+
+
+def _sheet_row(condition: Condition, sample: Sample, i: int) -> np.ndarray:
+    """Condition, colour, depth, classes and confidence of one frame side by side, u8[H,5W,3]."""
+    trust = (sample.confidence[i, 0].clamp(0, 1) * 255).byte().numpy()
+    cells = [
+        rgb_image(condition.color[i]), rgb_image(sample.rgb[i]), depth_image(sample.depth[i]), class_image(sample.semantics[i]),  # type: ignore[index]
+        np.repeat(trust[..., None], 3, 2),
+    ]  # fmt: skip
+    return np.concatenate(cells, 1)

@@ -1,0 +1,246 @@
+"""The diffusion model: shapes, invariances, determinism, what is copied and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base.types import Camera, Condition, View
+from mudg.models import mdm
+from mudg.models.mdm import MDM, MDMConfig
+from mudg.models.vae import CodecConfig
+
+TINY = MDMConfig(
+    widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
+    embed_width=16, patch=1, codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+)  # fmt: skip
+SEPARATE = replace(
+    TINY, joint=False, head="v", copy_condition=False, backdrop=False, mask_planes="none", reference="first_frame",
+    codec=CodecConfig(semantics_code="palette", depth_code="linear", decoder_width=8, decoder_blocks=1),
+)  # fmt: skip
+
+
+def some_condition(frames=3, height=16, width=24, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
+    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
+    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    return Condition(
+        views, draw(frames, 3, height, width), 3 + 60 * draw(frames, 1, height, width), draw(frames, 1, height, width) > 0.5,
+        draw(3, height, width), draw(frames, 1, height, width) > 0.3, draw(frames, 3, height, width),
+    )  # fmt: skip
+
+
+def randomised(config, seed=0):
+    """A model whose zero-initialised layers are random too, so that every path matters."""
+    model = MDM(config).eval()
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for value in model.net.parameters():
+            fan = value[0].numel() if value.ndim > 1 else 1
+            value.copy_(torch.randn(value.shape, generator=generator) * (0.5 / fan**0.5 if value.ndim > 1 else 0.1))
+    return model
+
+
+def test_sample_shapes_ranges_and_determinism():
+    model, condition = randomised(TINY), some_condition()
+    first = model.sample(condition, steps=3, seed=7, index=2)
+    again = model.sample(condition, steps=3, seed=7, index=2)
+    other = model.sample(condition, steps=3, seed=7, index=3)
+    assert first.rgb.shape == (3, 3, 16, 24)
+    assert first.depth.shape == (3, 1, 16, 24)
+    assert first.semantics.shape == (3, 16, 24)
+    assert first.confidence.shape == (3, 1, 16, 24)
+    assert float(first.rgb.min()) >= 0
+    assert float(first.rgb.max()) <= 1
+    assert float(first.depth.min()) > 0
+    assert float(first.depth.max()) <= 100
+    assert float(first.confidence.min()) >= 0
+    assert float(first.confidence.max()) <= 1
+    for name in ("rgb", "depth", "semantics", "confidence"):
+        assert torch.equal(getattr(first, name), getattr(again, name)), name
+    assert not torch.equal(first.rgb, other.rgb)
+
+
+def test_separate_modalities_use_their_labels():
+    model, condition = randomised(SEPARATE), some_condition()
+    seen = []
+    forward = model.net.forward
+    model.net.forward = lambda x, t, label: (seen.append((x.shape[2], label.tolist())), forward(x, t, label))[1]
+    sample = model.sample(condition, steps=1, modalities=("rgb", "depth"))
+    assert seen == [(12, [0]), (12, [500])]
+    assert sample.semantics is None
+    assert sample.rgb is not None
+    model.sample(condition, steps=1, modalities=("semantics",))
+    assert seen[-1] == (12, [1])
+
+
+def test_published_reference_replaces_frame_zero_of_the_colour_only():
+    model, condition = MDM(SEPARATE), some_condition()
+    encoded = model.encode_condition(condition)
+    reference = model.codec.encode_rgb(condition.reference)
+    assert torch.equal(encoded.planes[0, 0, :4], reference)
+    assert torch.equal(encoded.planes[0, 1, :4], model.codec.encode_rgb(condition.color[1]))
+    assert torch.equal(encoded.planes[0, 0, 4:8], model.codec.encode_depth(condition.depth[0]))
+    assert encoded.planes.shape[2] == 8
+
+
+def test_untrained_model_copies_the_condition_where_it_is_seen():
+    """At the start the x0 head gives sigmoid(4) of the condition's latent where everything was seen."""
+    model = MDM(TINY)
+    condition = some_condition()
+    everything = torch.ones_like(condition.valid)
+    condition = replace(condition, valid=everything, warped=everything)
+    encoded = model.encode_condition(condition)
+    x = {m: torch.randn(1, 3, c, 8, 12, generator=torch.Generator().manual_seed(1)) for m, c in model.codec.channels.items()}
+    stated, _ = model.predict(x, encoded, torch.tensor([999]))
+    gate = torch.sigmoid(torch.tensor(mdm.COPY_BIAS))
+    assert torch.allclose(stated["depth"], gate * encoded.copy["depth"], atol=1e-5)
+    assert torch.allclose(stated["rgb"], gate * encoded.copy["rgb"] + (1 - gate) * encoded.backdrop, atol=1e-5)
+
+
+def test_class_scores_are_shares():
+    model = randomised(TINY)
+    encoded = model.encode_condition(some_condition())
+    x = {m: torch.randn(1, 3, c, 8, 12) for m, c in model.codec.channels.items()}
+    _, log_shares = model.predict(x, encoded, torch.tensor([500]))
+    assert torch.allclose(log_shares.exp().sum(2), torch.ones(1, 3, 8, 12), atol=1e-5)
+
+
+def test_known_frames_are_kept():
+    model, condition = randomised(TINY), some_condition(frames=4)
+    earlier = model.sample(some_condition(frames=4, seed=9), steps=2, seed=1)
+    known = {m: z[-2:] for m, z in earlier.latents.items()}
+    sample = model.sample(condition, steps=2, seed=1, known=known)
+    for name, z in sample.latents.items():
+        assert torch.allclose(z[:2], known[name], atol=1e-5), name
+        assert not torch.allclose(z[2:], earlier.latents[name][2:], atol=1e-3), name
+
+
+def test_frames_and_clips_do_not_leak_across_the_batch():
+    model = randomised(TINY)
+    encoded = [model.encode_condition(some_condition(seed=s)) for s in (0, 1)]
+    both = model.encode_condition([some_condition(seed=0), some_condition(seed=1)])
+    x = {m: torch.randn(2, 3, c, 8, 12, generator=torch.Generator().manual_seed(2)) for m, c in model.codec.channels.items()}
+    together, _ = model.predict(x, both, torch.tensor([100, 700]))
+    with torch.no_grad():
+        for i, t in enumerate((100, 700)):
+            alone, _ = model.predict({m: z[i : i + 1] for m, z in x.items()}, encoded[i], torch.tensor([t]))
+            for name in alone:
+                assert torch.allclose(alone[name][0], together[name][i], atol=2e-4), name
+
+
+def test_training_and_inference_attention_agree():
+    q, k, v = torch.randn(3, 2, 4, 10, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
+    trained = mdm.attend(q, k, v)
+    with torch.no_grad():
+        fused = mdm.attend(q, k, v)
+    assert torch.allclose(trained, fused, atol=1e-5)
+
+
+def test_temporal_shift_moves_one_eighth_each_way():
+    x = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 16, 2, 2)
+    moved = mdm.temporal_shift(x, 3)
+    assert moved[:, :2].amax((1, 2, 3)).tolist() == [0, 0, 1]
+    assert moved[:, 2:4].amax((1, 2, 3)).tolist() == [1, 2, 2]
+    assert torch.equal(moved[:, 4:], x[:, 4:])
+
+
+@pytest.mark.parametrize("config", [TINY, SEPARATE])
+def test_loss_falls_when_a_clip_is_learnt(config):
+    torch.manual_seed(0)
+    model, condition = MDM(config), some_condition()
+    rgb, depth, ids = condition.color[None].flip(-1), condition.depth[None] * 0.5 + 2, torch.randint(0, 19, (1, 3, 16, 24))
+    truth, encoded = model.encode_truth(rgb, depth, ids), model.encode_condition(condition)
+    shares = mdm.truth_shares(ids)
+    optimizer = torch.optim.Adam(model.net.parameters(), lr=3e-3)
+    totals = []
+    for step in range(40):
+        # the same draws at every fourth step: a falling loss cannot come from an easier draw
+        losses = model.loss(truth, encoded, torch.Generator().manual_seed(step % 4), shares=shares)
+        optimizer.zero_grad()
+        losses.total.backward()
+        optimizer.step()
+        totals.append(float(losses.total.detach()))
+    assert np.mean(totals[-4:]) < 0.8 * np.mean(totals[:4])
+
+
+def test_loss_has_gradients_everywhere():
+    model = randomised(TINY)
+    condition = some_condition()
+    ids = torch.randint(0, 19, (1, 3, 16, 24), generator=torch.Generator().manual_seed(0))
+    losses = model.loss(
+        model.encode_truth(condition.color[None], condition.depth[None], ids), model.encode_condition(condition),
+        torch.Generator().manual_seed(0), shares=mdm.truth_shares(ids),
+    )  # fmt: skip
+    losses.total.backward()
+    dead = [n for n, p in model.net.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]
+    assert dead == []
+    assert set(losses.terms) == {"rgb", "depth", "semantics"}
+
+
+def test_measured_depth_is_taken_where_it_agrees():
+    condition = some_condition(frames=1)
+    depth = torch.full((1, 1, 16, 24), 20.0)
+    measured = torch.full_like(depth, 21.0)
+    measured[..., 12:] = 60.0
+    condition = replace(condition, depth=measured, valid=torch.ones_like(condition.valid[:1]))
+    settled = mdm.settle_depth(depth, condition, None, 100.0)
+    assert torch.equal(settled[..., :12], measured[..., :12])
+    assert torch.equal(settled[..., 12:], depth[..., 12:])
+    sky = torch.full((1, 16, 24), mdm.SKY)
+    nothing_seen = replace(condition, valid=torch.zeros_like(condition.valid))
+    assert float(mdm.settle_depth(depth, nothing_seen, sky, 100.0).min()) == 100.0
+
+
+def test_confidence_falls_with_change_and_distance():
+    seen = torch.zeros(1, 1, 8, 16)
+    seen[..., :8] = 1
+    still = mdm.confidence_of(seen, torch.zeros_like(seen), 2)
+    assert float(still[0, 0, 0, 0]) == pytest.approx(1.0)
+    assert float(still[0, 0, 0, -1]) == pytest.approx(0.35)
+    moving = mdm.confidence_of(seen, torch.full_like(seen, 0.5), 2)
+    assert bool((moving < still).all())
+
+
+def test_save_and_load_are_inverse(tmp_path):
+    model = randomised(TINY)
+    mdm.save(model, tmp_path / "m", "a card", {"note": 1})
+    loaded = mdm.load(tmp_path / "m")
+    assert loaded.config == model.config
+    for name, value in model.state_dict().items():
+        assert torch.allclose(loaded.state_dict()[name], value, rtol=1e-3, atol=1e-4), name
+    assert (tmp_path / "m" / "MODEL_CARD.md").read_text() == "a card"
+
+
+def test_damaged_and_foreign_models_are_refused(tmp_path):
+    mdm.save(randomised(TINY), tmp_path / "m", "", {})
+    weights = next((tmp_path / "m").glob("*.safetensors"))
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(bytes(content))
+    with pytest.raises(IntegrityError, match="altered"):
+        mdm.load(tmp_path / "m")
+    with pytest.raises(InputError, match="no diffusion model"):
+        mdm.load(tmp_path / "nothing")
+
+
+def test_configuration_is_strict():
+    values = mdm.config_to_dict(TINY)
+    assert mdm.config_from_dict(values) == TINY
+    with pytest.raises(InputError, match="patches"):
+        mdm.config_from_dict({**values, "patches": 3})
+    for change in ({"blocks": (1,)}, {"joint": False}, {"head": "v"}, {"widths": (16, 20)}):
+        with pytest.raises(UsageError):
+            replace(TINY, **change)
+
+
+def test_wrong_requests_are_refused():
+    model = MDM(TINY)
+    with pytest.raises(UsageError, match="multiples of 4"):
+        model.sample(some_condition(height=18))
+    with pytest.raises(UsageError, match="sampler"):
+        model.sample(some_condition(), sampler="magic")
+    with pytest.raises(UsageError, match="modality"):
+        model.sample(some_condition(), modalities=("normals",))
