@@ -8,10 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 
 Config = TypeVar("Config")
@@ -27,6 +25,8 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 def dump_yaml(config: Any) -> str:
     """A configuration as YAML text that ``load`` reads back to an equal configuration."""
+    import yaml
+
     return yaml.safe_dump(to_dict(config), sort_keys=False)
 
 
@@ -68,6 +68,10 @@ def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> C
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
+    import yaml  # late, as is the store with its numpy: --help needs neither
+
+    from mudg.base import store
+
     try:
         content = yaml.safe_load(store.read_bytes(path))
     except yaml.YAMLError as error:

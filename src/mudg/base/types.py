@@ -374,6 +374,8 @@ class Condition:
         depth: f32[T, 1, H, W] metres; meaningless where not valid.
         valid: bool[T, 1, H, W]: a fused point was seen here.
         reference: f32[3, H, W], the dense recorded image near views[0].
+        warped: bool[T, 1, H, W] or None: the colour here was warped from a recorded image near in time.
+        backdrop: f32[T, 3, H, W] in [0, 1] or None: a recorded image carried over as if all of it were far away.
     """
 
     views: tuple[View, ...]
@@ -381,6 +383,8 @@ class Condition:
     depth: Tensor
     valid: Tensor
     reference: Tensor
+    warped: Tensor | None = None
+    backdrop: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
@@ -388,6 +392,10 @@ class Condition:
         _check_tensor(self.depth, "condition.depth", (t, 1, h, w))
         _check_tensor(self.valid, "condition.valid", (t, 1, h, w))
         _check_tensor(self.reference, "condition.reference", (3, h, w))
+        if self.warped is not None:
+            _check_tensor(self.warped, "condition.warped", (t, 1, h, w))
+        if self.backdrop is not None:
+            _check_tensor(self.backdrop, "condition.backdrop", (t, 3, h, w))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,8 @@
+"""``python -m mudg`` is the ``mudg`` command."""
+
+import sys
+
+from mudg.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,293 @@
+"""The ``mudg`` command: flags to frozen configurations, errors to exit codes. No logic of its own, and no torch.
+
+Precedence: defaults < the preset behind ``--fast`` and ``--seed`` < ``--config`` YAML < flags. Results go to stdout,
+progress and messages to stderr.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import json
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mudg.base import log
+from mudg.base.errors import MudgError, UsageError
+from mudg.base.versions import version
+
+if TYPE_CHECKING:
+    from mudg import flags as f
+
+INTERRUPTED = 130
+TERMINATED = 143
+
+
+# what each verb calls ------------------------------------------------------------------------------------------------
+
+
+def _ingest(args: f.Ingest) -> dict[str, Any]:
+    from mudg.stages import ingest
+
+    return {"scene": ingest.run(args.settings, args.log, args.out, overwrite=args.overwrite)}
+
+
+def _annotate(args: f.Annotate) -> dict[str, Any]:
+    from mudg.stages import annotate
+
+    return {"scene": annotate.run(args.settings, args.scene, args.out, overwrite=args.overwrite)}
+
+
+def _fuse(args: f.Fuse) -> dict[str, Any]:
+    from mudg.stages import fuse
+
+    return {"fused": fuse.run(args.settings, args.scene, args.out, overwrite=args.overwrite)}
+
+
+def _learn(args: f.Learn) -> dict[str, Any]:
+    from mudg.stages import learn
+
+    return {"model": learn.run(args.settings, args.out, overwrite=args.overwrite)}
+
+
+def _synthesize(args: f.Synthesize) -> dict[str, Any]:
+    from mudg.stages import synthesize
+
+    return {"views": synthesize.run(args.settings, args.scene, args.fused, args.out, overwrite=args.overwrite)}
+
+
+def _fit(args: f.Fit) -> dict[str, Any]:
+    from mudg.stages import fit
+
+    virtual = args.observations
+    made = fit.run(args.settings, args.scene, args.fused, args.out, observations=virtual, overwrite=args.overwrite)
+    return {"model": made}
+
+
+def _render(args: f.Render) -> dict[str, Any]:
+    from mudg.stages import render
+
+    return {"views": render.run(args.settings, args.scene, args.model, args.out, overwrite=args.overwrite)}
+
+
+def _score(args: f.Score) -> dict[str, Any]:
+    from mudg.stages import score
+
+    methods = dict(_name_and_folder(item) for item in args.views)
+    made = score.run(args.settings, args.scene, methods, args.out, fused=args.fused, overwrite=args.overwrite)
+    return {"metrics": made / "metrics.json", "text": score.summary_table(made)}
+
+
+def _name_and_folder(item: str) -> tuple[str, Path]:
+    name, separator, folder = item.partition("=")
+    if not separator or not name or not folder:
+        raise UsageError("--views takes names with their folders", expected="NAME=FOLDER", got=item)
+    return name, Path(folder)
+
+
+def _run(args: f.Run) -> dict[str, Any]:
+    from mudg.stages import run
+
+    return run.run_chain(args.settings, args.source, args.out, overwrite=args.overwrite)
+
+
+def _demo(args: f.Demo) -> dict[str, Any]:
+    from mudg.stages import run
+
+    return run.run_chain(args.settings, "city", args.out, overwrite=args.overwrite)
+
+
+def _doctor(args: f.Doctor) -> dict[str, Any]:
+    from mudg.stages import doctor
+
+    return doctor.report_scene(args.scene) if args.scene is not None else doctor.report_machine()
+
+
+@dataclass(frozen=True)
+class Verb:
+    """One command: its one-line summary, example command lines, and the function behind it."""
+
+    summary: str
+    examples: tuple[str, ...]
+    call: Callable[[Any], dict[str, Any]]
+
+
+VERBS: dict[str, Verb] = {
+    "demo": Verb(
+        "The whole chain on the built-in city; ends with a report page.",
+        ("mudg demo", "mudg demo --fast --out /tmp/look", "mudg demo --seed 7 --out city7"),
+        _demo,
+    ),
+    "run": Verb(
+        "The whole chain on your own driving log or scene.",
+        ("mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti", "mudg run scenes/a --out runs/a --fast"),
+        _run,
+    ),
+    "doctor": Verb(
+        "What this machine offers; with a scene, what is wrong with it.",
+        ("mudg doctor", "mudg doctor runs/kitti/scene", "mudg doctor --json"),
+        _doctor,
+    ),
+    "ingest": Verb(
+        "Driving log (or the built-in city) -> scene directory.",
+        ("mudg ingest city --out scenes/city", "mudg ingest ~/kitti/2011_09_26_drive_0001_sync --out scenes/kitti"),
+        _ingest,
+    ),
+    "annotate": Verb(
+        "Scene without labels -> semantics, sky and depth, each with a confidence.",
+        ("mudg annotate scenes/kitti --out scenes/kitti_labelled",),
+        _annotate,
+    ),
+    "fuse": Verb(
+        "Scene -> one coloured cloud of the static world, one per moving object.",
+        ("mudg fuse scenes/city --out runs/fused",),
+        _fuse,
+    ),
+    "learn": Verb(
+        "Train the small diffusion model on generated cities.",
+        ("mudg learn --out runs/mdm", "mudg learn --config recipe.yaml --out runs/mdm"),
+        _learn,
+    ),
+    "synthesize": Verb(
+        "Dense RGB, depth and semantics on trajectories nobody drove.",
+        ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",),
+        _synthesize,
+    ),
+    "fit": Verb(
+        "Scene (and virtual views) -> dynamic 3D Gaussian scene.",
+        ("mudg fit scenes/city --fused runs/fused --method street_gaussians --out runs/plain",
+         "mudg fit scenes/city --fused runs/fused --observations runs/virtual --out runs/mudg_s"),
+        _fit,
+    ),
+    "render": Verb(
+        "Fitted scene -> RGB, depth and semantics on any shifted trajectory.",
+        ("mudg render scenes/city --model runs/mudg_s --shifts-m 0 3 -3 --out runs/render",),
+        _render,
+    ),
+    "score": Verb(
+        "Renders against truth -> metrics, tables, error pictures.",
+        ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
+        _score,
+    ),
+}  # fmt: skip
+
+SECTIONS = (
+    ("start here", ("demo", "run", "doctor")),
+    ("the steps, one by one", ("ingest", "annotate", "fuse", "learn", "synthesize", "fit", "render", "score")),
+)
+
+
+# the command line ----------------------------------------------------------------------------------------------------
+
+
+def overview() -> str:
+    """The text of ``mudg --help``."""
+    lines = [
+        f"mudg {version()}: from a driving log to lane-shifted RGB, depth and semantic video",
+        "and a dynamic 3D Gaussian scene that stays good off the recorded path.",
+        "",
+        "usage: mudg VERB [arguments]",
+        "       mudg VERB --help     all flags of one verb, with their defaults",
+        "       mudg --version",
+    ]
+    for title, names in SECTIONS:
+        lines += ["", f"{title}:"]
+        lines += [f"  {name:<12}{VERBS[name].summary}" for name in names]
+    lines += [
+        "",
+        "Settings: defaults < --config FILE.yaml < flags; the resolved settings lie beside every result as run.yaml.",
+        "Every step reuses a finished result that verifies, and continues an interrupted one.",
+        "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerics, 130 interrupted.",
+    ]
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line; return its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words
+    try:
+        if not words or words[0] in ("-h", "--help", "help"):
+            _say(overview())
+            return 0 if words else UsageError.exit_code
+        if words[0] in ("-V", "--version"):
+            _say(f"mudg {version()}")
+            return 0
+        args = parse(words)
+        log.set_quiet(args.quiet)
+        with _sigterm_interrupts():
+            result = VERBS[words[0]].call(args)
+        code = int(result.pop("exit_code", 0))
+        _show(result, as_json=args.json)
+        return code
+    except MudgError as error:
+        if debug:
+            raise
+        _complain(f"error: {error}")
+        return error.exit_code
+    except KeyboardInterrupt as interrupt:
+        _complain(f"stopped. Repeat the same command to continue: mudg {shlex.join(words)}")
+        return TERMINATED if isinstance(interrupt, Terminated) else INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def parse(words: Sequence[str]) -> Any:
+    """Turn ``VERB flags...`` into the verb's flags object (see ``mudg.flags``); an unknown verb is a UsageError."""
+    name = words[0]
+    if name not in VERBS:
+        near = difflib.get_close_matches(name, list(VERBS), n=1, cutoff=0.5)
+        raise UsageError(
+            f"there is no verb {name!r}", expected="one of " + ", ".join(VERBS),
+            remedy=f"did you mean `mudg {near[0]}`?" if near else "see mudg --help",
+        )  # fmt: skip
+    from mudg import flags
+
+    examples = "examples:\n" + "\n".join(f"  {line}" for line in VERBS[name].examples)
+    return flags.parse(name, words[1:], f"{VERBS[name].summary}\n\n{examples}")
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _complain(text: str) -> None:
+    sys.stderr.write(text + "\n")
+    sys.stderr.flush()
+
+
+def _show(result: dict[str, Any], *, as_json: bool) -> None:
+    """Print a verb's result: its text, else one ``name: path`` a line; or all but the text as JSON."""
+    text = result.pop("text", None)
+    if as_json:
+        _say(json.dumps(result, indent=1, default=str, allow_nan=False))
+    else:
+        _say(text if text is not None else "\n".join(f"{name}: {value}" for name, value in result.items()))
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: stops as Ctrl-C does, with its own exit code."""
+
+
+@contextlib.contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    def stop(_number: int, _frame: object) -> None:
+        raise Terminated
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,224 @@
+"""What every command takes on the command line: one frozen dataclass each, read by tyro. Imports no torch."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from pydantic import ValidationError
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from mudg.base import config as configuration
+from mudg.base.errors import UsageError
+from mudg.stages import config as stage_config
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """Flags that every command has."""
+
+    config: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
+    """Read settings from this YAML file (flags still win). The run.yaml beside any result is such a file."""
+    quiet: FlagCreatePairsOff[bool] = False
+    """No progress bars and no messages, only warnings and the result."""
+    json: FlagCreatePairsOff[bool] = False
+    """Print the result as JSON on stdout."""
+    debug: FlagCreatePairsOff[bool] = False
+    """Show the full traceback of an error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output(Common):
+    """Flags of commands that write a folder."""
+
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """Folder to write. A finished result of the same settings and inputs is verified and reused."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace the result of other settings or inputs in --out instead of refusing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ingest(Output):
+    """Flags of ``mudg ingest``."""
+
+    log: Positional[str]
+    """Folder of a dataset log (its format is recognised), or the word city."""
+    settings: Annotated[stage_config.IngestConfig, arg(name="")] = stage_config.IngestConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Annotate(Output):
+    """Flags of ``mudg annotate``."""
+
+    scene: Positional[Path]
+    """Scene made by ingest."""
+    settings: Annotated[stage_config.AnnotateConfig, arg(name="")] = stage_config.AnnotateConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fuse(Output):
+    """Flags of ``mudg fuse``."""
+
+    scene: Positional[Path]
+    """Scene made by ingest or annotate."""
+    settings: Annotated[stage_config.FuseConfig, arg(name="")] = stage_config.FuseConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learn(Output):
+    """Flags of ``mudg learn``."""
+
+    settings: Annotated[stage_config.LearnConfig, arg(name="")] = stage_config.LearnConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthesize(Output):
+    """Flags of ``mudg synthesize``."""
+
+    scene: Positional[Path]
+    """Scene made by ingest or annotate."""
+    fused: Annotated[Path, arg(metavar="FOLDER")]
+    """Clouds made by fuse."""
+    settings: Annotated[stage_config.SynthesizeConfig, arg(name="")] = stage_config.SynthesizeConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Output):
+    """Flags of ``mudg fit``."""
+
+    scene: Positional[Path]
+    """Scene made by ingest or annotate."""
+    fused: Annotated[Path, arg(metavar="FOLDER")]
+    """Clouds made by fuse."""
+    observations: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Output of synthesize: virtual views to learn from (method mudg_s)."""
+    settings: Annotated[stage_config.FitConfig, arg(name="")] = stage_config.FitConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Output):
+    """Flags of ``mudg render``."""
+
+    scene: Positional[Path]
+    """The scene the model was fitted to."""
+    model: Annotated[Path, arg(metavar="FOLDER")]
+    """Model made by fit."""
+    settings: Annotated[stage_config.RenderConfig, arg(name="")] = stage_config.RenderConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score(Output):
+    """Flags of ``mudg score``."""
+
+    scene: Positional[Path]
+    """The scene that was rendered."""
+    views: Annotated[tuple[str, ...], arg(metavar="NAME=FOLDER")]
+    """Methods to compare, each a name and its output of render or synthesize, e.g. mudg_s=runs/render."""
+    fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Clouds made by fuse, for the baseline that needs no model (not given: no baseline)."""
+    settings: Annotated[stage_config.ScoreConfig, arg(name="")] = stage_config.ScoreConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(Output):
+    """Flags of ``mudg run``."""
+
+    source: Positional[str]
+    """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
+    fast: FlagCreatePairsOff[bool] = False
+    """Smaller pictures, fewer frames and iterations: a first look in a minute or two."""
+    seed: Annotated[int | None, arg(metavar="INT")] = None
+    """Seed of every random draw in the chain (not given: 0, or what --config says)."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to move sideways (not given: the first one)."""
+    shifts_m: tuple[float, ...] = ()
+    """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+    settings: Annotated[stage_config.RunConfig, arg(name="")] = stage_config.RunConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Output):
+    """Flags of ``mudg demo``."""
+
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("mudg_demo")
+    """Folder to write. Repeat the same command to continue an interrupted demo."""
+    fast: FlagCreatePairsOff[bool] = False
+    """Smaller pictures, fewer frames and iterations: about 90 seconds instead of 5 minutes on 2 cores."""
+    seed: Annotated[int | None, arg(metavar="INT")] = None
+    """Seed of the city and of every random draw in the chain (not given: 0, or what --config says)."""
+    shifts_m: tuple[float, ...] = ()
+    """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+    settings: Annotated[stage_config.RunConfig, arg(name="")] = stage_config.RunConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Common):
+    """Flags of ``mudg doctor``."""
+
+    scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
+    """Scene to check; without it, the machine is reported."""
+
+
+FLAGS: dict[str, type[Common]] = {
+    "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
+    "synthesize": Synthesize, "fit": Fit, "render": Render, "score": Score,
+}  # fmt: skip
+
+
+def parse(verb: str, words: Sequence[str], description: str) -> Common:
+    """Turn the words after ``mudg VERB`` into that verb's flags.
+
+    Raises:
+        UsageError: unknown or invalid setting. InputError: --config cannot be read.
+        SystemExit: --help (0), or a flag that does not exist or fit (2); it has been said already.
+    """
+    flags = FLAGS[verb]
+    kind = next((f.default for f in fields(flags) if f.name == "settings"), None)
+    default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(type(kind), words))
+    try:
+        return tyro.cli(flags, args=list(words), default=default, prog=f"mudg {verb}", description=description)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"]).replace("_", "-")
+        raise UsageError(
+            "a flag's value is not valid", where=f"--{field}", expected=first["msg"], got=repr(first.get("input"))[:120],
+            remedy=f"see mudg {verb} --help",
+        ) from error  # fmt: skip
+
+
+def _settings(kind: type[Any], words: Sequence[str]) -> Any:
+    """The settings before their own flags: preset (--fast), then --config, then the flags that stand for several settings."""
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--config", type=Path)
+    early.add_argument("--fast", action="store_true")
+    early.add_argument("--seed", type=int)
+    early.add_argument("--cameras", nargs="*")
+    early.add_argument("--shifts-m", nargs="*", type=float)
+    with contextlib.redirect_stderr(io.StringIO()):
+        try:
+            known, _ = early.parse_known_args(list(words))
+        except SystemExit:  # malformed: the real parser says it better
+            return kind()
+    whole_chain = kind is stage_config.RunConfig
+    config = stage_config.run_preset(known.fast) if whole_chain else kind()
+    if known.config is not None:
+        config = configuration.load(kind, config, known.config)
+    if whole_chain and known.seed is not None:
+        config = stage_config.with_seed(config, known.seed)
+    if whole_chain:
+        cameras = tuple(known.cameras) if known.cameras else None
+        shifts_m = tuple(known.shifts_m) if known.shifts_m else None
+        config = stage_config.with_lines(config, cameras=cameras, shifts_m=shifts_m)
+    return config
+
+
+def _with_settings(flags: type[Any], settings: Any) -> Any:
+    """An instance of ``flags`` whose required fields are still missing, for tyro to fill."""
+    values = {f.name: tyro.MISSING for f in fields(flags) if f.default is f.default_factory}
+    return flags(**values, settings=settings)

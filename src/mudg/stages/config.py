@@ -1,0 +1,294 @@
+"""The frozen configuration of every verb, in one file that imports no torch, so that ``--help`` answers at once.
+
+Defaults are a full run on a small machine. Every field is one flag; units are in the names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from mudg.base.config import STRICT
+from mudg.data.city.config import CityConfig
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class IngestConfig:
+    """Turn a dataset log, or the built-in procedural city, into a scene directory."""
+
+    test_every: int = Field(default=4, ge=0)
+    """Hold out every n-th frame of all cameras for scoring (0 = hold out none)."""
+    format: Literal["auto", "kitti"] = "auto"
+    """Format of the log (auto = look)."""
+    frames: str = ""
+    """Source frames to take, FIRST:END with END left out (empty = all)."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to take, by their names in the scene (empty = the format's usual ones)."""
+    sequence: str = ""
+    """Which sequence or frame, where a folder holds several."""
+    poses: str = ""
+    """File (or folder of GPS/IMU packets) with vehicle poses, instead of the one found by looking."""
+    boxes: str = ""
+    """File with tracked boxes, instead of the one found by looking."""
+    skip_missing: bool = False
+    """Leave out frames of which an image or scan is missing, instead of refusing."""
+    untwist: Literal["auto", "yes", "no"] = "auto"
+    """Undo the distortion of LiDAR scans by the vehicle's motion (auto = where the dataset says they are distorted)."""
+    city: CityConfig = CityConfig()
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class AnnotateConfig:
+    """Make semantics and sky, each with a confidence, for a scene that has no labels."""
+
+    labeller: Literal["geometry"] = "geometry"
+    """geometry: what boxes, ground and sky tell; needs no download."""
+    depth: bool = False
+    """Also write dense depth (LiDAR, holes filled with the nearest measurement) with a confidence."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class FuseConfig:
+    """Fuse sweeps and images into a static coloured cloud and one cloud per moving object."""
+
+    voxel_m: float = Field(default=0.0, ge=0)
+    """Keep one point per voxel of this size (0 = keep all)."""
+    occlusion_test: bool = True
+    """Give no colour to points behind a nearer surface."""
+    max_image_gap_s: float = Field(default=0.06, ge=0)
+    """Images at most this far in time from a sweep colour its points."""
+    colour_from_held_out: bool = False
+    """Also take colours from held-out images (scores at held-out frames then mean little)."""
+    box_growth_m: float = Field(default=0.1, ge=0, le=2)
+    """Moving boxes are grown by this on each side."""
+    floor_margin_m: float = Field(default=0.1, ge=0, le=1)
+    """Points this close above a moving box's floor stay with the road."""
+    moving_distance_m: float = Field(default=0.5, gt=0)
+    """A tracked box that gets or travels farther than this moves."""
+    min_object_points: int = Field(default=100, ge=1)
+    """Moving objects with fewer coloured points are left out."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class LearnConfig:
+    """Train the small multi-modal diffusion model on generated cities."""
+
+    seed: int = 0
+    """Fixes the cities, the weights' start and every draw."""
+    cities: int = Field(default=240, ge=1)
+    """Generated cities to train on."""
+    first_cities: int = Field(default=40, ge=1)
+    """Cities in use from the first step; the others join as training goes on."""
+    all_cities_at: float = Field(default=0.6, ge=0, le=1)
+    """Share of the steps after which all cities are in use."""
+    clips_per_city: int = Field(default=4, ge=1)
+    held_out: int = Field(default=6, ge=1)
+    """Cities kept for scoring only."""
+    watched: int = Field(default=1, ge=1)
+    """Held-out cities scored and drawn during training."""
+    clips: str = ""
+    """Folder of generated clips to use and complete (empty = inside the output folder)."""
+    workers: int = Field(default=1, ge=0)
+    """Processes that generate clips while training runs (0 = none: wait for another process to fill the folder)."""
+    threads: int = Field(default=1, ge=1)
+    """Threads of the training process. Results are repeatable at a fixed number."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
+    width: int = Field(default=192, ge=32)
+    height: int = Field(default=128, ge=32)
+    window: int = Field(default=8, ge=1)
+    """Frames per clip."""
+    widths: tuple[int, ...] = (64, 128, 224)
+    """Channels of the network's levels."""
+    blocks: tuple[int, ...] = (1, 1, 2)
+    spatial_attention: tuple[bool, ...] = (False, False, True)
+    temporal_attention: tuple[bool, ...] = (False, False, True)
+    patch: int = Field(default=2, ge=1)
+    codec_steps: int = Field(default=400, ge=1)
+    codec_batch: int = Field(default=16, ge=1)
+    codec_fit_batches: int = Field(default=8, ge=1)
+    codec_lr: float = Field(default=2e-3, gt=0)
+    steps: int = Field(default=2800, ge=1)
+    """Steps of the denoising network."""
+    batch_frames: int = Field(default=16, ge=1)
+    """Frames per step: half windows first, whole windows at the end."""
+    full_window_share: float = Field(default=0.3, ge=0, le=1)
+    """Share of the steps, at the end, with whole windows."""
+    lr: float = Field(default=1e-3, gt=0)
+    warmup_steps: int = Field(default=100, ge=0)
+    decay_share: float = Field(default=0.5, gt=0, le=1)
+    """Share of the steps, at the end, over which the learning rate falls."""
+    average_decay: float = Field(default=0.998, ge=0, lt=1)
+    """Decay of the moving average of the weights."""
+    checkpoint_every: int = Field(default=100, ge=1)
+    sample_every: int = Field(default=400, ge=1)
+    sample_steps: int = Field(default=4, ge=1)
+    score_steps: int = Field(default=8, ge=1)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SynthesizeConfig:
+    """Generate dense RGB, depth and semantics on shifted trajectories with the diffusion model."""
+
+    cameras: tuple[str, ...] = ("front",)
+    """Cameras to move sideways. Names that the scene lacks are an error; empty = the first camera."""
+    shifts_m: tuple[float, ...] = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
+    """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded path."""
+    model: str = "embedded"
+    """The model shipped with the package, or the folder of one made by learn."""
+    steps: int = Field(default=8, ge=1, le=1000)
+    """Denoising steps."""
+    eta: float = Field(default=1.0, ge=0, le=1)
+    """Noise added between steps: 0 = deterministic sampler, 1 = ancestral."""
+    overlap: int = Field(default=2, ge=0)
+    """Frames that a window of the model shares with the one before; they are kept, so that the video continues."""
+    width_px: int = Field(default=0, ge=0)
+    """Width the model works at (0 = about the area it was trained at, in the camera's aspect)."""
+    full_size: bool = True
+    """Write views at the camera's size, with detail of the warped recorded images put back; otherwise at the model's."""
+    held_out_images: bool = False
+    """Also warp in recorded images that are held out for scoring."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
+    processes: int = Field(default=0, ge=0)
+    """Trajectories made at the same time, one thread each (0 = one per core)."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class FitConfig:
+    """Fit a dynamic Gaussian scene to recorded, and optionally virtual, views."""
+
+    method: Literal["gs3d", "street_gaussians", "mudg_s"] = "mudg_s"
+    """Which nodes and which supervision (see the table of methods)."""
+    iterations: int = Field(default=2000, ge=1, le=1_000_000)
+    """Optimisation steps, one view each. Schedules and learning rates follow this number."""
+    seed: int = 0
+    cameras: tuple[str, ...] = ()
+    """Cameras whose recorded frames are fitted; empty = all."""
+    width_px: int = Field(default=0, ge=0)
+    """Width of the recorded images while fitting; the height follows (0 = as recorded)."""
+    sh_degree: int = Field(default=0, ge=0, le=3)
+    """Bands of view-dependent colour. On short drives every band above 0 learns the recorded line by heart."""
+    semantics: bool = True
+    """Carry class logits on every Gaussian where labels exist."""
+    semantic_every: int = Field(default=3, ge=1)
+    """Recorded views render and learn classes at every n-th step only (they converge early and cost a third of a step)."""
+    longest_to_middle: float = Field(default=10.0, ge=1)
+    """A Gaussian's longest axis is kept within this factor of its middle one: needles look right along the recorded line only."""
+    max_gaussians: int = Field(default=120_000, ge=100)
+    initial_gaussians: int = Field(default=70_000, ge=50)
+    """Upper bound for the static points taken from the fused cloud, and for those of all objects together."""
+    voxel_m: float = Field(default=0.15, gt=0)
+    """Static points are thinned to one per cube of this size (finer close to the drive)."""
+    far_m: float = Field(default=150.0, gt=1)
+    """Distance of what is neither sky nor within LiDAR reach."""
+    learn_poses: bool = False
+    """Correct the boxes of moving objects while fitting (offset and yaw per key)."""
+    densify: bool = True
+    ssim_weight: float = Field(default=0.2, ge=0, le=1)
+    lidar_weight: float = Field(default=0.1, ge=0)
+    """LiDAR depth on recorded views (best 95 % of the points, relative error)."""
+    sky_weight: float = Field(default=0.05, ge=0)
+    semantic_weight: float = Field(default=0.1, ge=0)
+    virtual_probability: float = Field(default=0.2, ge=0, le=1)
+    """mudg_s: how often a virtual view is taken instead of a recorded one (theta)."""
+    virtual_start: float = Field(default=0.15, ge=0, le=1)
+    """mudg_s: share of the iterations before virtual views join."""
+    virtual_seen_weight: float = Field(default=0.1, ge=0, le=1)
+    """mudg_s: weight of virtual pixels whose surface a recorded view saw, beside 1 for those that none saw."""
+    virtual_color_weight: float = Field(default=1.0, ge=0)
+    virtual_perceptual_weight: float = Field(default=0.1, ge=0)
+    virtual_depth_weight: float = Field(default=0.1, ge=0)
+    virtual_semantic_weight: float = Field(default=0.1, ge=0)
+    checkpoint_every: int = Field(default=500, ge=1)
+    preview_every: int = Field(default=500, ge=1)
+    raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
+    """Backend of the renderer; auto takes the fastest there is and says which."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RenderConfig:
+    """Render a fitted scene on recorded and shifted trajectories."""
+
+    cameras: tuple[str, ...] = ("front",)
+    shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
+    """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded drive."""
+    height_m: float = 0.0
+    """Added to the height of shifted cameras."""
+    yaw_deg: float = 0.0
+    """Turn of shifted cameras about the vertical, counter-clockwise from above."""
+    width_px: int = Field(default=0, ge=0)
+    """Image width (0 = as recorded)."""
+    remove_tracks: tuple[str, ...] = ()
+    """Moving objects to leave out."""
+    sky_below_alpha: float = Field(default=0.5, ge=0, le=1)
+    """Pixels covered less than this are sky: no depth, semantics sky."""
+    video: bool = True
+    fps: float = Field(default=10.0, gt=0)
+    raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ScoreConfig:
+    """Score renders and generated views against truth where it exists."""
+
+    width_px: int = Field(default=0, ge=0)
+    """Width at which everything is compared; the height follows (0 = the size of the scene's camera)."""
+    baseline: bool = True
+    """Also score the sparse condition with its holes filled by the nearest point: the bar a model has to clear."""
+    error_pictures: bool = True
+    """Write one picture of the colour error for the middle view of every trajectory."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RunConfig:
+    """The whole chain. Each verb's settings carry its name as prefix."""
+
+    ingest: IngestConfig = IngestConfig()
+    annotate: AnnotateConfig = AnnotateConfig()
+    fuse: FuseConfig = FuseConfig()
+    synthesize: SynthesizeConfig = SynthesizeConfig()
+    fit: FitConfig = FitConfig()
+    render: RenderConfig = RenderConfig()
+    score: ScoreConfig = ScoreConfig()
+
+
+def run_preset(fast: bool = False) -> RunConfig:
+    """The chain's settings before any file or flag; the first camera of whatever scene it is.
+
+    ``fast`` trades quality for time: fewer frames, denoising steps and iterations.
+    """
+    config = with_lines(RunConfig(), cameras=())
+    if not fast:
+        return config
+    return replace(
+        config, fit=replace(config.fit, iterations=300), synthesize=replace(config.synthesize, steps=4)
+    )  # fmt: skip
+
+
+def with_seed(config: RunConfig, seed: int) -> RunConfig:
+    """The same settings with ``seed`` in every verb that draws random numbers."""
+    parts = {f.name: getattr(config, f.name) for f in fields(config)}  # type: ignore[arg-type]
+    seeded = {n: replace(p, seed=seed) for n, p in parts.items() if any(f.name == "seed" for f in fields(p))}
+    seeded["ingest"] = replace(config.ingest, city=replace(config.ingest.city, seed=seed))
+    return replace(config, **seeded)
+
+
+def with_lines(
+    config: RunConfig, *, cameras: tuple[str, ...] | None = None, shifts_m: tuple[float, ...] | None = None
+) -> RunConfig:
+    """The same settings with these cameras (empty = the first) and lateral shifts in synthesize and render.
+
+    Render always adds the recorded path, synthesize leaves it out.
+    """
+    synthesize, render = config.synthesize, config.render
+    if cameras is not None:
+        synthesize, render = replace(synthesize, cameras=cameras), replace(render, cameras=cameras)
+    if shifts_m is not None:
+        moved = tuple(shift for shift in dict.fromkeys(shifts_m) if shift != 0)
+        synthesize, render = replace(synthesize, shifts_m=moved), replace(render, shifts_m=(0.0, *moved))
+    return replace(config, synthesize=synthesize, render=render)

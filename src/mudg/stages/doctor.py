@@ -1,0 +1,173 @@
+"""``mudg doctor``: what this machine offers, and with a scene, what is wrong with it. Never reaches the network."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Mapping
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from mudg.base.versions import version
+
+_CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av")
+_OPTIONAL: Mapping[str, tuple[str, str]] = {
+    # module: (what it is for, how to get it)
+    "gsplat": ("faster rasteriser on CUDA devices", "pip install 'mudg[gsplat]'"),
+}
+_ENCODERS = ("libx264", "h264_videotoolbox", "libopenh264")
+
+
+def report_machine() -> dict[str, Any]:
+    """Describe machine, Python, torch, native library, packages, video encoders and weights.
+
+    Returns:
+        Plain values for ``--json``; ``text`` is the same for people; ``ready`` says whether everything needed is here.
+    """
+    problems: list[str] = []
+    sections: dict[str, dict[str, str]] = {
+        "machine": _machine(),
+        "python": {"version": platform.python_version(), "executable": sys.executable, "mudg": version()},
+        "torch": _torch(problems),
+        "native library": _native(problems),
+        "packages": _packages(problems),
+        "optional packages": _optional(),
+        "video": _video(problems),
+        "weights": _weights(problems),
+    }
+    lines = []
+    for title, rows in sections.items():
+        lines.append(title)
+        lines += [f"  {name:<18} {value}" for name, value in rows.items()]
+    lines.append("")
+    lines += [f"problem: {problem}" for problem in problems] or ["everything that the default run needs is here"]
+    return {**sections, "problems": problems, "ready": not problems, "text": "\n".join(lines)}
+
+
+def report_scene(scene: Path) -> dict[str, Any]:
+    """Check a scene directory or zip and say in words what is wrong or odd.
+
+    Returns:
+        Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if the scene cannot be used.
+    """
+    from mudg.data.scene_check import check_scene
+
+    found = check_scene(scene)
+    count = {level: sum(f.level == level for f in found) for level in ("error", "warning", "note")}
+    lines = [f"{f.level}: {f.where}: {f.words}" for f in found]
+    if count["error"]:
+        lines.append(f"{scene} cannot be used: {count['error']} errors, {count['warning']} warnings")
+    else:
+        lines.append(f"{scene} can be used: {count['warning']} warnings, {count['note']} notes")
+    return {
+        "scene": scene, "findings": [{"level": f.level, "where": f.where, "words": f.words} for f in found],
+        "usable": not count["error"], "text": "\n".join(lines), "exit_code": 3 if count["error"] else 0,
+    }  # fmt: skip
+
+
+def _machine() -> dict[str, str]:
+    rows = {"system": f"{platform.system()} {platform.release()} {platform.machine()}", "processors": _processors()}
+    memory = _memory_bytes()
+    if memory:
+        rows["memory"] = f"{memory / 2**30:.1f} GiB"
+    free = shutil.disk_usage(Path.cwd()).free
+    rows["free disk here"] = f"{free / 2**30:.1f} GiB"
+    return rows
+
+
+def _processors() -> str:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{usable} usable of {os.cpu_count()}"
+
+
+def _memory_bytes() -> int:
+    names = getattr(os, "sysconf_names", {})
+    if "SC_PHYS_PAGES" in names and "SC_PAGE_SIZE" in names:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 0
+
+
+def _torch(problems: list[str]) -> dict[str, str]:
+    try:
+        import torch
+    except ImportError as error:
+        problems.append(f"torch cannot be imported: {error}; reinstall with pip install 'torch>=2.10,<2.14'")
+        return {"version": "missing"}
+    rows = {"version": torch.__version__, "threads": str(torch.get_num_threads())}
+    if torch.cuda.is_available():
+        rows["CUDA device"] = f"{torch.cuda.get_device_name(0)}, {torch.cuda.mem_get_info()[1] / 2**30:.0f} GiB"
+    else:
+        rows["CUDA device"] = "none: everything runs on the processor"
+    return rows
+
+
+def _native(problems: list[str]) -> dict[str, str]:
+    from mudg import native
+
+    if native.library() is None:
+        problems.append("the native library is not in use: " + native.REMEDY)
+    return {"status": native.status().removeprefix("native library: ")}
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _packages(problems: list[str]) -> dict[str, str]:
+    rows = {name: _installed(name) or "missing" for name in _CORE}
+    missing = [name for name, found in rows.items() if found == "missing"]
+    if missing:
+        problems.append(f"packages are missing: {', '.join(missing)}; reinstall mudg with pip")
+    if find_spec("torchvision") is not None:
+        rows["torchvision"] = "present but never used; where its build does not fit torch, uninstall it"
+    return rows
+
+
+def _optional() -> dict[str, str]:
+    return {
+        name: found if (found := _installed(name)) else f"not installed ({use}; {how})"
+        for name, (use, how) in _OPTIONAL.items()
+    }
+
+
+def video_encoders() -> list[str]:
+    """Names of the H.264 encoders (what browsers play) that PyAV offers here, best first."""
+    import av
+
+    found = []
+    for name in _ENCODERS:
+        try:
+            av.codec.Codec(name, "w")
+        except av.codec.codec.UnknownCodecError:
+            continue
+        found.append(name)
+    return found
+
+
+def _video(problems: list[str]) -> dict[str, str]:
+    if find_spec("av") is None:
+        return {"encoders": "unknown (av is missing)"}
+    found = video_encoders()
+    if not found:
+        problems.append("PyAV has no H.264 encoder: reports will show pictures instead of videos")
+    return {"encoders": ", ".join(found) or "none"}
+
+
+def _weights(problems: list[str]) -> dict[str, str]:
+    folder = Path(__file__).resolve().parents[1] / "assets"
+    models = sorted({p.parent for p in folder.rglob("*.safetensors")})
+    rows = {}
+    for model in models:
+        size = sum(p.stat().st_size for p in model.rglob("*.safetensors")) / 2**20
+        rows[model.name] = f"shipped with mudg, {size:.1f} MiB"
+    if not models:
+        problems.append("no diffusion model is shipped with this build: train one with mudg learn")
+        rows["diffusion model"] = "none found"
+    return rows

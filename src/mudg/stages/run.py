@@ -1,0 +1,232 @@
+"""The chain behind ``mudg demo`` and ``mudg run``: every verb in order, each skipped when its result verifies.
+
+OUT/scene  OUT/fuse  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>  OUT/score
+OUT/report.html  OUT/run.yaml (settings)  OUT/run.json (state, seconds per step over all continuations)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mudg.base import config as configuration
+from mudg.base import log, store
+from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.versions import environment
+from mudg.stages.config import RunConfig
+
+CITY = "city"
+WITHOUT_DIFFUSION = "street_gaussians"
+DIFFUSION = "mudg_r"
+WITH_DIFFUSION = "mudg_s"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the chain: the name in tables, the folder it fills (relative to OUT), and what does it."""
+
+    name: str
+    folder: str
+    make: Callable[[], Path]
+
+
+def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
+    """Run the whole chain on a generated city, a dataset log or a scene, and write ``OUT/report.html``.
+
+    A step whose folder holds a finished result of the same settings and inputs is verified and reused; an interrupted
+    one continues. The seconds of each step are summed over all continuations.
+
+    Args:
+        config: settings of all verbs.
+        source: ``"city"``, the folder of a dataset log, or a scene made by ingest.
+        out: folder for everything.
+        overwrite: replace what other settings have left in ``out``.
+
+    Returns:
+        Paths of the report and the metrics, the seconds per step, and ``text``: the tables for people.
+
+    Raises:
+        InputError: no such log. UsageError: ``out`` holds a run of other settings. Whatever a verb raises.
+    """
+    from mudg import native
+
+    out = Path(out)
+    if str(source) != CITY and not Path(source).exists():
+        raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
+    _use_all_threads(native.default_threads())
+    ledger = _Ledger.open(out, config, str(source), overwrite)
+    try:
+        scene = _prepare_scene(config, source, out, ledger, overwrite)
+        for step in _steps(config, scene, out, overwrite):
+            ledger.timed(step)
+        report = ledger.timed(Step("report", "report.html", lambda: _report(out)))
+    except KeyboardInterrupt:
+        ledger.save("interrupted")
+        raise
+    except MudgError:
+        ledger.save("failed")
+        raise
+    ledger.save("complete")
+    _report(out)  # once more, now that the seconds of all steps are known
+    return {
+        "report": report, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
+        "text": _closing_words(out, report, ledger),
+    }  # fmt: skip
+
+
+def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Ledger, overwrite: bool) -> Path:
+    """Ingest (unless ``source`` is a scene already) and, where semantic labels are absent, annotate."""
+    from mudg.stages import annotate, ingest
+
+    if (Path(source) / "scene.json").is_file() or str(source).endswith(".zip"):
+        scene = Path(source)
+    else:
+        scene = ledger.timed(
+            Step("ingest", "scene", lambda: ingest.run(config.ingest, str(source), out / "scene", overwrite=overwrite))
+        )
+    if not _has_semantics(scene):
+        labelled = out / "annotate"
+        return ledger.timed(
+            Step("annotate", "annotate", lambda: annotate.run(config.annotate, scene, labelled, overwrite=overwrite))
+        )
+    return scene
+
+
+def _has_semantics(scene: Path) -> bool:
+    from mudg.data.scenefile import read_scene
+
+    return all("semantics" in frame.labels for frame in read_scene(scene).frames)
+
+
+def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[Step, ...]:
+    from mudg.stages import fit, fuse, render, score, synthesize
+
+    fused, virtual = out / "fuse", out / "synthesize"
+    plain = replace(config.fit, method=WITHOUT_DIFFUSION)
+    guided = replace(config.fit, method=WITH_DIFFUSION)
+    models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
+    renders = {name: out / "render" / name for name in models}
+
+    def fitted(name: str) -> Path:
+        settings, observations = (guided, virtual) if name == WITH_DIFFUSION else (plain, None)
+        return fit.run(settings, scene, fused, models[name], observations=observations, overwrite=overwrite)
+
+    def rendered(name: str) -> Path:
+        return render.run(config.render, scene, models[name], renders[name], overwrite=overwrite)
+
+    def scored() -> Path:
+        compared = {
+            WITHOUT_DIFFUSION: renders[WITHOUT_DIFFUSION],
+            DIFFUSION: virtual,
+            WITH_DIFFUSION: renders[WITH_DIFFUSION],
+        }
+        return score.run(config.score, scene, compared, out / "score", fused=fused, overwrite=overwrite)
+
+    return (
+        Step("fuse", "fuse", lambda: fuse.run(config.fuse, scene, fused, overwrite=overwrite)),
+        Step("synthesize", "synthesize",
+             lambda: synthesize.run(config.synthesize, scene, fused, virtual, overwrite=overwrite)),
+        Step("fit without diffusion", f"fit/{WITHOUT_DIFFUSION}", lambda: fitted(WITHOUT_DIFFUSION)),
+        Step("fit with diffusion", f"fit/{WITH_DIFFUSION}", lambda: fitted(WITH_DIFFUSION)),
+        Step("render without diffusion", f"render/{WITHOUT_DIFFUSION}", lambda: rendered(WITHOUT_DIFFUSION)),
+        Step("render with diffusion", f"render/{WITH_DIFFUSION}", lambda: rendered(WITH_DIFFUSION)),
+        Step("score", "score", scored),
+    )  # fmt: skip
+
+
+def _report(out: Path) -> Path:
+    from mudg.stages import report
+
+    return report.write_report(out)
+
+
+def _use_all_threads(count: int) -> None:
+    import torch
+
+    torch.set_num_threads(count)
+
+
+def _closing_words(out: Path, report: Path, ledger: _Ledger) -> str:
+    from mudg.stages import score
+
+    rows = "\n".join(f"  {name:<26}{seconds:8.1f} s" for name, seconds in ledger.seconds().items())
+    total = sum(ledger.seconds().values())
+    return (
+        f"{score.summary_table(out / 'score')}\n\nseconds per step\n{rows}\n  {'total':<26}{total:8.1f} s\n\n"
+        f"report: {report.resolve()}"
+    )
+
+
+class _Ledger:
+    """OUT/run.json: what was asked, and how long each step took over all continuations."""
+
+    def __init__(self, out: Path, asked: Mapping[str, Any], steps: dict[str, dict[str, Any]]) -> None:
+        self._out = out
+        self._asked = dict(asked)
+        self._steps = steps
+
+    @classmethod
+    def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
+        """Open or begin the ledger of ``out``; UsageError if it belongs to other settings."""
+        asked = {"verb": "run", "source": source, **configuration.to_dict(config)}
+        steps: dict[str, dict[str, Any]] = {}
+        known = out / "run.json"
+        if known.is_file():
+            before = store.read_json(known)
+            if before.get("asked") == asked:
+                steps = dict(before.get("steps", {}))
+            elif not overwrite:
+                raise UsageError(
+                    "the output folder holds a run of other settings", where=str(out),
+                    got="; ".join(_differences(before.get("asked", {}), asked)[:8]) or "another program version",
+                    remedy="choose another --out, or add --overwrite to replace it",
+                )  # fmt: skip
+        elif out.is_dir() and any(out.iterdir()) and not overwrite:
+            raise UsageError("the output folder holds files of something else", where=str(out),
+                             remedy="choose an empty --out")  # fmt: skip
+        ledger = cls(out, asked, steps)
+        ledger.save("running")
+        store.write_text(out / "run.yaml", configuration.dump_yaml(config))
+        return ledger
+
+    def timed(self, step: Step) -> Path:
+        """Do one step and add its seconds, also when it is interrupted; a reused result adds none."""
+        finished = self._steps.get(step.name, {}).get("state") == "complete" and (self._out / step.folder).exists()
+        began = time.monotonic()
+        state = "interrupted"
+        log.info(f"== {step.name}")
+        try:
+            path = step.make()
+            state = "complete"
+        finally:
+            spent = time.monotonic() - began
+            earlier = float(self._steps.get(step.name, {}).get("seconds", 0.0))
+            if not (finished and state == "complete" and spent < earlier):
+                self._steps[step.name] = {
+                    "state": state, "seconds": round(earlier + spent, 2) if not finished else round(spent, 2),
+                }  # fmt: skip
+            self.save("running")
+        return path
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds per step, in order."""
+        return {name: float(entry["seconds"]) for name, entry in self._steps.items()}
+
+    def save(self, state: str) -> None:
+        """Write OUT/run.json."""
+        store.write_json(
+            self._out / "run.json",
+            {"schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "environment": environment()},
+        )
+
+
+def _differences(old: Any, new: Any, path: str = "") -> list[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        found = []
+        for name in sorted(set(old) | set(new), key=str):
+            found += _differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
+        return found
+    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]

@@ -1,0 +1,417 @@
+"""``mudg score``: what the methods rendered, against the truth.
+
+For a generated city the truth is exact at any view. For a recorded log it is the held-out recorded frames, and nothing
+at shifted views. OUT holds metrics.json, metrics.md, truth/<trajectory>/ and nearest_fill/<trajectory>/ (observations)
+and errors/*.png.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from mudg.base import config as configuration
+from mudg.base import geometry, log, palette, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Frame, FusedCloud, Observation, Scene, View
+from mudg.core import metrics, project
+from mudg.data.cloudfile import read_fused
+from mudg.data.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
+from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+from mudg.stages import score_tables
+from mudg.stages.config import ScoreConfig
+
+BASELINE: Final = "nearest_fill"
+BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
+DEPTH_LIMIT_M: Final = 80.0
+SAME_SWEEP_S: Final = 0.05
+_SAME_TIME_S: Final = 1e-4
+_SAME_PLACE_M: Final = 1e-3
+_NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
+
+
+@dataclass(frozen=True)
+class Course:
+    """One trajectory to score.
+
+    Args:
+        name: trajectory name. camera: its camera. shift_m: 0 = the recorded path, None = neither it nor a plain shift.
+        views: at the common size. frames: the recorded frame of each view on the recorded path, else None.
+        sets, indices: the methods that have it, and which of their views stand beside ``views``.
+    """
+
+    name: str
+    camera: str
+    shift_m: float | None
+    views: tuple[View, ...]
+    frames: tuple[Frame | None, ...]
+    sets: Mapping[str, ObservationSet]
+    indices: Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Where truth comes from: ``at(view, frame)`` is None where there is none."""
+
+    exact: bool
+    at: Callable[[View, Frame | None], Observation | None]
+
+
+Baseline = Callable[[View], Observation]
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """What every method is held against."""
+
+    truth: Truth
+    baseline: Baseline | None
+    held_out: frozenset[str]
+    error_pictures: bool
+
+
+def run(
+    config: ScoreConfig, scene: Path, methods: Mapping[str, Path], out: Path, *, fused: Path | None = None,
+    overwrite: bool = False,
+) -> Path:  # fmt: skip
+    """Score every trajectory of every method and write ``out``.
+
+    Args:
+        config: settings.
+        scene: the scene that was rendered.
+        methods: name -> folder of observation folders (output of render or synthesize).
+        out: folder to write.
+        fused: clouds made by fuse, for the baseline; without them there is none.
+        overwrite: replace what other settings or inputs left in ``out``.
+
+    Raises:
+        UsageError: no method given. InputError: nothing to score, or methods disagree about a trajectory's views.
+    """
+    if not methods:
+        raise UsageError("nothing to score", expected="at least one method with its folder of rendered views")
+    inputs = {"scene": store.digest(scene)} | {name: store.digest(folder) for name, folder in methods.items()}
+    if fused is not None and config.baseline:
+        inputs["fused"] = store.digest(fused)
+    work = store.RunDir.open(out, "score", configuration.to_dict(config), inputs, version=1, overwrite=overwrite)
+    if work.complete:
+        return work.reused()
+    recorded = read_scene(scene)
+    truth = _truth_of(recorded)
+    courses = _courses(config, recorded, methods)
+    baseline = _baseline(recorded, fused) if fused is not None and config.baseline else None
+    held_out = frozenset(f.id for f in recorded.frames_in("test")) or frozenset(f.id for f in recorded.frames)
+    yardstick = Yardstick(truth, baseline, held_out, config.error_pictures)
+    results: list[dict[str, Any]] = []
+    with log.task("score", sum(len(course.views) for course in courses)) as bar:
+        for course in courses:
+            bar.update(course.name)
+            results += _score_course(course, yardstick, out, bar.advance)
+    names = [*([BASELINE] if baseline is not None else []), *methods]
+    rows = {
+        name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
+        for name, row in metrics.METRICS.items()
+    }
+    record = courses_record(courses)
+    document = score_tables.document(recorded, truth.exact, record, names, results, rows, DEPTH_LIMIT_M)
+    store.write_json(out / "metrics.json", document)
+    store.write_text(out / "metrics.md", score_tables.markdown(document))
+    work.finish({"trajectories": len(courses), "methods": names})
+    return out
+
+
+def summary_table(out: Path) -> str:
+    """The main numbers of a finished score folder as plain text for a terminal."""
+    return score_tables.plain(store.read_json(Path(out) / "metrics.json"))
+
+
+# ---- what is compared with what ----
+
+
+def _courses(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[Course]:
+    sets = {
+        method: {name: read_observations(path) for name, path in list_observation_sets(folder).items()}
+        for method, folder in methods.items()
+    }
+    names = sorted({name for of in sets.values() for name in of}, key=_order)
+    if not names:
+        raise InputError(
+            "none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
+            expected="output of mudg render or mudg synthesize",
+        )  # fmt: skip
+    return [_course(config, scene, name, {m: of[name] for m, of in sets.items() if name in of}) for name in names]
+
+
+def _order(name: str) -> tuple[str, float, str]:
+    found = _NAME.fullmatch(name)
+    return (found["camera"], float(found["shift"] or 0), name) if found else (name, 1e9, name)
+
+
+def _course(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, ObservationSet]) -> Course:
+    """Match the methods' views by time; keep those that all have, so that all are scored on the same ones."""
+    times = {m: np.array([v.time_s for v in of.views]) for m, of in sets.items()}
+    indices: dict[str, list[int]] = {m: [] for m in sets}
+    views: list[View] = []
+    for view in next(iter(sets.values())).views:
+        nearest = {m: int(np.argmin(np.abs(t - view.time_s))) for m, t in times.items() if len(t)}
+        if len(nearest) < len(sets) or any(abs(times[m][i] - view.time_s) > _SAME_TIME_S for m, i in nearest.items()):
+            continue
+        for method, index in nearest.items():
+            apart_m = float(np.linalg.norm(sets[method].views[index].center_world - view.center_world))
+            if apart_m > _SAME_PLACE_M:
+                raise InputError("two methods rendered one trajectory from different places",
+                                 where=f"{name}: {method}, view {index}", got=f"{apart_m:.3f} m apart")  # fmt: skip
+            indices[method].append(index)
+        views.append(_sized(config, scene, view))
+    if not views:
+        raise InputError("the methods have no view in common", where=name, got=", ".join(sets))
+    found = _NAME.fullmatch(name)
+    shift_m = float(found["shift"] or 0.0) if found is not None and not found["more"] else None
+    camera = views[0].camera.name
+    frames = tuple(_frame_at(scene, camera, view) if shift_m == 0.0 else None for view in views)
+    return Course(name, camera, shift_m, tuple(views), frames, sets, {m: tuple(i) for m, i in indices.items()})
+
+
+def courses_record(courses: list[Course]) -> list[dict[str, Any]]:
+    """The trajectories as JSON values."""
+    return [
+        {
+            "name": course.name, "camera": course.camera, "shift_m": course.shift_m, "views": len(course.views),
+            "width": course.views[0].camera.width, "height": course.views[0].camera.height,
+            "methods": list(course.sets), "indices": {m: list(i) for m, i in course.indices.items()},
+        }
+        for course in courses
+    ]  # fmt: skip
+
+
+def _sized(config: ScoreConfig, scene: Scene, view: View) -> View:
+    camera = scene.cameras.get(view.camera.name, view.camera)
+    width = config.width_px or camera.width
+    return view.resized(width, max(1, round(camera.height * width / camera.width)))
+
+
+def _frame_at(scene: Scene, camera: str, view: View) -> Frame | None:
+    return next((f for f in scene.frames_of(camera) if abs(f.view.time_s - view.time_s) <= _SAME_TIME_S), None)
+
+
+# ---- truth ----
+
+
+def _truth_of(scene: Scene) -> Truth:
+    if scene.source.recipe is not None:
+        from mudg.data.city import CityWorld
+
+        world = CityWorld.from_source(scene.source)
+        return Truth(True, lambda view, _frame: world.observation(view))
+    return Truth(False, lambda view, frame: None if frame is None else _recorded(scene, frame, view))
+
+
+def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
+    """A recorded frame at the common size, with measured depth and the labels the log came with, never guessed ones."""
+    height, width = view.camera.height, view.camera.width
+    rgb = torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255
+    semantics = None
+    if "semantics" in frame.labels and "semantics_confidence" not in frame.labels:  # else a labeller made them
+        labels = torch.from_numpy(read_label(scene, frame, "semantics").astype(np.int64))[None]
+        semantics = resize_nearest(labels, height, width)[0]
+    if "depth" in frame.labels and "depth_confidence" not in frame.labels:
+        measured = torch.from_numpy(read_label(scene, frame, "depth").copy())[None]
+        depth: Tensor | None = resize_nearest(measured, height, width)
+    else:
+        depth = _lidar_depth(scene, view)
+    keep = torch.ones(1, height, width, dtype=torch.bool)
+    if "ego" in frame.labels:
+        ego = torch.from_numpy(read_label(scene, frame, "ego").astype(bool))[None]
+        keep = ~resize_nearest(ego, height, width)
+    return Observation(
+        view=view, rgb=resize_rgb(rgb, height, width), depth=depth, semantics=semantics,
+        confidence=torch.ones(1, height, width), mask=keep, kind="recorded", source="camera",
+    )  # fmt: skip
+
+
+def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
+    """Depth f32[1, H, W] of the sweep taken with this frame (NaN where no point fell), or None without such a sweep."""
+    from mudg.stages.fit_views import visible_lidar
+
+    sweeps = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= SAME_SWEEP_S]
+    if not sweeps:
+        return None
+    points = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in sweeps]
+    seen = visible_lidar(view, np.concatenate(points).astype(np.float32))
+    depth = torch.full((view.camera.height * view.camera.width,), torch.nan)
+    depth[seen.pixel] = seen.depth_m
+    return depth.reshape(1, view.camera.height, view.camera.width)
+
+
+def _baseline(scene: Scene, fused: Path) -> Baseline:
+    """The fused points drawn at a view, every hole taking the nearest point in the picture: no learning at all."""
+    cloud = read_fused(fused)
+
+    def at(view: View) -> Observation:
+        placed = ((track.id, track.pose_at(view.time_s)) for track in scene.tracks)
+        poses = {name: pose for name, pose in placed if pose is not None}
+        return nearest_fill(cloud, poses, view)
+
+    return at
+
+
+def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.float64]], view: View) -> Observation:
+    """Draw a cloud and fill what no point covers with the nearest covered pixel's colour, depth and class.
+
+    A view that sees no point at all is black, without depth and class.
+    """
+    drawn = project.project_cloud(cloud, world_from_object, view, BASELINE_DRAWING)
+    height, width = view.camera.height, view.camera.width
+    index = drawn.index.numpy()
+    if (index < 0).all():
+        row, column = np.mgrid[0:height, 0:width]
+    else:
+        row, column = distance_transform_edt(index < 0, return_distances=False, return_indices=True)
+    layers = [cloud.static, *(points for _, points in project.drawn_objects(cloud, world_from_object))]
+    semantics = None
+    if all(layer.semantics is not None for layer in layers):
+        known = np.concatenate([layer.semantics for layer in layers if layer.semantics is not None])
+        ids = np.append(known, palette.UNLABELLED)[index]  # index -1 = nothing = the appended entry
+        semantics = torch.from_numpy(ids[row, column].astype(np.int64))
+    depth = drawn.depth.numpy()[:, row, column]
+    return Observation(
+        view=view, rgb=torch.from_numpy(drawn.color.numpy()[:, row, column]),
+        depth=torch.from_numpy(np.where(depth > 0, depth, np.nan).astype(np.float32)), semantics=semantics,
+        confidence=drawn.valid.float(), mask=torch.ones(1, height, width, dtype=torch.bool),
+        kind="virtual", source=BASELINE,
+    )  # fmt: skip
+
+
+def resize_rgb(rgb: Tensor, height: int, width: int) -> Tensor:
+    """Colour f32[3, H, W] to another size, bilinear with antialiasing; unchanged if the size is right already."""
+    if rgb.shape[-2:] == (height, width):
+        return rgb
+    return torch.nn.functional.interpolate(rgb[None], size=(height, width), mode="bilinear", antialias=True)[0]
+
+
+def resize_nearest(values: Tensor, height: int, width: int) -> Tensor:
+    """Depth, labels or masks [C, H, W] to another size by the nearest pixel centre; nothing is mixed."""
+    if values.shape[-2:] == (height, width):
+        return values
+    rows = ((torch.arange(height) + 0.5) * values.shape[-2] / height).long()
+    columns = ((torch.arange(width) + 0.5) * values.shape[-1] / width).long()
+    return values[:, rows][:, :, columns]
+
+
+# ---- one trajectory ----
+
+
+def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[], None]) -> list[dict[str, Any]]:
+    """Score all methods on one trajectory; writes its truth, its baseline and its error pictures."""
+    names = [*([BASELINE] if by.baseline is not None else []), *course.sets]
+    sums = {name: metrics.build_all() for name in names}
+    truth_has: set[str] = set()
+    scored = 0
+    middle = len(course.views) // 2
+    with contextlib.ExitStack() as stack:
+        truths = fills = None
+        if by.truth.exact or all(frame is not None for frame in course.frames):
+            writer = ObservationWriter(out / "truth" / course.name, course.name, "truth", "recorded")
+            truths = stack.enter_context(writer)
+        if by.baseline is not None:
+            fills = stack.enter_context(ObservationWriter(out / BASELINE / course.name, course.name, BASELINE))
+        for number, (view, frame) in enumerate(zip(course.views, course.frames, strict=True)):
+            true = by.truth.at(view, frame)
+            found = {m: of[course.indices[m][number]] for m, of in course.sets.items()}
+            if by.baseline is not None and fills is not None:
+                found = {BASELINE: by.baseline(view), **found}
+                fills.add(found[BASELINE])
+            if true is not None:
+                if truths is not None:
+                    truths.add(true)
+                # Recorded training frames were seen by the fit and do not count; views off the path never were.
+                if frame is None or frame.id in by.held_out:
+                    scored += 1
+                    truth_has |= {m for m in ("rgb", "depth", "semantics") if getattr(true, m) is not None}
+                    _update(sums, found, true)
+                if by.error_pictures and number == middle:
+                    _write_error_picture(out / "errors" / f"{course.name}.png", found, true)
+            advance()
+    return [
+        {"method": name, "trajectory": course.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
+        for name, of in sums.items()
+    ]
+
+
+def _update(
+    sums: Mapping[str, Mapping[str, metrics.Metric]], found: Mapping[str, Observation], true: Observation
+) -> None:
+    for name, seen in found.items():
+        pair = pair_of(seen, true)
+        for metric in sums[name].values():
+            metric.update(pair)
+
+
+def _values(of: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str, float | str]:
+    """A number per metric, or why there is none: no truth, not produced by the method, not computed by this build."""
+    values = metrics.results(dict(of))
+    for name, row in metrics.METRICS.items():
+        if row.build is not None and row.needs[0] not in truth_has:
+            values[name] = score_tables.NO_TRUTH
+    return {n: round(v, 6) if isinstance(v, float) else v for n, v in values.items()}
+
+
+def _iou(of: Mapping[str, metrics.Metric]) -> dict[str, float]:
+    segmentation = of["miou"]
+    if not isinstance(segmentation, metrics.Segmentation) or not int(segmentation.counts.sum()):
+        return {}
+    return {name: round(value, 4) for name, value in metrics.iou_of(segmentation.counts).items()}
+
+
+def pair_of(seen: Observation, true: Observation) -> metrics.Pair:
+    """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m)."""
+    height, width = true.view.camera.height, true.view.camera.width
+    depth = None
+    if seen.depth is not None:
+        depth = resize_nearest(seen.depth, height, width)
+        given = torch.isfinite(depth) & (depth > 0)
+        depth = torch.where(given, depth, torch.full_like(depth, DEPTH_LIMIT_M)).clamp(max=DEPTH_LIMIT_M)
+    valid = None
+    if true.depth is not None:
+        valid = torch.isfinite(true.depth) & (true.depth > 0) & (true.depth <= DEPTH_LIMIT_M)
+    return metrics.Pair(
+        rgb=resize_rgb(seen.rgb, height, width), depth=depth,
+        semantics=None if seen.semantics is None else resize_nearest(seen.semantics[None], height, width)[0],
+        truth_rgb=true.rgb, truth_depth=true.depth, truth_depth_valid=valid, truth_semantics=true.semantics,
+        mask=true.mask,
+    )  # fmt: skip
+
+
+def error_image(rgb: Tensor, truth: Tensor) -> np.ndarray:
+    """Mean absolute colour error as a picture u8[H, W, 3]: black = equal, through red to white = 0.35 or more."""
+    error = ((rgb.clamp(0, 1) - truth).abs().mean(0) / 0.35).clamp(0, 1).numpy()
+    channels = (np.clip(error * 2.2, 0, 1), np.clip(error * 2.2 - 0.8, 0, 1), np.clip(error * 3.2 - 2.2, 0, 1))
+    return (np.stack(channels, -1) * 255).round().astype(np.uint8)
+
+
+def _write_error_picture(path: Path, found: Mapping[str, Observation], true: Observation) -> None:
+    """Truth and the methods beside each other, their colour errors below."""
+    height, width = true.view.camera.height, true.view.camera.width
+    picture = np.zeros((2 * height, (len(found) + 1) * width, 3), np.uint8)
+    picture[:height, :width] = to_bytes(true.rgb)
+    for column, seen in enumerate(found.values(), start=1):
+        rgb = resize_rgb(seen.rgb, height, width)
+        picture[:height, column * width : (column + 1) * width] = to_bytes(rgb)
+        picture[height:, column * width : (column + 1) * width] = error_image(rgb, true.rgb)
+    with store.atomic_path(path) as temporary:
+        Image.fromarray(picture).save(temporary, optimize=False, compress_level=1)
+
+
+def to_bytes(rgb: Tensor) -> np.ndarray:
+    """Colour f32[3, H, W] in [0, 1] as a picture u8[H, W, 3]."""
+    return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()

@@ -1,0 +1,158 @@
+"""Scores as a document (metrics.json), as Markdown and as plain text for a terminal. Plain values only; no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from mudg.base.types import Scene
+from mudg.methods import METHODS
+
+NO_TRUTH: Final = "no truth"
+TITLES: Final[dict[str, str]] = {
+    "truth": "Truth",
+    "nearest_fill": "Fused points, holes filled",
+    **{name: method.title for name, method in METHODS.items()},
+}
+SHOWN: Final = ("psnr", "ssim", "abs_rel", "rmse_m", "delta1", "miou")
+_DIGITS: Final = {"psnr": 2, "rmse_m": 2, "fid": 1, "fvd": 1}
+
+
+def title_of(method: str) -> str:
+    """Name of a method for people."""
+    return TITLES.get(method, method)
+
+
+def number_text(metric: str, value: float | str | None) -> str:
+    """A metric's value with its usual digits; a reason why there is none is returned as it is."""
+    if isinstance(value, str):
+        return value
+    return "" if value is None else f"{value:.{_DIGITS.get(metric, 3)}f}"
+
+
+def document(
+    scene: Scene, exact: bool, courses: Sequence[Mapping[str, Any]], methods: Sequence[str],
+    results: Sequence[Mapping[str, Any]], rows: Mapping[str, Mapping[str, Any]], depth_limit_m: float,
+) -> dict[str, Any]:  # fmt: skip
+    """Everything ``metrics.json`` holds.
+
+    Args:
+        scene: what was scored. exact: whether truth exists at any view.
+        courses: trajectories as JSON values. methods: in the order of the tables.
+        results: one entry per method and trajectory. rows: title, unit, better and needs of each metric.
+        depth_limit_m: depths beyond it do not count.
+    """
+    held_out = len(scene.frames_in("test"))
+    rules = [
+        "All methods are scored at one size, that of the scene's camera unless another was asked for; "
+        "colour is resized bilinearly, depth and classes take the nearest pixel.",
+        "On the recorded path only held-out frames count."
+        if held_out
+        else "No frame was held out: on the recorded path the frames that were learned from are scored.",
+        "Views off the path were never seen by any method."
+        if exact
+        else "A recorded log has no truth off its path: shifted views are shown, not scored.",
+        f"Depth counts where the truth is known and at most {depth_limit_m:g} m; "
+        f"where a method gives none, it counts as {depth_limit_m:g} m.",
+        "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
+    ]
+    return {
+        "schema": 1,
+        "scene": {
+            "id": scene.id, "dataset": scene.source.dataset, "licence": scene.source.licence,
+            "notes": list(scene.source.notes), "frames": len(scene.frames), "held_out": held_out,
+            "cameras": {c.name: [c.width, c.height] for c in scene.cameras.values()}, "tracks": len(scene.tracks),
+        },
+        "truth": "exact" if exact else "recorded",
+        "rules": rules,
+        "methods": [{"name": m, "title": title_of(m)} for m in methods],
+        "metrics": [{"name": name, **row} for name, row in rows.items()],
+        "trajectories": list(courses),
+        "results": list(results),
+        "by_distance": by_distance(courses, methods, results, list(rows)),
+    }  # fmt: skip
+
+
+def by_distance(
+    courses: Sequence[Mapping[str, Any]],
+    methods: Sequence[str],
+    results: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+) -> list[dict[str, Any]]:
+    """Mean over cameras and both sides, per method and distance from the recorded path (metres)."""
+    distances = sorted({abs(float(c["shift_m"])) for c in courses if c["shift_m"] is not None})
+    table = []
+    for distance in distances:
+        here = [c["name"] for c in courses if c["shift_m"] is not None and abs(float(c["shift_m"])) == distance]
+        for method in methods:
+            of = [r for r in results if r["method"] == method and r["trajectory"] in here]
+            table.append(
+                {"method": method, "distance_m": distance, "trajectories": [r["trajectory"] for r in of],
+                 "values": {name: _mean([r["values"].get(name) for r in of]) for name in names}}
+            )  # fmt: skip
+    return table
+
+
+def _mean(values: Sequence[float | str | None]) -> float | str:
+    numbers = [v for v in values if isinstance(v, int | float)]
+    if numbers:
+        return round(sum(numbers) / len(numbers), 6)
+    reasons = [v for v in values if isinstance(v, str)]
+    return reasons[0] if reasons else "not produced"
+
+
+def best_of(better: str, values: Mapping[str, Any], metric: str) -> set[str]:
+    """Methods whose shown value is the best one; none when fewer than two have a number."""
+    numbers = {m: float(number_text(metric, v)) for m, v in values.items() if isinstance(v, int | float)}
+    if len(numbers) < 2:
+        return set()
+    best = max(numbers.values()) if better == "higher" else min(numbers.values())
+    return {m for m, v in numbers.items() if v == best}
+
+
+def distance_title(distance_m: float, held_out: int) -> str:
+    """Heading of a distance."""
+    if distance_m == 0:
+        return "recorded path, held-out frames" if held_out else "recorded path, all frames"
+    return f"{distance_m:g} m to either side"
+
+
+def _lookup(document: Mapping[str, Any]) -> dict[tuple[str, float], Mapping[str, Any]]:
+    return {(row["method"], float(row["distance_m"])): row["values"] for row in document["by_distance"]}
+
+
+def plain(document: Mapping[str, Any]) -> str:
+    """The main numbers for a terminal: one block per distance, best values marked with a star."""
+    of = _lookup(document)
+    distances = sorted({d for _, d in of})
+    columns = [m for m in document["metrics"] if m["name"] in SHOWN]
+    lines = []
+    for distance in distances:
+        lines.append(distance_title(distance, document["scene"]["held_out"]))
+        heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
+        lines.append("  " + " " * 28 + "".join(f"{head:>14}" for head in heads))
+        for method in document["methods"]:
+            values = of.get((method["name"], distance), {})
+            cells = []
+            for metric in columns:
+                across = {m["name"]: of.get((m["name"], distance), {}).get(metric["name"]) for m in document["methods"]}
+                star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
+                cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>14}")
+            lines.append(f"  {method['title']:<28}" + "".join(cells))
+        lines.append("")
+    return "\n".join(lines).rstrip()
+
+
+def markdown(document: Mapping[str, Any]) -> str:
+    """All trajectories and metrics as Markdown, with the rules."""
+    lines = [f"# Scores of {document['scene']['id']}", ""]
+    lines += [f"* {rule}" for rule in document["rules"]]
+    names = [m["name"] for m in document["metrics"]]
+    for course in document["trajectories"]:
+        lines += ["", f"## {course['name']}", "", "| method | views | " + " | ".join(names) + " |"]
+        lines.append("|---" * (len(names) + 2) + "|")
+        for row in document["results"]:
+            if row["trajectory"] == course["name"]:
+                cells = " | ".join(number_text(n, row["values"].get(n)) for n in names)
+                lines.append(f"| {title_of(row['method'])} | {row['views']} | {cells} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,89 @@
+"""What every test gets: one thread, no network, real data where it lies beside the checkout."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+# Set before any test imports torch: tests are many and small, and results must not depend on the machine's core count.
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+os.environ.setdefault("NO_COLOR", "1")
+os.environ.setdefault("COLUMNS", "120")
+
+settings.register_profile(
+    "mudg", deadline=None, derandomize=True, max_examples=50, database=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
+settings.load_profile("mudg")
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def pytest_report_header() -> list[str]:
+    """Say which mudg is under test: the installed one, or the source tree."""
+    import mudg
+
+    home = Path(mudg.__file__).resolve().parent
+    kind = "source tree" if home.is_relative_to(REPOSITORY / "src") else "installed"
+    return [f"mudg {mudg.__version__} ({kind}): {home}"]
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The checkout the tests lie in."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def package_dir() -> Path:
+    """The folder of the mudg package under test."""
+    import mudg
+
+    return Path(mudg.__file__).resolve().parent
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Callable[[str], Path]:
+    """Return ``find(name) -> Path``: a folder of real driving data, or skip the test where there is none."""
+
+    def find(name: str) -> Path:
+        root = Path(os.environ.get("MUDG_SHARED_DATA", REPOSITORY.parent / "shared" / "data"))
+        path = root / name
+        if not path.exists():
+            pytest.skip(f"real data {name!r} is not on this machine (set MUDG_SHARED_DATA)")
+        return path
+
+    return find
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _no_network() -> Iterator[None]:
+    """Refuse every connection except to this machine."""
+    connect = socket.socket.connect
+
+    def guarded(self: socket.socket, address: object) -> object:
+        local = self.family not in (socket.AF_INET, socket.AF_INET6)
+        if not local and isinstance(address, tuple) and address[0] not in ("127.0.0.1", "::1", "localhost"):
+            raise RuntimeError(f"a test tried to reach the network: {address}")
+        return connect(self, address)
+
+    socket.socket.connect = guarded  # type: ignore[method-assign, assignment]
+    yield
+    socket.socket.connect = connect  # type: ignore[method-assign]
+
+
+@pytest.fixture(autouse=True)
+def _one_torch_thread() -> Iterator[None]:
+    """Give back the thread count a test may have changed, if torch is loaded at all."""
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch is not None else None
+    yield
+    if torch is not None and torch.get_num_threads() != before:
+        torch.set_num_threads(before)

@@ -1,0 +1,340 @@
+"""House rules that a machine can check by reading the source. CONTRIBUTING.md says why each exists."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+MAX_FILE_LINES = 800
+MAX_FUNCTION_LINES = 100
+
+# Floor of each part of the package; an import may only reach a lower number, or its own part.
+FLOORS = {
+    "base": 1, "core": 2, "native": 2, "data": 3, "models": 3, "methods": 3.5, "stages": 4,
+    "cli": 5, "flags": 5, "__main__": 5, "__init__": 5,
+}  # fmt: skip
+
+# Modules that `mudg --help` loads, or that plain `import mudg` may reach: torch only inside functions.
+TORCH_FREE = (
+    "__init__.py", "__main__.py", "cli.py", "flags.py", "methods.py", "stages/__init__.py", "stages/config.py",
+    "stages/doctor.py", "base/*.py",
+)  # fmt: skip
+TORCH_ALLOWED = ("base/checkpoint.py",)
+
+FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "random", "torchvision"}
+FORBIDDEN_CALLS = {
+    "eval", "exec", "compile", "__import__", "os.system", "os.popen", "os.execv", "os.fork", "tempfile.mktemp",
+    "yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.manual_seed", "torch.seed", "np.random.seed",
+    "torch.jit.load", "np.load", "numpy.load", "torch.hub.load",
+}  # fmt: skip
+WRITERS = {
+    "np.save", "np.savez", "np.savez_compressed", "np.savetxt", "torch.save", "json.dump", "yaml.dump", "save_file",
+}  # fmt: skip
+DRAWS = {
+    "rand", "randn", "randint", "randperm", "normal", "bernoulli", "multinomial", "poisson", "rand_like", "randn_like",
+}  # fmt: skip
+IN_PLACE_DRAWS = {"normal_", "uniform_", "random_", "bernoulli_", "exponential_", "trunc_normal_"}
+
+
+def sources(package_dir: Path) -> list[Path]:
+    found = sorted(package_dir.rglob("*.py"))
+    assert len(found) > 10, "the package's sources were not found"
+    return found
+
+
+def parsed(package_dir: Path) -> Iterator[tuple[str, ast.Module]]:
+    for path in sources(package_dir):
+        yield path.relative_to(package_dir).as_posix(), ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def dotted(node: ast.AST) -> str:
+    """Return ``a.b.c`` for an attribute chain, '' for anything else."""
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    if isinstance(node, ast.Name):
+        parts.append(node.id)
+        return ".".join(reversed(parts))
+    return ""
+
+
+def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield node, dotted(node.func)
+
+
+def imported_modules(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield (line, dotted module) of every import, late ones included, type-checking ones left out."""
+    skipped: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and dotted(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
+            skipped.update(inner for child in node.body for inner in ast.walk(child))
+    for node in ast.walk(tree):
+        if node in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: imports are absolute in this package"
+            for alias in node.names:
+                yield node.lineno, f"{node.module}.{alias.name}"
+
+
+def top_level_imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    for node in tree.body:
+        if isinstance(node, ast.Import | ast.ImportFrom | ast.Try | ast.With):
+            yield from imported_modules(node)
+
+
+def refuse(problems: list[str]) -> None:
+    assert not problems, "\n" + "\n".join(problems)
+
+
+def test_imports_point_down(package_dir: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        own = name.split("/")[0].removesuffix(".py")
+        if name == "__init__.py":
+            continue  # the lazy names of the package root
+        for line, module in imported_modules(tree):
+            parts = module.split(".")
+            if parts[0] != "mudg" or len(parts) < 2:
+                continue
+            other = parts[1]
+            if other not in FLOORS:
+                other = "__init__"
+            if other == "__init__" and parts[1] == "__version__":
+                continue
+            if FLOORS[other] > FLOORS[own] or (FLOORS[other] == FLOORS[own] and other != own and FLOORS[own] < 5):
+                if {own, other} == {"core", "native"}:
+                    continue  # one floor: pure functions and the compiled ones behind them
+                problems.append(f"{name}:{line}: {own} (floor {FLOORS[own]}) imports {module} (floor {FLOORS[other]})")
+    refuse(problems)
+
+
+def test_torch_is_not_imported_where_help_must_be_fast(package_dir: Path) -> None:
+    allowed = {package_dir / name for name in TORCH_ALLOWED}
+    listed = sorted({path for pattern in TORCH_FREE for path in package_dir.glob(pattern)} - allowed)
+    assert listed
+    problems = []
+    for path in listed:
+        for line, module in top_level_imports(ast.parse(path.read_text(encoding="utf-8"))):
+            if module.split(".")[0] in ("torch", "scipy", "av"):
+                problems.append(f"{path.relative_to(package_dir)}:{line}: imports {module} at the top")
+    refuse(problems)
+
+
+def test_nothing_executes_data(package_dir: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        problems += [
+            f"{name}:{line}: imports {module}"
+            for line, module in imported_modules(tree)
+            if module.split(".")[0] in FORBIDDEN_MODULES
+        ]
+        for call, function in calls(tree):
+            if function in FORBIDDEN_CALLS:
+                problems.append(f"{name}:{call.lineno}: calls {function}")
+            if function == "torch.load" and name != "data/weights.py":
+                problems.append(f"{name}:{call.lineno}: torch.load belongs to data/weights.py alone")
+            computed = function.endswith("import_module") and not isinstance(call.args[0], ast.Constant)
+            if computed and name != "__init__.py":
+                problems.append(f"{name}:{call.lineno}: a computed name becomes an import")
+            for keyword in call.keywords:
+                value = keyword.value.value if isinstance(keyword.value, ast.Constant) else None
+                if (keyword.arg in ("shell", "allow_pickle") and value is not False) or (
+                    keyword.arg in ("weights_only", "verify") and value is False
+                ):
+                    problems.append(f"{name}:{call.lineno}: {keyword.arg}={ast.unparse(keyword.value)}")
+    refuse(problems)
+
+
+def test_only_the_store_opens_files_for_writing(package_dir: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        if name == "base/store.py":
+            continue
+        for call, function in calls(tree):
+            method = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+            if function == "open" or method == "open":
+                modes = [a.value for a in call.args[:2] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+                modes += [k.value.value for k in call.keywords if k.arg == "mode" and isinstance(k.value, ast.Constant)]
+                writes = any(re.fullmatch(r"[rbt]*[wax+][rwabtx+]*", str(mode)) for mode in modes)
+                if writes and function != "av.open":
+                    problems.append(f"{name}:{call.lineno}: opens a file for writing")
+            if method in ("write_text", "write_bytes") and not dotted(call.func).startswith("store."):
+                problems.append(f"{name}:{call.lineno}: {ast.unparse(call.func)}")
+            if function in WRITERS:
+                problems.append(f"{name}:{call.lineno}: {function} writes without the store")
+    refuse(problems)
+
+
+def test_no_global_random_state(package_dir: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        if name == "base/seeds.py":
+            continue
+        for call, function in calls(tree):
+            named = {keyword.arg for keyword in call.keywords}
+            parts = function.split(".")
+            if parts[0] == "torch" and parts[-1] in DRAWS and len(parts) == 2 and "generator" not in named:
+                problems.append(f"{name}:{call.lineno}: {function} without generator=")
+            method = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+            if method in IN_PLACE_DRAWS and "generator" not in named:
+                problems.append(f"{name}:{call.lineno}: {method} without generator=")
+            if function.startswith(("np.random.", "numpy.random.")):
+                problems.append(f"{name}:{call.lineno}: {function}: draw from mudg.base.seeds")
+    refuse(problems)
+
+
+def test_no_blind_except(package_dir: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.ExceptHandler):
+                continue
+            kinds = node.type.elts if isinstance(node.type, ast.Tuple) else [node.type]
+            blind = any(kind is None or dotted(kind) in ("Exception", "BaseException") for kind in kinds)
+            if blind and not any(isinstance(inner, ast.Raise) for inner in ast.walk(node)):
+                problems.append(f"{name}:{node.lineno}: catches everything and does not raise")
+    refuse(problems)
+
+
+def test_files_and_functions_stay_short(package_dir: Path) -> None:
+    problems = []
+    for path in sources(package_dir):
+        lines = path.read_text(encoding="utf-8").count("\n")
+        if lines > MAX_FILE_LINES:
+            problems.append(f"{path.relative_to(package_dir)}: {lines} lines")
+    for name, tree in parsed(package_dir):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                length = (node.end_lineno or node.lineno) - node.lineno + 1
+                if length > MAX_FUNCTION_LINES:
+                    problems.append(f"{name}:{node.lineno}: {node.name} has {length} lines")
+    refuse(problems)
+
+
+def public_definitions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef | ast.ClassDef, bool]]:
+    """Yield (definition, is a method) of the public functions, classes and methods of one module."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node, False
+            if isinstance(node, ast.ClassDef):
+                for inner in node.body:
+                    if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_"):
+                        yield inner, True
+
+
+def explained_once(tree: ast.Module) -> set[str]:
+    """Methods that need no text of their own: torch's forward, and what a Protocol in the same module explains."""
+    names = {"forward"}
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and any(dotted(base) == "Protocol" for base in node.bases):
+            names |= {m.name for m in node.body if isinstance(m, ast.FunctionDef) and ast.get_docstring(m)}
+    return names
+
+
+def test_public_functions_are_annotated_and_documented(package_dir: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        for node, is_method in public_definitions(tree):
+            if node.name == "main" and name == "__main__.py":
+                continue
+            if not ast.get_docstring(node) and not (is_method and node.name in explained_once(tree)):
+                problems.append(f"{name}:{node.lineno}: {node.name} has no docstring")
+            if isinstance(node, ast.ClassDef):
+                continue
+            arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            skip = 1 if is_method and not any(dotted(d) == "staticmethod" for d in node.decorator_list) else 0
+            bare = [a.arg for a in arguments[skip:] if a.annotation is None]
+            if bare or node.returns is None:
+                problems.append(f"{name}:{node.lineno}: {node.name} lacks annotations ({', '.join(bare) or 'return'})")
+        if not ast.get_docstring(tree):
+            problems.append(f"{name}: no module docstring")
+    refuse(problems)
+
+
+def test_no_print_in_the_library(package_dir: Path) -> None:
+    refuse(
+        [
+            f"{name}:{call.lineno}: print"
+            for name, tree in parsed(package_dir)
+            for call, f in calls(tree)
+            if f == "print"
+        ]
+    )
+
+
+def test_class_names_say_what_a_thing_is(package_dir: Path) -> None:
+    vague = re.compile(r"(Manager|Helper|Utils?|Trainer|Handler|^Base[A-Z]\w*)$")
+    refuse(
+        [
+            f"{name}:{node.lineno}: {node.name}"
+            for name, tree in parsed(package_dir)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ClassDef) and vague.search(node.name)
+        ]
+    )
+
+
+WORDS_THAT_DO_NOT_BELONG = re.compile(
+    r"\b(sessions?|sub-?agents?|prompts?|colleagues?|the brief|the lead|chatbot|assistant|language model)\b"
+    r"|/work/|/root/|/home/|\bissue #?\d|\bpart \d of the (task|job)\b",
+    re.IGNORECASE,
+)
+
+
+def product_texts(repository: Path, package_dir: Path) -> list[Path]:
+    kinds = (".py", ".cpp", ".h", ".hpp", ".md", ".json", ".yaml", ".cu")
+    texts = [p for p in package_dir.rglob("*") if p.suffix in kinds]
+    texts += [*repository.glob("*.md"), *(repository / "docs").rglob("*.md")]
+    return sorted(texts)
+
+
+def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> None:
+    problems = []
+    for path in product_texts(repository, package_dir):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            found = WORDS_THAT_DO_NOT_BELONG.search(line)
+            if found:
+                problems.append(f"{path.name}:{number}: {found.group(0)!r}: {line.strip()[:100]}")
+    refuse(problems)
+
+
+@pytest.mark.parametrize(
+    ("snippet", "test"),
+    [
+        ("def f():\n    try:\n        pass\n    except Exception:\n        pass\n", test_no_blind_except),
+        ("import pickle\n", test_nothing_executes_data),
+        ("def f(x: int) -> int:\n    '''d'''\n    return eval('x')\n", test_nothing_executes_data),
+        ("import subprocess\nsubprocess.run('ls', shell=True)\n", test_nothing_executes_data),
+        ("import torch\ntorch.rand(3)\n", test_no_global_random_state),
+        ("import numpy as np\nnp.random.default_rng(0)\n", test_no_global_random_state),
+        ("open('x', 'w')\n", test_only_the_store_opens_files_for_writing),
+        ("path.open('ab')\n", test_only_the_store_opens_files_for_writing),
+        ("path.write_text('x')\n", test_only_the_store_opens_files_for_writing),
+        ("print(1)\n", test_no_print_in_the_library),
+        ("def f(x):\n    return x\n", test_public_functions_are_annotated_and_documented),
+        ("class SceneManager:\n    '''d'''\n", test_class_names_say_what_a_thing_is),
+        ("from mudg.stages import fit\n", test_imports_point_down),
+        ("import torch\n", test_torch_is_not_imported_where_help_must_be_fast),
+        ("x = 1\n" * (MAX_FILE_LINES + 1), test_files_and_functions_stay_short),
+    ],
+)
+def test_each_rule_catches_its_offence(tmp_path: Path, snippet: str, test: object) -> None:
+    """A rule that cannot fail protects nothing: give each one a package that breaks it."""
+    (tmp_path / "base").mkdir()
+    for number in range(12):
+        (tmp_path / "base" / f"fine{number}.py").write_text('"""Fine."""\n')
+    test(tmp_path)  # type: ignore[operator]
+    (tmp_path / "base" / "bad.py").write_text('"""Bad."""\n' + snippet)
+    with pytest.raises(AssertionError):
+        test(tmp_path)  # type: ignore[operator]

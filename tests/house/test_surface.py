@@ -1,0 +1,64 @@
+"""The public surface is frozen: names in api.json, flags in cli.json. A change is a decision made in the same commit.
+
+``MUDG_UPDATE_FROZEN=1 pytest tests/house`` writes the files anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+import mudg
+from mudg import cli, flags
+
+HERE = Path(__file__).parent
+
+
+def frozen(name: str, now: object) -> object:
+    """What the file says; with MUDG_UPDATE_FROZEN it is written first."""
+    path = HERE / name
+    if os.environ.get("MUDG_UPDATE_FROZEN"):
+        path.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def help_text(verb: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stopped:
+        flags.parse(verb, ["--help"], "summary")
+    assert stopped.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_public_names_are_frozen() -> None:
+    now = sorted(mudg.__all__)
+    assert now == frozen("api.json", now)
+    for name in mudg.__all__:
+        assert getattr(mudg, name) is not None
+    assert set(now) <= set(dir(mudg))
+
+
+def test_flags_are_frozen(capsys: pytest.CaptureFixture[str]) -> None:
+    now = {verb: sorted(set(re.findall(r"--[a-z][\w.-]*", help_text(verb, capsys)))) for verb in cli.VERBS}
+    assert now == frozen("cli.json", now)
+
+
+def test_every_verb_has_flags_and_every_flag_an_explanation(capsys: pytest.CaptureFixture[str]) -> None:
+    assert set(cli.VERBS) == set(flags.FLAGS)
+    listed = [name for _, names in cli.SECTIONS for name in names]
+    assert sorted(listed) == sorted(cli.VERBS)
+    for verb in cli.VERBS:
+        text = help_text(verb, capsys)
+        assert "(default:" in text
+        assert "usage: mudg " + verb in text
+
+
+def test_help_lists_only_what_exists() -> None:
+    overview = cli.overview()
+    for name in cli.VERBS:
+        assert f"\n  {name}" in overview
+    for later in ("view", "export", "convert", "bench"):
+        assert f"\n  {later}" not in overview

@@ -1,0 +1,224 @@
+"""The command line: precedence, suggestions, exit codes, quiet errors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mudg import cli
+from mudg.base import config as configuration
+from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsError, ResourceError, UsageError
+from mudg.stages import config as stage_config
+
+
+def parse(*words: str) -> Any:
+    return cli.parse(list(words))
+
+
+def call(monkeypatch: pytest.MonkeyPatch, outcome: object, *words: str) -> int:
+    """Run ``mudg doctor`` with its function replaced."""
+
+    def act(_args: object) -> dict[str, Any]:
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome  # type: ignore[return-value]
+
+    monkeypatch.setitem(cli.VERBS, "doctor", cli.Verb("s", (), act))
+    return cli.main(["doctor", *words])
+
+
+# ---- settings ----
+
+
+def test_flags_beat_the_file_and_the_file_beats_the_preset(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("fit:\n  iterations: 77\n  voxel_m: 0.3\n")
+    args = parse("demo", "--fast", "--config", str(file), "--fit.voxel-m", "0.25")
+    assert args.settings.fit.iterations == 77
+    assert args.settings.fit.voxel_m == 0.25
+    fast, full = stage_config.run_preset(fast=True), stage_config.run_preset()
+    assert args.settings.synthesize == fast.synthesize != full.synthesize
+    assert args.settings.ingest == fast.ingest
+
+
+def test_the_seed_goes_to_every_verb_that_draws() -> None:
+    args = parse("demo", "--seed", "7")
+    seeds = [part["seed"] for part in configuration.to_dict(args.settings).values() if "seed" in part]
+    assert len(seeds) >= 2
+    assert set(seeds) == {7}
+    assert args.settings.ingest.city.seed == 7
+    assert parse("demo", "--seed", "7", "--fit.seed", "3").settings.fit.seed == 3
+
+
+def test_a_seed_on_the_command_line_beats_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text(configuration.dump_yaml(stage_config.with_seed(stage_config.run_preset(), 3)))
+    assert parse("demo", "--config", str(file)).settings.fit.seed == 3
+    assert parse("demo", "--config", str(file), "--seed", "4").settings.fit.seed == 4
+
+
+def test_shifts_go_to_synthesize_and_render_together() -> None:
+    settings = parse("demo", "--shifts-m", "1.5", "-2", "0").settings
+    assert settings.synthesize.shifts_m == (1.5, -2.0)
+    assert settings.render.shifts_m == (0.0, 1.5, -2.0)
+    default = parse("run", "log", "--out", "o").settings
+    assert default.synthesize.cameras == default.render.cameras == ()
+    assert set(default.render.shifts_m) == {0.0, *default.synthesize.shifts_m}
+    side = parse("run", "log", "--out", "o", "--cameras", "front_left").settings
+    assert side.synthesize.cameras == side.render.cameras == ("front_left",)
+
+
+def test_what_run_yaml_says_can_be_given_back(tmp_path: Path) -> None:
+    before = parse("run", "city", "--out", "x", "--fast", "--fit.iterations", "5").settings
+    file = tmp_path / "run.yaml"
+    file.write_text("verb: run\n" + configuration.dump_yaml(before))
+    assert parse("run", "city", "--out", "x", "--config", str(file)).settings == before
+
+
+def test_unknown_key_in_a_file_suggests_the_nearest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("iteratons: 3\n")
+    assert cli.main(["fit", "scene", "--fused", "f", "--out", "o", "--config", str(file)]) == 2
+    message = capsys.readouterr().err
+    assert "iteratons" in message
+    assert "did you mean iterations" in message
+    assert "Traceback" not in message
+
+
+def test_unknown_flag_suggests_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["fit", "scene", "--fused", "f", "--out", "o", "--iteratons", "3"])
+    assert stopped.value.code == 2
+    assert "--iterations" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["fti", "--help"], "did you mean `mudg fit`?"),
+        (["synthesise"], "did you mean `mudg synthesize`?"),
+        (["zzzz"], "see mudg --help"),
+    ],
+)
+def test_unknown_verb_suggests_the_nearest(words: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["fit", "scene", "--fused", "f", "--out", "o", "--iterations", "0"],
+        ["fit", "scene", "--fused", "f", "--out", "o", "--iterations", "many"],
+        ["fit", "scene", "--fused", "f", "--out", "o", "--method", "nerf"],
+        ["score", "scene", "--out", "o", "--views", "no-equals-sign"],
+        ["demo", "--seed", "x"],
+        ["render", "scene"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_values_end_with_code_2_and_no_traceback(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = cli.main(words)
+    except SystemExit as stopped:
+        code = stopped.code
+    assert code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_wrong_value_in_a_file_names_field_and_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("fit:\n  iterations: -4\n")
+    assert cli.main(["demo", "--config", str(file)]) == 2
+    message = capsys.readouterr().err
+    assert "fit.iterations" in message
+    assert "settings.yaml" in message
+
+
+def test_unreadable_file_ends_with_code_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--config", str(tmp_path / "none.yaml")]) == 3
+    file = tmp_path / "broken.yaml"
+    file.write_text("fit: [1, 2\n")
+    assert cli.main(["demo", "--config", str(file)]) == 3
+    assert "not valid YAML" in capsys.readouterr().err
+
+
+def test_yaml_objects_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "evil.yaml"
+    marker = tmp_path / "marker"
+    file.write_text(f"fit: !!python/object/apply:os.mkdir ['{marker}']\n")
+    assert cli.main(["demo", "--config", str(file)]) == 3
+    assert not marker.exists()
+
+
+# ---- exit codes and output ----
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (UsageError, 2),
+        (InputError, 3),
+        (IntegrityError, 4),
+        (ResourceError, 5),
+        (NumericsError, 6),
+        (KeyboardInterrupt, 130),
+    ],
+)
+def test_exit_codes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: type[BaseException], code: int
+) -> None:
+    raised = error("it broke", where="here", remedy="mend it") if issubclass(error, MudgError) else error()
+    assert call(monkeypatch, raised) == code
+    message = capsys.readouterr().err
+    assert "Traceback" not in message
+    assert ("mend it" in message) if issubclass(error, MudgError) else ("mudg doctor" in message)
+
+
+def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError):
+        call(monkeypatch, InputError("it broke"), "--debug")
+
+
+def test_a_programming_error_is_not_disguised(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ZeroDivisionError):
+        call(monkeypatch, ZeroDivisionError())
+
+
+def test_results_go_to_stdout_as_text_or_json(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, {"report": Path("a") / "b", "text": "words"}) == 0
+    assert capsys.readouterr().out == "words\n"
+    assert call(monkeypatch, {"report": Path("a") / "b", "text": "words"}, "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"report": str(Path("a") / "b")}
+    assert call(monkeypatch, {"model": Path("m")}) == 0
+    assert capsys.readouterr().out == "model: m\n"
+    assert call(monkeypatch, {"text": "bad", "exit_code": 3}) == 3
+
+
+def test_version_and_overview(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("mudg ")
+    assert cli.main(["--help"]) == 0
+    assert "mudg VERB --help" in capsys.readouterr().out
+    assert cli.main([]) == 2
+
+
+def test_sigterm_stops_like_ctrl_c_with_its_own_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    import os
+    import signal
+    import time
+
+    def act(_args: object) -> dict[str, Any]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(5)
+        return {}
+
+    monkeypatch.setitem(cli.VERBS, "doctor", cli.Verb("s", (), act))
+    before = signal.getsignal(signal.SIGTERM)
+    assert cli.main(["doctor"]) == 143
+    assert signal.getsignal(signal.SIGTERM) is before

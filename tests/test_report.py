@@ -1,0 +1,211 @@
+"""The report page: self-contained, honest words, right pictures."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import html.parser
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import toy_views
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.types import Observation
+from mudg.stages import report, report_page, score
+from mudg.stages.config import ScoreConfig
+
+
+def dark(share: float) -> Any:
+    def change(_index: int, seen: Observation) -> Observation:
+        return dataclasses.replace(seen, rgb=seen.rgb * share)
+
+    return change
+
+
+def grey(_index: int, seen: Observation) -> Observation:
+    return dataclasses.replace(seen, rgb=torch.full_like(seen.rgb, 0.5), semantics=None)
+
+
+def finished_run(out: Path) -> Path:
+    """What the chain leaves behind, made from toy views."""
+    scene = toy_views.write_scene(out / "scene")
+    plain = toy_views.write_views(scene, out / "render" / "street_gaussians", "street_gaussians", (0.0, 2.0), dark(0.8))
+    guided = toy_views.write_views(scene, out / "render" / "mudg_s", "mudg_s", (0.0, 2.0), dark(0.9))
+    virtual = toy_views.write_views(scene, out / "synthesize", "mudg_r", (2.0,), grey)
+    methods = {"street_gaussians": plain, "mudg_r": virtual, "mudg_s": guided}
+    score.run(ScoreConfig(), scene, methods, out / "score")
+    steps = {"ingest": {"state": "complete", "seconds": 1.5}, "score": {"state": "complete", "seconds": 3.0}}
+    ledger = {
+        "asked": {"source": "<toy> & co"},
+        "steps": steps,
+        "environment": {"mudg": "0", "packages": {"torch": "2"}},
+    }
+    store.write_json(out / "run.json", ledger)
+    store.write_text(out / "run.yaml", "fit:\n  iterations: 3 # <script>alert(1)</script>\n")
+    return out
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    out = finished_run(tmp_path_factory.mktemp("run"))
+    return report.write_report(out).read_text(encoding="utf-8")
+
+
+class Outline(html.parser.HTMLParser):
+    """Collects tags and checks that they nest."""
+
+    VOID = frozenset(("meta", "input", "img", "br", "link", "line", "circle", "polyline"))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> without a beginning"
+        assert self.open.pop() == tag
+
+
+def outline(page: str) -> Outline:
+    parser = Outline()
+    parser.feed(page)
+    parser.close()
+    assert parser.open == []
+    return parser
+
+
+def test_the_page_is_well_formed_and_loads_nothing(page: str) -> None:
+    found = outline(page)
+    for tag, attributes in found.tags:
+        for name in ("src", "href", "poster", "srcset", "data", "action"):
+            value = attributes.get(name)
+            assert value is None or value.startswith(("data:", "#")), f"<{tag} {name}={value[:60]}>"
+    assert not re.search(r"url\(\s*['\"]?(?!data:)", page)
+    assert "@import" not in page
+    assert "default-src 'none'" in page
+
+
+def test_every_control_has_a_label(page: str) -> None:
+    found = outline(page)
+    labelled = {a["for"] for tag, a in found.tags if tag == "label" and a.get("for")}
+    for tag, attributes in found.tags:
+        if tag == "select" or (tag == "input" and attributes.get("type") == "range"):
+            assert attributes["id"] in labelled
+        if tag in ("svg", "canvas", "video", "img"):
+            assert attributes.get("aria-label") or attributes.get("alt")
+    ids = [a["id"] for _, a in found.tags if a.get("id")]
+    assert len(ids) == len(set(ids))
+
+
+def test_texts_from_outside_are_escaped(page: str) -> None:
+    assert "<script>alert(1)" not in page
+    assert "&lt;toy&gt; &amp; co" in page
+
+
+def test_videos_hold_all_panels_and_play(page: str) -> None:
+    import av
+
+    videos = re.findall(r'src="data:video/mp4;base64,([^"]+)"', page)
+    assert len(videos) == 2
+    for text in videos:
+        with av.open(io.BytesIO(base64.b64decode(text))) as box:
+            stream = box.streams.video[0]
+            assert stream.codec_context.name == "h264"
+            assert stream.codec_context.pix_fmt == "yuv420p"
+            frames = [frame.to_ndarray(format="rgb24") for frame in box.decode(video=0)]
+        assert len(frames) == toy_views.FRAMES
+        # columns: truth (recorded path only), three methods; rows: colour, depth, classes, error
+        assert frames[0].shape == (4 * toy_views.HEIGHT, 4 * toy_views.WIDTH, 3)
+
+
+def test_panels_show_what_they_say(tmp_path: Path) -> None:
+    out = finished_run(tmp_path)
+    scores = store.read_json(out / "score" / "metrics.json")
+    folders = report._folders(out, scores)
+    assert list(folders) == ["truth", "street_gaussians", "mudg_r", "mudg_s"]
+    course = next(c for c in scores["trajectories"] if c["shift_m"] == 0)
+    columns = report._columns(
+        course, {c: report.read_observations(of[course["name"]]) for c, of in folders.items() if course["name"] in of}
+    )
+    panels = {c: tuple(report._modalities(columns, c)) for c in columns.sets}
+    assert panels["truth"] == ("rgb", "depth", "semantics")
+    assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
+    assert "mudg_r" not in panels
+    atlas = next(report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
+    h, w = toy_views.HEIGHT, toy_views.WIDTH
+    assert np.array_equal(atlas[:h, :w], toy_views.colours(0))
+    assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colours(0) * 0.8)).max() <= 1
+    assert (atlas[h : 2 * h, :w][np.isnan(toy_views.depths())] == 0).all()
+    assert tuple(atlas[2 * h, 0]) == (70, 130, 180)  # sky in the usual colour
+    assert (atlas[:h, 2 * w : 3 * w] == 24).all()  # not produced
+
+
+def run_of(psnr: dict[tuple[str, float], float | str], truth: str = "exact") -> dict[str, Any]:
+    rows = [
+        {"method": m, "distance_m": d, "values": {"psnr": v, "abs_rel": "no truth", "miou": "no truth"}}
+        for (m, d), v in psnr.items()
+    ]
+    return {"by_distance": rows, "truth": truth, "scene": {"id": "toy"}}
+
+
+def test_headline_says_what_the_numbers_say() -> None:
+    both = ("street_gaussians", "mudg_s")
+    gain = run_of({(both[0], 4.0): 15.0, (both[1], 4.0): 17.0, (both[0], 2.0): 16.0, (both[1], 2.0): 16.0})
+    assert report_page.headline(gain)[0] == "4 m off the recorded path, diffusion adds 2.0 dB"
+    loss = run_of({(both[0], 3.0): 15.0, (both[1], 3.0): 14.5})
+    assert report_page.headline(loss)[0] == "3 m off the recorded path, diffusion costs 0.5 dB"
+    same = run_of({(both[0], 3.0): 15.0, (both[1], 3.0): 15.01})
+    assert "no difference" in report_page.headline(same)[0]
+    recorded = run_of(
+        {(both[0], 0.0): 20.0, (both[1], 0.0): 21.0, (both[0], 2.0): "no truth", (both[1], 2.0): "no truth"}, "recorded"
+    )
+    title, words = report_page.headline(recorded)
+    assert "nobody drove" in title
+    assert "21.0 dB with diffusion and 20.0 dB without" in words
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(9.5, 19.3), (0.03, 0.07), (1.0, 1.0), (0.0, 0.0), (12.1, 12.3), (-5.0, 3.0)]
+)
+def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
+    ticks = report_page.axis_ticks(low, high)
+    assert ticks[0] <= low + 1e-9
+    assert ticks[-1] >= high - 1e-9
+    assert 3 <= len(ticks) <= 7
+    assert np.allclose(np.diff(ticks), ticks[1] - ticks[0])
+
+
+def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = finished_run(tmp_path)
+    monkeypatch.setattr(report, "video_encoders", list)
+    page = report.write_report(out).read_text(encoding="utf-8")
+    outline(page)
+    assert "<video" not in page
+    assert page.count("data:image/jpeg") == 2
+
+
+def test_an_unscored_run_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="file not found"):
+        report.write_report(tmp_path)
+
+
+def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = finished_run(tmp_path)
+    large = report.write_report(out).stat().st_size
+    monkeypatch.setattr(report, "BUDGET_BYTES", 1000)
+    assert report.write_report(out).stat().st_size < large

@@ -1,0 +1,200 @@
+"""The chain: order, reuse, interruption, refusal. The verbs are stand-ins; the real ones run in the slow test below."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mudg import cli
+from mudg.base import config as configuration
+from mudg.base import store
+from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.stages import annotate, fit, fuse, ingest, render, report, run, score, synthesize
+from mudg.stages.config import RunConfig, run_preset, with_seed
+
+
+@pytest.fixture
+def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Stand-ins that note their calls and write a folder; ``trouble[verb]`` is raised once by that verb."""
+    seen: dict[str, Any] = {"calls": [], "trouble": {}, "labelled": True}
+
+    def stand_in(name: str) -> Callable[..., Path]:
+        def act(*arguments: Any, **named: Any) -> Path:
+            trouble = seen["trouble"].pop(name, None)
+            if trouble is not None:
+                raise trouble
+            out = next(a for a in reversed(arguments) if isinstance(a, Path))
+            label = f"{name}:{out.name}" if name in ("fit", "render") else name
+            seen["calls"].append(label)
+            seen[label] = (arguments, named)
+            out.mkdir(parents=True, exist_ok=True)
+            (out / "scene.json").write_text("{}") if name in ("ingest", "annotate") else None
+            return out
+
+        return act
+
+    for module, name in (
+        (ingest, "ingest"), (annotate, "annotate"), (fuse, "fuse"), (synthesize, "synthesize"), (fit, "fit"),
+        (render, "render"), (score, "score"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, "run", stand_in(name))
+    monkeypatch.setattr(run, "_has_semantics", lambda _scene: seen["labelled"])
+    monkeypatch.setattr(score, "summary_table", lambda _out: "table")
+
+    def write_report(out: Path) -> Path:
+        store.write_text(out / "report.html", "page")
+        return out / "report.html"
+
+    monkeypatch.setattr(report, "write_report", write_report)
+    return seen
+
+
+CHAIN = [
+    "ingest", "fuse", "synthesize", "fit:street_gaussians", "fit:mudg_s", "render:street_gaussians", "render:mudg_s",
+    "score",
+]  # fmt: skip
+
+
+def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    result = run.run_chain(RunConfig(), "city", tmp_path / "out")
+    assert verbs["calls"] == CHAIN
+    assert result["report"] == tmp_path / "out" / "report.html"
+    assert list(result["seconds"])[-1] == "report"
+    assert "table" in result["text"]
+    assert str(result["report"].resolve()) in result["text"]
+    plain, guided = verbs["fit:street_gaussians"], verbs["fit:mudg_s"]
+    assert plain[0][0].method == "street_gaussians"
+    assert plain[1]["observations"] is None
+    assert guided[0][0].method == "mudg_s"
+    assert guided[1]["observations"] == tmp_path / "out" / "synthesize"
+    ledger = store.read_json(tmp_path / "out" / "run.json")
+    assert ledger["state"] == "complete"
+    assert all(step["state"] == "complete" for step in ledger["steps"].values())
+
+
+def test_run_yaml_repeats_the_run(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    config = with_seed(run_preset(fast=True), 5)
+    run.run_chain(config, "city", tmp_path / "out")
+    assert configuration.load(RunConfig, None, tmp_path / "out" / "run.yaml") == config
+
+
+def test_a_scene_without_labels_is_annotated_and_then_used(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    verbs["labelled"] = False
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+    assert verbs["calls"] == [CHAIN[0], "annotate", *CHAIN[1:]]
+    for label in ("fuse", "synthesize", "fit:mudg_s", "render:mudg_s", "score"):
+        assert tmp_path / "out" / "annotate" in verbs[label][0]
+
+
+def test_a_scene_needs_no_ingest(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "scene.json").write_text("{}")
+    run.run_chain(RunConfig(), scene, tmp_path / "out")
+    assert verbs["calls"] == CHAIN[1:]
+    assert scene in verbs["fuse"][0]
+
+
+def test_an_interruption_is_recorded_and_the_repeat_continues(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    verbs["trouble"]["synthesize"] = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        run.run_chain(RunConfig(), "city", tmp_path / "out")
+    ledger = store.read_json(tmp_path / "out" / "run.json")
+    assert ledger["state"] == "interrupted"
+    assert ledger["steps"]["synthesize"]["state"] == "interrupted"
+    assert "score" not in ledger["steps"]
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+    assert store.read_json(tmp_path / "out" / "run.json")["state"] == "complete"
+
+
+def test_seconds_add_up_over_continuations_and_reuse_adds_none(
+    tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = {"now": 0.0}
+    costs = {"ingest": [10.0, 1.0, 1.0], "fuse": [2.0, 0.5], "synthesize": [30.0, 12.0, 0.25]}
+    monkeypatch.setattr(run.time, "monotonic", lambda: clock["now"])
+    plain = {name: module.run for name, module in (("ingest", ingest), ("fuse", fuse), ("synthesize", synthesize))}
+
+    def costing(name: str) -> Callable[..., Path]:
+        def act(*arguments: Any, **named: Any) -> Path:
+            clock["now"] += costs[name].pop(0)
+            return plain[name](*arguments, **named)
+
+        return act
+
+    for name, module in (("ingest", ingest), ("fuse", fuse), ("synthesize", synthesize)):
+        monkeypatch.setattr(module, "run", costing(name))
+    verbs["trouble"]["synthesize"] = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        run.run_chain(RunConfig(), "city", tmp_path / "out")
+    seconds = run.run_chain(RunConfig(), "city", tmp_path / "out")["seconds"]
+    assert (seconds["ingest"], seconds["fuse"], seconds["synthesize"]) == (10.0, 2.0, 42.0)
+
+
+def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+    verbs["calls"].clear()
+    with pytest.raises(UsageError) as refused:
+        run.run_chain(with_seed(RunConfig(), 3), "city", tmp_path / "out")
+    assert "fit.seed: 0 there, 3 asked" in str(refused.value)
+    assert verbs["calls"] == []
+    run.run_chain(with_seed(RunConfig(), 3), "city", tmp_path / "out", overwrite=True)
+    assert verbs["calls"] == CHAIN
+    assert all(verbs[label][1]["overwrite"] for label in CHAIN)
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    (tmp_path / "holiday.jpg").write_text("x")
+    with pytest.raises(UsageError, match="something else"):
+        run.run_chain(RunConfig(), "city", tmp_path)
+    assert verbs["calls"] == []
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["holiday.jpg"]
+
+
+def test_no_such_log(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="no such driving log"):
+        run.run_chain(RunConfig(), tmp_path / "nothing", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_error_in_a_step_keeps_what_was_done(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    verbs["trouble"]["fit"] = NumericsError("a loss is not finite")
+    with pytest.raises(NumericsError):
+        run.run_chain(RunConfig(), "city", tmp_path / "out")
+    ledger = store.read_json(tmp_path / "out" / "run.json")
+    assert ledger["state"] == "failed"
+    assert ledger["steps"]["fuse"]["state"] == "complete"
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+
+
+def test_ctrl_c_prints_how_to_continue(
+    tmp_path: Path, verbs: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    verbs["trouble"]["fuse"] = KeyboardInterrupt()
+    words = ["demo", "--fast", "--out", str(tmp_path / "my out")]
+    assert cli.main(words) == 130
+    assert f"mudg demo --fast --out '{tmp_path / 'my out'}'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_real_chain_ends_with_a_report_and_continues_after_a_kill(tmp_path: Path) -> None:
+    """``mudg demo --fast`` in miniature, killed once on the way; the repeat gives what an undisturbed run gives."""
+    small = ["--fast", "--fit.iterations", "12", "--synthesize.steps", "1", "--out"]
+    command = [sys.executable, "-m", "mudg", "demo", "--quiet", *small]
+    first = subprocess.Popen([*command, str(tmp_path / "killed")])
+    try:
+        first.wait(timeout=20)
+    except subprocess.TimeoutExpired:
+        first.kill()
+        first.wait()
+    subprocess.run([*command, str(tmp_path / "killed")], check=True, timeout=900)
+    subprocess.run([*command, str(tmp_path / "whole")], check=True, timeout=900)
+    page = (tmp_path / "killed" / "report.html").read_text()
+    assert len(page) < 25e6
+    scores = [(tmp_path / name / "score" / "metrics.json").read_bytes() for name in ("killed", "whole")]
+    assert scores[0] == scores[1]

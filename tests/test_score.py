@@ -1,0 +1,251 @@
+"""Scores with known answers."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import toy_views
+
+from mudg.base import geometry, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import FusedCloud, Observation, PointCloud, View
+from mudg.stages import score, score_tables
+from mudg.stages.config import ScoreConfig
+
+
+def brighter(step: int) -> object:
+    """Every channel of every pixel ``step`` grey values brighter: a mean squared error of exactly (step / 255)^2."""
+
+    def change(_index: int, seen: Observation) -> Observation:
+        return dataclasses.replace(seen, rgb=seen.rgb + step / 255)
+
+    return change
+
+
+def value(document: dict, method: str, trajectory: str, metric: str) -> object:
+    found = [r for r in document["results"] if r["method"] == method and r["trajectory"] == trajectory]
+    assert len(found) == 1
+    return found[0]["values"][metric]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return toy_views.write_scene(tmp_path / "scene")
+
+
+def test_known_colour_error_gives_known_psnr(tmp_path: Path, scene: Path) -> None:
+    plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), brighter(5))
+    worse = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), brighter(20))
+    out = score.run(ScoreConfig(), scene, {"street_gaussians": plain, "mudg_s": worse}, tmp_path / "score")
+    document = store.read_json(out / "metrics.json")
+    for method, step in (("street_gaussians", 5), ("mudg_s", 20)):
+        assert value(document, method, "front_recorded", "psnr") == pytest.approx(20 * math.log10(255 / step), abs=1e-4)
+    assert value(document, "mudg_s", "front_recorded", "miou") == 1.0
+    assert value(document, "mudg_s", "front_recorded", "abs_rel") == 0.0
+
+
+def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: Path) -> None:
+    def spoil_training_frames(index: int, seen: Observation) -> Observation:
+        return seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
+
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), spoil_training_frames)
+    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    assert document["results"][0]["views"] == 2
+    assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
+
+
+def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
+    scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
+    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    assert document["results"][0]["views"] == 4
+    assert any("No frame was held out" in rule for rule in document["rules"])
+
+
+def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -> None:
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, 2.0))
+    out = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score")
+    document = store.read_json(out / "metrics.json")
+    assert document["truth"] == "recorded"
+    assert value(document, "a", "front_shift+2.0", "psnr") == score_tables.NO_TRUTH
+    assert value(document, "a", "front_shift+2.0", "fid") == "not computed"
+    assert not (out / "truth" / "front_shift+2.0").exists()
+    assert "no truth" in score.summary_table(out)
+
+
+def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Path) -> None:
+    def colour_only(_index: int, seen: Observation) -> Observation:
+        return dataclasses.replace(seen, depth=None, semantics=None)
+
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), colour_only)
+    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
+    assert value(document, "a", "front_recorded", "miou") == "not produced"
+    assert value(document, "a", "front_recorded", "psnr") == 100.0
+
+
+def test_labels_that_the_log_lacks_are_no_truth(tmp_path: Path) -> None:
+    scene = toy_views.write_scene(tmp_path / "scene", labels=False)
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
+    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    assert value(document, "a", "front_recorded", "miou") == score_tables.NO_TRUTH
+    assert value(document, "a", "front_recorded", "abs_rel") == score_tables.NO_TRUTH
+
+
+def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
+    def no_depth_anywhere(_index: int, seen: Observation) -> Observation:
+        return dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
+
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), no_depth_anywhere)
+    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    true = toy_views.depths()[np.isfinite(toy_views.depths())].astype(np.float64)
+    expected = float(np.mean((80.0 - true) / true))
+    assert value(document, "a", "front_recorded", "abs_rel") == pytest.approx(expected, rel=1e-4)
+
+
+def test_methods_of_other_sizes_are_compared_at_the_cameras_size(tmp_path: Path, scene: Path) -> None:
+    def half(_index: int, seen: Observation) -> Observation:
+        view = seen.view.resized(toy_views.WIDTH // 2, toy_views.HEIGHT // 2)
+        return dataclasses.replace(
+            seen,
+            view=view,
+            rgb=torch.full((3, toy_views.HEIGHT // 2, toy_views.WIDTH // 2), 0.5),
+            depth=seen.depth[:, ::2, ::2],
+            semantics=seen.semantics[::2, ::2],
+            confidence=seen.confidence[:, ::2, ::2],
+            mask=seen.mask[:, ::2, ::2],
+        )
+
+    small = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), half)
+    full = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,))
+    out = score.run(ScoreConfig(), scene, {"a": small, "b": full}, tmp_path / "score")
+    document = store.read_json(out / "metrics.json")
+    course = document["trajectories"][0]
+    assert (course["width"], course["height"]) == (toy_views.WIDTH, toy_views.HEIGHT)
+    assert value(document, "b", "front_recorded", "psnr") == 100.0
+    grey = [np.mean((128 / 255 - toy_views.colours(i) / 255) ** 2) for i in (1, 3)]  # stored as 8 bits: 0.5 becomes 128
+    expected = float(np.mean([-10 * math.log10(e) for e in grey]))
+    assert value(document, "a", "front_recorded", "psnr") == pytest.approx(expected, abs=1e-3)
+
+
+def test_nearest_resize_mixes_nothing() -> None:
+    ids = torch.tensor([[[0, 1], [2, 3]]])
+    assert score.resize_nearest(ids, 4, 4).tolist() == [[[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 3, 3], [2, 2, 3, 3]]]
+    assert score.resize_nearest(torch.arange(16).reshape(1, 4, 4), 2, 2).tolist() == [[[5, 7], [13, 15]]]
+
+
+def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Path) -> None:
+    full = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
+    part = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,))
+    index = store.read_json(part / "front_recorded" / "observations.json")
+    index["observations"] = index["observations"][:3]
+    store.write_json(part / "front_recorded" / "observations.json", index)
+    document = store.read_json(
+        score.run(ScoreConfig(), scene, {"a": full, "b": part}, tmp_path / "score") / "metrics.json"
+    )
+    assert document["trajectories"][0]["views"] == 3
+    assert {r["views"] for r in document["results"]} == {1}
+
+
+def test_methods_must_stand_in_the_same_place(tmp_path: Path, scene: Path) -> None:
+    here = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
+    there = toy_views.write_views(scene, tmp_path / "b", "b", (3.0,))
+    (there / "front_shift+3.0").rename(there / "front_shift+2.0")
+    with pytest.raises(InputError, match="different places"):
+        score.run(ScoreConfig(), scene, {"a": here, "b": there}, tmp_path / "score")
+
+
+def test_nothing_to_score_is_said(tmp_path: Path, scene: Path) -> None:
+    with pytest.raises(UsageError):
+        score.run(ScoreConfig(), scene, {}, tmp_path / "score")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="none of the folders"):
+        score.run(ScoreConfig(), scene, {"a": tmp_path / "empty"}, tmp_path / "score2")
+
+
+def test_a_finished_score_is_reused_and_another_configuration_refused(tmp_path: Path, scene: Path) -> None:
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
+    out = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score")
+    before = (out / "metrics.json").stat().st_mtime_ns
+    score.run(ScoreConfig(), scene, {"a": views}, out)
+    assert (out / "metrics.json").stat().st_mtime_ns == before
+    with pytest.raises(UsageError, match="another configuration"):
+        score.run(ScoreConfig(width_px=24), scene, {"a": views}, out)
+
+
+def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, -3.0), brighter(9))
+    first = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "one")
+    second = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "two")
+    for name in ("metrics.json", "metrics.md", "errors/front_recorded.png"):
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+
+
+def test_distances_average_both_sides_and_mark_the_best() -> None:
+    courses = [{"name": n, "shift_m": s} for n, s in (("l", 2.0), ("r", -2.0), ("here", 0.0), ("odd", None))]
+    results = [
+        {"method": m, "trajectory": t, "values": {"psnr": v}}
+        for m, t, v in (
+            ("a", "l", 20.0),
+            ("a", "r", 24.0),
+            ("a", "here", 30.0),
+            ("b", "l", 21.0),
+            ("b", "r", "no truth"),
+        )
+    ]
+    table = score_tables.by_distance(courses, ["a", "b"], results, ["psnr"])
+    found = {(row["method"], row["distance_m"]): row["values"]["psnr"] for row in table}
+    assert found == {("a", 0.0): 30.0, ("b", 0.0): "not produced", ("a", 2.0): 22.0, ("b", 2.0): 21.0}
+    assert score_tables.best_of("higher", {"a": 1.0, "b": 2.0, "c": "not computed"}, "psnr") == {"b"}
+    assert score_tables.best_of("lower", {"a": 0.1001, "b": 0.1004}, "abs_rel") == {"a", "b"}  # equal as shown
+    assert score_tables.best_of("lower", {"a": 0.1}, "abs_rel") == set()
+
+
+def test_baseline_fills_holes_with_the_nearest_point(scene: Path) -> None:
+    """Two walls of points, red at 10 m on the left and green at 20 m on the right; between them the nearer edge wins."""
+    view = View(toy_views.CAMERA, toy_views.EGO_FROM_CAM, 0.0)
+    rows, columns = np.mgrid[2 : toy_views.HEIGHT : 4, 4:12:4]
+    left = geometry.unproject(view, np.stack([columns, rows], -1).reshape(-1, 2) + 0.5, np.full(rows.size, 10.0))
+    right = geometry.unproject(view, np.stack([columns + 32, rows], -1).reshape(-1, 2) + 0.5, np.full(rows.size, 20.0))
+    cloud = FusedCloud(
+        PointCloud(
+            np.concatenate([left, right]).astype(np.float32),
+            np.repeat(np.array([[255, 0, 0], [0, 255, 0]], np.uint8), rows.size, 0),
+            "world",
+            np.repeat(np.array([0, 13], np.uint8), rows.size),
+        ),
+        {},
+    )
+    seen = score.nearest_fill(cloud, {}, view)
+    middle = (8 + 36) // 2 + 1
+    assert bool((seen.rgb[0, :, : middle - 4] == 1).all())
+    assert bool((seen.rgb[1, :, middle + 4 :] == 1).all())
+    assert seen.depth is not None and seen.semantics is not None
+    assert torch.allclose(seen.depth[0, :, 0], torch.tensor(10.0)) and torch.allclose(
+        seen.depth[0, :, -1], torch.tensor(20.0)
+    )
+    assert set(seen.semantics.unique().tolist()) == {0, 13}
+
+
+def test_baseline_of_a_view_that_sees_nothing() -> None:
+    view = View(toy_views.CAMERA, toy_views.EGO_FROM_CAM, 0.0)
+    behind = PointCloud(
+        np.array([[-5.0, 0, 1]], np.float32), np.zeros((1, 3), np.uint8), "world", np.zeros(1, np.uint8)
+    )
+    seen = score.nearest_fill(FusedCloud(behind, {}), {}, view)
+    assert seen.depth is not None and bool(torch.isnan(seen.depth).all())
+    assert seen.semantics is not None and set(seen.semantics.unique().tolist()) == {255}
+
+
+def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) -> None:
+    scene = toy_views.write_scene(tmp_path / "scene", labels=False, lidar=True)
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), lambda _i, seen: dataclasses.replace(
+        seen, depth=torch.full_like(seen.depth, 12.0)
+    ))  # fmt: skip
+    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m
