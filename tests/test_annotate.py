@@ -60,9 +60,9 @@ def test_labels_of_a_street_agree_with_the_truth() -> None:
     assert overlap(labels.semantics, truth, "sky") > 0.95
     assert overlap(labels.semantics, truth, "building", "vegetation", "wall") > 0.8
     assert (labels.semantics != UNLABELLED).mean() > 0.95
-    assert set(np.unique(labels.semantics)) <= {ID[n] for n in ("road", "building", "vegetation", "sky", "car")} | {
-        UNLABELLED
-    }
+    assert set(np.unique(labels.semantics)) <= {
+        ID[n] for n in ("road", "terrain", "building", "vegetation", "sky", "car")
+    } | {UNLABELLED}
 
 
 def test_confidence_tells_right_from_wrong() -> None:
@@ -186,11 +186,12 @@ def test_elevation_of_rays() -> None:
 def test_sky_is_not_found_where_returns_are_or_below_the_horizon() -> None:
     rgb = np.full((60, 80, 3), 220, np.uint8)
     elevation = np.repeat(np.linspace(0.5, -0.5, 60)[:, None], 80, 1).astype(np.float32)
-    empty = np.ones((60, 80), bool)
-    empty[:, 50:] = False
-    sky = find_sky(rgb, elevation, empty)
-    assert sky[2:28, 2:48].all()
-    assert not sky[:, 50:].any()
+    away_px = np.repeat(np.maximum(50.0 - np.arange(80), 0)[None], 60, 0).astype(
+        np.float32
+    )  # returns from column 50 on
+    sky = find_sky(rgb, elevation, away_px, 6.0)
+    assert sky[:28, :48].all()  # grown up to the returns, not into them
+    assert not sky[:, 49:].any()
     assert not sky[31:].any()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 from mudg.data.cloudfile import read_fused
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import check_scene, read_image, read_points, read_scene
+from mudg.data.scenefile import check_scene, decode_image, read_image, read_points, read_scene, write_zip
 from mudg.stages import annotate, fuse, ingest
 from mudg.stages.config import AnnotateConfig, FuseConfig, IngestConfig
 
@@ -385,3 +386,45 @@ def test_images_with_colour_maps_and_grey_are_read_as_rgb(tmp_path: Path) -> Non
     scene = IMPORTERS["kitti"](source, tmp_path / "out", ImportOptions())
     assert (read_image(scene, scene.frames[0]) == grey[..., None]).all()
     assert read_image(scene, scene.frames[1]).shape == (made.HEIGHT, made.WIDTH, 3)
+
+
+# --- damage at random: only our own errors, never a crash and never a picture of another size -------------------------
+
+
+def damaged(content: bytes, rng: np.random.Generator) -> bytes:
+    changed = bytearray(content)
+    for _ in range(rng.integers(1, 4)):
+        changed[rng.integers(len(changed))] = rng.integers(256)
+    return bytes(changed[: rng.integers(len(changed))] if rng.random() < 0.3 else changed)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_damaged_images_end_in_words(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    buffer = io.BytesIO()
+    Image.fromarray(made.image(1)).save(buffer, kind)
+    refused = 0
+    for _ in range(400):
+        try:
+            assert decode_image(damaged(buffer.getvalue(), rng), "damaged").dtype == np.uint8
+        except InputError:
+            refused += 1
+    assert refused > 100
+
+
+def test_damaged_zips_and_indices_end_in_words(good_scene: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    shutil.copytree(good_scene, tmp_path / "scene")
+    packed = write_zip(tmp_path / "scene", tmp_path / "scene.zip").read_bytes()
+    index = (tmp_path / "scene" / "scene.json").read_bytes()
+    refused = 0
+    for _ in range(150):
+        (tmp_path / "damaged.zip").write_bytes(damaged(packed[-3000:], rng).join([packed[:-3000], b""]))
+        (tmp_path / "scene" / "scene.json").write_bytes(damaged(index, rng))
+        for path in (tmp_path / "damaged.zip", tmp_path / "scene"):
+            try:
+                scene = read_scene(path)
+                read_points(scene, scene.sweeps[0])
+            except MudgError:
+                refused += 1
+    assert refused > 150

@@ -10,10 +10,20 @@ import torch
 from mudg.base import geometry
 from mudg.base.types import RasterTrace
 from mudg.core.table import Table
-from mudg.models.densify import SPLIT_SHRINK, DensifySettings, DensifyStats, densify, reset_opacity, rotate
+from mudg.models.densify import (
+    SPLIT_SHRINK,
+    DensifySettings,
+    DensifyStats,
+    densify,
+    reset_opacity,
+    rotate,
+    shorten_needles,
+)
 from mudg.models.nodes import RigidNode, SceneModel, StaticNode
 
-SETTINGS = DensifySettings(start=10, stop=100, every=10, static_gradient=1.0, object_gradient=1.0, split_above_m=0.5, max_rows=1000, growth=10.0)
+SETTINGS = DensifySettings(
+    start=10, stop=100, every=10, static_gradient=1.0, object_gradient=1.0, split_above_m=0.5, max_rows=1000, growth=10.0
+)  # fmt: skip
 
 
 def scene(static: int = 6, moving: int = 4, scale_m: float = 0.1, opacity: float = 0.5) -> SceneModel:
@@ -124,7 +134,8 @@ def test_thresholds_differ_by_kind_of_node():
 
 def test_statistics_count_visible_rows_only_in_half_image_units():
     stats = DensifyStats.zeros(2)
-    trace = RasterTrace(torch.zeros(2, 2), torch.zeros(2, 2, dtype=torch.int32), torch.tensor([True, False]), torch.tensor([[0.3, 0.4], [1.0, 1.0]]))
+    visible, gradient = torch.tensor([True, False]), torch.tensor([[0.3, 0.4], [1.0, 1.0]])
+    trace = RasterTrace(torch.zeros(2, 2), torch.zeros(2, 2, dtype=torch.int32), visible, gradient)
     stats.observe(trace, 200, 100)
     stats.observe(trace, 200, 100)
     assert stats.seen.tolist() == [2, 0]
@@ -144,6 +155,16 @@ def test_opacity_reset_only_lowers_and_forgets():
     assert opacity.max().item() == pytest.approx(0.01, rel=1e-4)
     assert opacity[0] < 0.005
     assert (model.table.moment1["logits"] == 0).all()
+
+
+def test_needles_are_shortened_discs_are_not():
+    model = scene(static=2, moving=0)
+    with torch.no_grad():
+        model.table["log_scales"][0] = torch.log(torch.tensor([0.1, 5.0, 0.2]))  # a needle
+        model.table["log_scales"][1] = torch.log(torch.tensor([3.0, 0.01, 4.0]))  # a disc
+    shorten_needles(model.table, 4.0)
+    assert model.table["log_scales"].exp()[0].tolist() == pytest.approx([0.1, 0.8, 0.2], rel=1e-5)
+    assert model.table["log_scales"].exp()[1].tolist() == pytest.approx([3.0, 0.01, 4.0], rel=1e-5)
 
 
 def test_when_it_is_due():

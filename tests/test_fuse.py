@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from toy_scene import CAR, CAR_SIZE_M, COLOURS, GROUND, PANEL, TRAIN_IDS, WALL_HIGH, WALL_LOW, ToyStreet
 
@@ -32,6 +32,7 @@ from mudg.core.fusion import (
     separate,
     voxel_keys,
 )  # fmt: skip
+from mudg.core.project import ProjectConfig, project_cloud
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
@@ -101,6 +102,7 @@ def test_stands(case: str) -> None:
     assert not verdict.moving, verdict.words
 
 
+@settings(max_examples=12)
 @given(st.floats(-3, 3), st.floats(-500, 500), st.floats(-500, 500))
 def test_verdict_does_not_depend_on_where_the_world_lies(yaw: float, x: float, y: float) -> None:
     elsewhere = yaw_matrix(yaw, (x, y, 2.0))
@@ -497,6 +499,7 @@ class KittiCheck:
         )  # fmt: skip
         cloud, _ = fuse_sweeps(sweeps, self.scene.tracks if mode.endswith("boxes") else (), rules)
         target = view(8)
+        self.last = (cloud, target)
         xyz, rgb = [cloud.static.xyz.astype(np.float64)], [cloud.static.rgb]
         for track_id, points in cloud.objects.items():
             placed = self.scene.track(track_id).pose_at(target.time_s)
@@ -504,6 +507,14 @@ class KittiCheck:
             xyz.append(geometry.transform_points(placed, points.xyz.astype(np.float64)))
             rgb.append(points.rgb)
         return self.draw(target, np.concatenate(xyz), np.concatenate(rgb))
+
+    def project(self, config: ProjectConfig) -> tuple[np.ndarray, np.ndarray]:
+        """The last prediction drawn by the package's own projection."""
+        cloud, target = self.last
+        poses = {track_id: self.scene.track(track_id).pose_at(target.time_s) for track_id in cloud.objects}
+        seen = project_cloud(cloud, poses, target, config)
+        picture = (seen.color.permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
+        return picture, seen.valid[0].numpy()
 
     def draw(self, view: View, xyz: np.ndarray, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         uv, z = geometry.project(view, xyz)
@@ -542,6 +553,13 @@ def test_real_sequence_reproduces_its_protocol_and_the_occlusion_test_helps(
     )  # better where both say something, not only by saying less
     changed = both & (tested != picture).any(2)
     assert check.psnr(tested, changed) > check.psnr(picture, changed) + 0.5
+    own, own_covered = check.project(ProjectConfig())
+    assert (own_covered == tested_covered).mean() > 0.9999
+    assert check.psnr(own, own_covered) == pytest.approx(check.psnr(tested, tested_covered), abs=0.02)
+    clean, clean_covered = check.project(
+        ProjectConfig(occluder_m=0.2)
+    )  # far points no longer shine through near surfaces
+    assert check.psnr(clean, clean_covered) > check.psnr(own, own_covered) + 0.5
 
 
 def test_real_sequence_moves_what_its_readme_says(shared_data: Callable[[str], Path], tmp_path: Path) -> None:

@@ -110,6 +110,9 @@ def test_pose_at_is_exact_at_keys_interpolates_both_neighbours_and_never_extrapo
 )  # fmt: skip
 def test_rigid_problem_names_the_fault(matrix: np.ndarray, word: str) -> None:
     assert word in str(geometry.rigid_problem(matrix))
+    if matrix.shape == (4, 4):
+        assert geometry.all_rigid(np.stack([np.eye(4)] * 3))
+        assert not geometry.all_rigid(np.stack([np.eye(4), matrix]))
 
 
 def test_zero_quaternion_is_refused() -> None:

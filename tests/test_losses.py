@@ -71,6 +71,12 @@ def test_weighted_mean_known_value_and_empty_weight():
     assert (values.grad == 0).all()
 
 
+def test_confident_mean_of_little_confidence_is_little():
+    values = torch.tensor([[1.0, 2.0], [4.0, 8.0]])
+    assert losses.confident_mean(values, torch.tensor([[1.0, 0.0], [0.5, 0.0]])).item() == pytest.approx(3.0 / 4)
+    assert losses.confident_mean(values, torch.ones(2, 2)).item() == values.mean().item()
+
+
 def test_trimmed_mean_leaves_the_largest_out():
     values = torch.tensor([5.0, 1.0, 2.0, 100.0, 3.0])
     assert float(losses.trimmed_mean(values, 0.8)) == pytest.approx((1 + 2 + 3 + 5) / 4)

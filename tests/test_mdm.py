@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Camera, Condition, View
 from mudg.models import mdm
@@ -180,18 +181,37 @@ def test_loss_has_gradients_everywhere():
     assert set(losses.terms) == {"rgb", "depth", "semantics"}
 
 
-def test_measured_depth_is_taken_where_it_agrees():
+def test_measured_depth_is_taken_and_sky_is_far():
     condition = some_condition(frames=1)
     depth = torch.full((1, 1, 16, 24), 20.0)
-    measured = torch.full_like(depth, 21.0)
-    measured[..., 12:] = 60.0
-    condition = replace(condition, depth=measured, valid=torch.ones_like(condition.valid[:1]))
     settled = mdm.settle_depth(depth, condition, None, 100.0)
-    assert torch.equal(settled[..., :12], measured[..., :12])
-    assert torch.equal(settled[..., 12:], depth[..., 12:])
+    assert torch.equal(settled[condition.valid], condition.depth[condition.valid])
+    assert torch.equal(settled[~condition.valid], depth[~condition.valid])
     sky = torch.full((1, 16, 24), mdm.SKY)
-    nothing_seen = replace(condition, valid=torch.zeros_like(condition.valid))
-    assert float(mdm.settle_depth(depth, nothing_seen, sky, 100.0).min()) == 100.0
+    settled = mdm.settle_depth(depth, condition, sky, 100.0)
+    assert torch.equal(settled[condition.valid], condition.depth[condition.valid])
+    assert bool((settled[~condition.valid] == 100.0).all())
+
+
+def test_lost_colour_is_given_back_only_where_generated_and_condition_agree():
+    condition = some_condition(frames=1)
+    everywhere = torch.ones_like(condition.valid)
+    condition = replace(condition, valid=everywhere, color=torch.full_like(condition.color, 0.6))
+    carried = torch.full_like(condition.color, 0.5)
+    assert torch.allclose(mdm.restore_colour(carried, carried, condition), condition.color)
+    other = carried + 0.2
+    assert torch.equal(mdm.restore_colour(other, carried, condition), other)
+    unseen = replace(condition, valid=~everywhere, warped=~everywhere)
+    assert torch.equal(mdm.restore_colour(carried, carried, unseen), carried)
+
+
+def test_the_shipped_model_loads():
+    model = mdm.load("embedded")
+    assert model.config.window == 8
+    files = list(mdm.EMBEDDED.glob("*.safetensors"))
+    assert all(f.stat().st_size < 16 * 1024 * 1024 for f in files)
+    assert sum(f.stat().st_size for f in files) < 40 * 1024 * 1024
+    assert mdm.facts("embedded")["held_out"]["clips"] == 24
 
 
 def test_confidence_falls_with_change_and_distance():

@@ -132,7 +132,8 @@ def test_pose_gradient_by_finite_differences():
         means, turned = node.place(local, quats, 0.8)
         return torch.cat([means.flatten(), turned.flatten()])
 
-    assert torch.autograd.gradcheck(placed, [(0.1 * torch.randn(4, 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)).requires_grad_()])
+    offsets = 0.1 * torch.randn(4, 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    assert torch.autograd.gradcheck(placed, [offsets.requires_grad_()])
 
 
 @settings(max_examples=25)

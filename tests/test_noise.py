@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
 from mudg.base.errors import NumericsError, UsageError
 from mudg.base.store import read_safetensors
 from mudg.core import noise

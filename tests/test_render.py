@@ -94,7 +94,8 @@ def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_
 
 
 def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
-    folder = render.run(RenderConfig(shifts_m=(0.0,), remove_tracks=("car",), video=False), world["scene"], world["model"], tmp_path / "out")
+    config = RenderConfig(shifts_m=(0.0,), remove_tracks=("car",), video=False)
+    folder = render.run(config, world["scene"], world["model"], tmp_path / "out")
     seen = read_observations(folder / "front_recorded")[1]
     with_car = fit.render_view(fit.load_model(world["model"]), seen.view, render.RasterConfig())
     uv, _ = geometry.project(seen.view, (car_pose(seen.view.time_s)[:3, 3] - [0, 0, CAR_SIZE[2] / 4])[None])

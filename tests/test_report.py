@@ -157,10 +157,15 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
 
 def run_of(psnr: dict[tuple[str, float], float | str], truth: str = "exact") -> dict[str, Any]:
     rows = [
-        {"method": m, "distance_m": d, "values": {"psnr": v, "abs_rel": "no truth", "miou": "no truth"}}
+        {
+            "method": m,
+            "distance_m": d,
+            "sides": "both" if d else "recorded",
+            "values": {"psnr": v, "abs_rel": "no truth", "miou": "no truth"},
+        }
         for (m, d), v in psnr.items()
     ]
-    return {"by_distance": rows, "truth": truth, "scene": {"id": "toy"}}
+    return {"by_distance": rows, "truth": truth, "scene": {"id": "toy", "held_out": 1}}
 
 
 def test_headline_says_what_the_numbers_say() -> None:

@@ -195,6 +195,21 @@ def test_what_a_killed_writer_left_is_cleared_and_a_live_one_is_not(tmp_path: Pa
     small_scene(tmp_path / "scene")
     assert not dead.exists()
     assert alive.exists()
+    inside = tmp_path / "there" / ".scene.999999999-1.part"
+    inside.mkdir(parents=True)
+    small_scene(tmp_path / "there")
+    assert sorted(p.name for p in (tmp_path / "there").iterdir()) == [
+        "images",
+        "lidar",
+        "manifest.json",
+        "scene.json",
+        "tracks.json",
+    ]
+
+
+def test_the_current_folder_can_be_the_destination(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert len(small_scene(Path()).frames) == 3
 
 
 def test_bookkeeping_in_the_destination_stays_and_a_scene_there_is_refused(tmp_path: Path) -> None:
@@ -282,6 +297,19 @@ def test_writer_refuses(case: str, tmp_path: Path) -> None:
             act(writer)
         if case not in ("twice",):
             assert len(writer.finish().frames) == 3  # the refusal did not spoil what was there
+
+
+def test_what_could_not_be_read_back_is_not_put_in_place(tmp_path: Path) -> None:
+    with SceneWriter(tmp_path / "s", "s", Source("t", "n", {"seed": 1})) as writer:
+        fill(writer)
+        writer.set_split({"front/000000": "val"})  # type: ignore[dict-item]
+        with pytest.raises(InputError, match="train and test"):
+            writer.finish()
+    with SceneWriter(tmp_path / "t", "t", Source("t", "n", {"when": object()})) as writer:
+        fill(writer)
+        with pytest.raises(InputError, match="JSON cannot hold|cannot hold"):
+            writer.finish()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_times_must_increase_per_camera(tmp_path: Path) -> None:

@@ -201,6 +201,13 @@ def test_distances_average_both_sides_and_mark_the_best() -> None:
     table = score_tables.by_distance(courses, ["a", "b"], results, ["psnr"])
     found = {(row["method"], row["distance_m"]): row["values"]["psnr"] for row in table}
     assert found == {("a", 0.0): 30.0, ("b", 0.0): "not produced", ("a", 2.0): 22.0, ("b", 2.0): 21.0}
+    sides = {row["distance_m"]: row["sides"] for row in table}
+    assert sides == {0.0: "recorded", 2.0: "both"}
+    document = {"by_distance": table, "scene": {"held_out": 0}}
+    assert score_tables.distance_title(document, 2.0) == "2 m to either side"
+    assert score_tables.distance_title(document, 0.0) == "recorded path, all frames"
+    left = {"by_distance": score_tables.by_distance(courses[:1], ["a"], results, ["psnr"]), "scene": {"held_out": 1}}
+    assert score_tables.distance_title(left, 2.0) == "2 m to the left"
     assert score_tables.best_of("higher", {"a": 1.0, "b": 2.0, "c": "not computed"}, "psnr") == {"b"}
     assert score_tables.best_of("lower", {"a": 0.1001, "b": 0.1004}, "abs_rel") == {"a", "b"}  # equal as shown
     assert score_tables.best_of("lower", {"a": 0.1}, "abs_rel") == set()

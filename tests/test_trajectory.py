@@ -26,7 +26,8 @@ def drive(poses: list[np.ndarray], cameras: dict[str, float] = YAWS) -> Scene:
     for name, yaw in cameras.items():
         ego_from_cam = geometry.yaw_matrix(yaw, (1.0, 0.0, 1.5)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
         for index, pose in enumerate(poses):
-            frames.append(Frame(f"{name}/{index:06d}", View(mounted[name], pose @ ego_from_cam, times[index]), Ref(f"images/{name}/{index}.png")))
+            view = View(mounted[name], pose @ ego_from_cam, times[index])
+            frames.append(Frame(f"{name}/{index:06d}", view, Ref(f"images/{name}/{index}.png")))
     return Scene("drive", ".", mounted, tuple(frames), (), (), EgoPath(times, np.stack(poses)), {}, Source("test", "none"))
 
 
@@ -40,7 +41,8 @@ def circle(count: int = 20) -> Scene:
 def test_on_a_circle_the_ego_stays_on_a_concentric_circle(shift_m):
     """Left of a left turn is inside: the radius shrinks by exactly the shift, at every frame."""
     scene = circle()
-    for ego, old, new in zip(scene.ego.world_from_ego, trajectory.recorded(scene, "front").views, trajectory.shifted(scene, "front", shift_m).views):
+    before, after = trajectory.recorded(scene, "front").views, trajectory.shifted(scene, "front", shift_m).views
+    for ego, old, new in zip(scene.ego.world_from_ego, before, after):
         moved = ego[:3, 3] + new.center_world - old.center_world
         assert np.hypot(moved[0], moved[1] - RADIUS_M) == pytest.approx(RADIUS_M - shift_m, abs=1e-9)
         assert moved[2] == pytest.approx(0.3, abs=1e-12)

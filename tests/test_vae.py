@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from mudg.base import palette
 from mudg.base.errors import UsageError
 from mudg.models.vae import CodecConfig, build_codec, code_to_depth, depth_to_code, semantic_shares
@@ -11,7 +12,7 @@ from mudg.models.vae import CodecConfig, build_codec, code_to_depth, depth_to_co
 
 def smooth_images(count=6, height=16, width=24, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    coarse = torch.rand(count, 3, 4, 6, generator=generator)
+    coarse = torch.rand(count, 3, 3, 4, generator=generator)
     return torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic").clamp(0, 1)
 
 
@@ -91,6 +92,13 @@ def test_palette_code_decodes_every_class():
         decoded = codec.decode({"semantics": codec.encode_semantics(ids)})
     assert float((decoded.semantics == ids).float().mean()) > 0.9
     assert palette.CLASSES[int(decoded.semantics[0, 0, 0])] == "road"
+
+
+def test_a_single_frame_without_leading_axes_is_fine():
+    codec = build_codec(CodecConfig()).eval()
+    with torch.no_grad():
+        decoded = codec.decode({"depth": codec.encode_depth(torch.full((1, 8, 8), 7.0))})
+    assert decoded.depth.shape == (1, 8, 8)
 
 
 def test_leading_axes_are_kept():

@@ -16,7 +16,16 @@ import torch
 from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import (
-    Camera, EgoPath, FusedCloud, Observation, PointCloud, Scene, Source, SweepPoints, Track, View,
+    Camera,
+    EgoPath,
+    FusedCloud,
+    Observation,
+    PointCloud,
+    Scene,
+    Source,
+    SweepPoints,
+    Track,
+    View,
 )  # fmt: skip
 from mudg.data.scenefile import SceneWriter
 

@@ -219,6 +219,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if words[0] in ("-V", "--version"):
             _say(f"mudg {version()}")
             return 0
+        # Idle OpenMP threads that spin would take the cores from the native library's threads; must precede torch.
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         args = parse(words)
         log.set_quiet(args.quiet)
         with _sigterm_interrupts():

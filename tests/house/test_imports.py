@@ -12,7 +12,7 @@ HEAVY = ("torch", "torchvision", "scipy", "av", "PIL", "matplotlib", "cv2")
 
 
 def fresh(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
 
 
 def loaded_by(code: str) -> list[str]:
@@ -46,7 +46,7 @@ def best_of(count: int, command: list[str]) -> float:
     times = []
     for _ in range(count):
         before = os.times()
-        subprocess.run(command, capture_output=True, timeout=60, check=False)
+        subprocess.run(command, capture_output=True, timeout=300, check=False)
         after = os.times()
         times.append(after.children_user + after.children_system - before.children_user - before.children_system)
     return min(times)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,9 +47,14 @@ def sources(package_dir: Path) -> list[Path]:
     return found
 
 
+@functools.lru_cache(maxsize=2000)
+def syntax_of(path: Path, _modified_ns: int) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
 def parsed(package_dir: Path) -> Iterator[tuple[str, ast.Module]]:
     for path in sources(package_dir):
-        yield path.relative_to(package_dir).as_posix(), ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+        yield path.relative_to(package_dir).as_posix(), syntax_of(path, path.stat().st_mtime_ns)
 
 
 def dotted(node: ast.AST) -> str:

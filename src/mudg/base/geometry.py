@@ -48,6 +48,15 @@ def rigid_problem(transform: ArrayLike, tolerance: float = 1e-4) -> str | None:
     return None
 
 
+def all_rigid(transforms: Matrix, tolerance: float = 1e-4) -> bool:
+    """Whether every one of f64[N, 4, 4] is rigid: ``rigid_problem`` for many at once, without the words."""
+    rotation = transforms[:, :3, :3]
+    if not np.isfinite(transforms).all() or (np.abs(transforms[:, 3] - [0, 0, 0, 1]) > tolerance).any():
+        return False
+    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))
+    return not (error > tolerance).any() and not (np.linalg.det(rotation) < 0).any()
+
+
 def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
     """Whether ``transform`` is a finite, right-handed rigid 4x4 matrix within ``tolerance``."""
     return rigid_problem(transform, tolerance) is None

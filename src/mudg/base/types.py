@@ -51,8 +51,9 @@ def _pose_keys(times_s: Any, poses: Any, where: str) -> tuple[NDArray[np.float64
         )
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise InputError("times must be finite and strictly increasing", where=f"{where}.times_s", got=_some(times))
-    for index, matrix in enumerate(matrices):
-        _rigid(matrix, f"{where}[{index}]")
+    if not geometry.all_rigid(matrices):
+        for index, matrix in enumerate(matrices):
+            _rigid(matrix, f"{where}[{index}]")
     times.setflags(write=False)
     matrices.setflags(write=False)
     return times, matrices

@@ -32,6 +32,14 @@ def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
     return (values * weight).sum() / weight.sum().clamp_min(1e-12)
 
 
+def confident_mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Mean over **all** pixels of ``values * weight`` (broadcast): an observation that is sure of little also weighs little.
+
+    ``weighted_mean`` would blow the few sure pixels up to the weight of a whole image.
+    """
+    return (values * weight.to(values.dtype)).mean()
+
+
 # ---- colour ------------------------------------------------------------------------------------------------------
 
 
@@ -171,7 +179,7 @@ def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) 
 
 
 def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Tensor) -> Tensor:
-    """Weighted mean absolute difference of feature maps, averaged over the scales.
+    """Mean absolute difference of feature maps, every place weighted by its confidence, averaged over the scales.
 
     Args:
         prediction, target: per scale ``[C_s, H_s, W_s]``.
@@ -181,7 +189,7 @@ def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Ten
     for mine, theirs in zip(prediction, target):
         _same_shape(mine, theirs, "feature_distance")
         scale_weight = F.adaptive_avg_pool2d(weight.to(mine.dtype), mine.shape[-2:])
-        total = total + weighted_mean((mine - theirs).abs(), scale_weight)
+        total = total + confident_mean((mine - theirs).abs(), scale_weight)
     return total / len(prediction)
 
 

@@ -73,8 +73,8 @@ class _Context:
 def _statistics(library: ctypes.CDLL, handle: int) -> dict[str, float]:
     counts, phases = (ctypes.c_int64 * 5)(), (ctypes.c_double * 6)()
     library.mudg_raster_statistics(handle, counts, phases)
-    names = ("visible", "entries", "not_finite", "first_not_finite", "context_bytes")
-    return dict(zip(names, map(int, counts), strict=True)) | dict(zip(PHASES, phases, strict=True))
+    names = ("visible", "entries", "not_finite", "first_not_finite", "context_bytes", *PHASES)
+    return {name: float(value) for name, value in zip(names, (*counts, *phases), strict=True)}
 
 
 def release_memory() -> None:
@@ -182,7 +182,7 @@ class _Rasterize(torch.autograd.Function):
         if status != 0:
             _raise(status, ctx.context, parts)
         if absolute is not None:
-            call.abs_grad2d += absolute
+            call.abs_grad2d.add_(absolute)
         of_background = torch.tensor(list(gradient.background), dtype=ctx.background_type) if needs[6] else None
         of_pose = _pose_gradient(gradient, ctx.pose_type) if needs[7] else None
         wanted = [g if needed else None for g, needed in zip(out, needs)]

@@ -9,7 +9,7 @@ scales S has covariance R S S^T R^T; the camera maps it to the image with the Ja
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import torch
@@ -53,14 +53,14 @@ def render(request: Request) -> Render:
     probe = torch.zeros_like(splats.means2d).requires_grad_(keeps_graph)
     size = (camera.width, camera.height)
     with torch.no_grad():
-        touched = (splats.depth > config.near_m) & (splats.depth < config.far_m) & (splats.opacity >= ALPHA_MIN)
+        touched = (splats.depth < config.far_m) & (splats.opacity >= ALPHA_MIN)
         low, high = splats.means2d - splats.extents, splats.means2d + splats.extents
         limit = torch.tensor(size, device=low.device)
         touched &= (splats.extents > 0).all(1) & (high >= 0.5).all(1) & (low <= limit - 0.5).all(1)
         order = torch.nonzero(touched)[:, 0]
         order = order[torch.argsort(splats.depth[order], stable=True)]
     channels = torch.cat([colors, splats.depth[:, None], *([] if g.extra is None else [g.extra])], 1)[order]
-    if not torch.isfinite(channels).all():
+    if not (torch.isfinite(channels).all() and torch.isfinite(g.sh[order]).all()):
         raise NumericsError("the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra")
     absolute = torch.zeros_like(probe) if request.absgrad and keeps_graph else None
     blended, alpha = _blend_tiles(splats, probe, order, channels, absolute, size, config.alpha_max)
@@ -78,15 +78,30 @@ def render(request: Request) -> Render:
 
 
 def project(g: Gaussians, world_from_cam: Tensor, camera: Camera, config: RasterConfig) -> Splats:
-    """Means and covariances into the image. Gaussians in front of ``near_m`` get finite stand-in values."""
+    """Means and covariances into the image. What cannot be drawn (in front of ``near_m``, a covariance that overflows) gets
+    extent 0 and harmless stand-in values, so that it can spoil neither images nor gradients."""
+    with torch.no_grad():
+        first = _project((g.means, g.quats, g.scales, g.opacity), world_from_cam, camera, config)
+        proper = torch.isfinite(torch.cat([first.means2d, first.conics, first.extents], 1)).all(1)
+        proper &= (first.conics[:, 0] > 0) & (first.conics[:, 2] > 0) & (first.depth > config.near_m)
+    harmless = world_from_cam.detach()[:3, 3] + world_from_cam.detach()[:3, 2] * (config.near_m + 1)
+    values = ((g.means, harmless), (g.quats, harmless.new_tensor([1.0, 0, 0, 0])), (g.scales, harmless.new_ones(3)))
+    safe = [torch.where(proper[:, None], value, stand_in) for value, stand_in in values]
+    splats = _project((safe[0], safe[1], safe[2], g.opacity), world_from_cam, camera, config)
+    return replace(splats, extents=torch.where(proper[:, None], splats.extents, 0))
+
+
+def _project(
+    parts: tuple[Tensor, Tensor, Tensor, Tensor], world_from_cam: Tensor, camera: Camera, config: RasterConfig
+) -> Splats:
+    means, quats, scales, opacity = parts
     cam_from_world = world_from_cam[:3, :3].T
-    mean_cam = (g.means - world_from_cam[:3, 3]) @ cam_from_world.T
+    mean_cam = (means - world_from_cam[:3, 3]) @ cam_from_world.T
     depth = mean_cam[:, 2]
     z = torch.where(depth > config.near_m, depth, torch.ones_like(depth))
     slope = mean_cam[:, :2] / z[:, None]
     focal = slope.new_tensor([camera.fx, camera.fy])
     center, size = slope.new_tensor([camera.cx, camera.cy]), slope.new_tensor([camera.width, camera.height])
-    means2d = focal * slope + center
     # The linearisation point is held within 1.3 times the field of view, where the approximation still makes sense.
     slack = 0.15 * size / focal
     held = torch.minimum(torch.maximum(slope, -center / focal - slack), (size - center) / focal + slack)
@@ -94,22 +109,19 @@ def project(g: Gaussians, world_from_cam: Tensor, camera: Camera, config: Raster
     jacobian = torch.stack(
         [focal[0] / z, zero, -focal[0] * held[:, 0] / z, zero, focal[1] / z, -focal[1] * held[:, 1] / z], 1
     ).view(-1, 2, 3)
-    half = jacobian @ cam_from_world @ (rotation_matrices(g.quats) * g.scales[:, None, :])  # unit sphere -> ellipse
+    half = jacobian @ cam_from_world @ (rotation_matrices(quats) * scales[:, None, :])  # unit sphere -> ellipse
     sharp = half @ half.transpose(1, 2)
     xx, xy, yy = sharp[:, 0, 0] + config.blur_px2, sharp[:, 0, 1], sharp[:, 1, 1] + config.blur_px2
-    det = xx * yy - xy * xy
-    proper = (depth > config.near_m) & torch.isfinite(det) & (det > 0)
-    det = torch.where(proper, det, torch.ones_like(det))
-    opacity = g.opacity
+    # det = xx yy - xy^2, by way of the cross product of the two rows: no cancellation for needles.
+    sharp_det = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
+    det = sharp_det + config.blur_px2 * (xx + yy - config.blur_px2)
     if config.antialias:
-        sharp_det = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
         opacity = opacity * (sharp_det / det).clamp_min(1e-6).sqrt()
     conics = torch.stack([yy / det, -xy / det, xx / det], 1)
     with torch.no_grad():
         level = (2 * torch.log(opacity.clamp_min(1e-30) / ALPHA_MIN)).clamp_min(0)
         extents = torch.stack([(level * xx).sqrt(), (level * yy).sqrt()], 1) + 1e-3
-        extents = torch.where(proper[:, None], extents, 0)
-    return Splats(means2d, conics, opacity, depth, extents)
+    return Splats(focal * slope + center, conics, opacity, depth, extents)
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -124,11 +136,11 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics of unit directions [N, 3]: [N, (degree + 1)^2]."""
     x, y, z = directions.unbind(1)
+    cos2, sin2 = x * x - y * y, 2 * x * y
     basis = [torch.full_like(x, 0.2820947917738781)]
     if degree >= 1:
         basis += [-0.48860251190292 * y, 0.48860251190292 * z, -0.48860251190292 * x]
     if degree >= 2:
-        cos2, sin2 = x * x - y * y, 2 * x * y
         basis += [0.5462742152960395 * sin2, -1.092548430592079 * y * z, 0.9461746957575601 * z * z - 0.3153915652525201,
                   -1.092548430592079 * x * z, 0.5462742152960395 * cos2]  # fmt: skip
     if degree >= 3:
@@ -212,8 +224,8 @@ class _SumAbsolute(torch.autograd.Function):
 
 def _refuse_not_finite(g: Gaussians) -> None:
     for name in ("means", "quats", "scales", "opacity"):
-        tensor = getattr(g, name)
-        bad = ~torch.isfinite(tensor.reshape(len(g), -1)).all(1)
+        values = getattr(g, name)
+        bad = ~torch.isfinite(values if values.ndim > 1 else values[:, None]).all(1)
         if bad.any():
             row = int(torch.nonzero(bad)[0, 0])
             raise NumericsError("a Gaussian is not finite", where=f"Gaussian {row}: {name}",

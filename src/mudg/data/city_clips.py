@@ -25,7 +25,7 @@ from mudg.core.fusion import FusionRules, Shot, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
 from mudg.data.clip_shards import pack_clips, write_shard
-from mudg.data.clips import ConditionRules, Recorded, build_condition
+from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
 
 HELD_OUT = 1_000_000
 """City numbers from here on are for scoring: standard rig, all cameras, shifts of exactly 2, 3 and 4 m."""
@@ -44,6 +44,8 @@ class CityClipRules:
     window: int = 8
     seed: int = 0
     clips: int = 4
+    fine: int = 2
+    """Recorded images are this many times larger than the clips; their colours are gathered at that size."""
 
 
 @dataclass(frozen=True)
@@ -53,22 +55,21 @@ class CityLog:
     world: CityWorld
     cloud: FusedCloud
     recorded: tuple[Recorded, ...]
-    front: tuple[CityTruth, ...]
 
 
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
     """The city's configuration."""
     seed = seeds.key(rules.seed, city, "city") & 0x7FFFFFFF
     if city >= HELD_OUT:
-        return CityConfig(seed=seed, n_frames=FRAMES, width=rules.width, height=rules.height)
+        return CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < 0.4
     return CityConfig(
         seed=seed,
         n_frames=FRAMES,
         rate_hz=float(rng.choice([10.0, 10.0, 6.0])),
-        width=rules.width,
-        height=rules.height,
+        width=rules.width * rules.fine,
+        height=rules.height * rules.fine,
         cameras=("front", "front_left", "front_right") if side_cameras else ("front",),
         hfov_deg=float(rng.uniform(46, 76)),
         rig_variation=1.0,
@@ -118,30 +119,35 @@ def make_log(rules: CityClipRules, city: int) -> CityLog:
     recorded = tuple(
         Recorded(view, truth.rgb_u8) for name in config.cameras for view, truth in zip(world.frame_views(name), truths[name])
     )
-    return CityLog(world, cloud, recorded, tuple(truths["front"]))
+    return CityLog(world, cloud, recorded)
 
 
 def make_clips(rules: CityClipRules, city: int) -> tuple[list[Clip], tuple[float, ...]]:
     """All clips of one city and their shifts in metres."""
     log = make_log(rules, city)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
+    size = (rules.width, rules.height)
     recorded_views = log.world.frame_views("front")[FIRST : FIRST + rules.window]
-    conditions = ConditionRules(rules.width, rules.height)
+    conditions = ConditionRules(*size, rules.width * rules.fine, rules.height * rules.fine)
+    tracks = log.world.tracks()
     clips = []
     shifts = shifts_of(rules, city)
-    sources: dict = {}
+    sources: dict[int, Source] = {}
+    known = _without_every_fourth(log.recorded, rng) if city < HELD_OUT and rng.random() < 0.5 else log.recorded
     for shift_m in shifts:
-        if shift_m == 0.0:
-            truths = log.front[FIRST : FIRST + rules.window]
-            given, cache = _thinned(log.recorded, rng), {}
-            views = recorded_views
-        else:
-            views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
-            truths = [log.world.render(view, sensor_noise=False) for view in views]
-            given, cache = log.recorded, sources
-        condition = build_condition(log.cloud, log.world.tracks(), views, given, conditions, cache)
+        views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
+        given, cache = (_thinned(log.recorded, rng), {}) if shift_m == 0.0 else (known, sources)
+        condition = build_condition(log.cloud, tracks, views, given, conditions, cache)
+        truths = [log.world.render(view.resized(*size)) for view in views]
         clips.append(clip_from_truth(condition, truths))
     return clips, shifts
+
+
+def _without_every_fourth(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
+    """As in a log whose every fourth moment is held out."""
+    times = sorted({r.view.time_s for r in recorded})
+    held_out = set(times[int(rng.integers(4)) :: 4])
+    return tuple(r for r in recorded if r.view.time_s not in held_out)
 
 
 def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:

@@ -39,10 +39,13 @@ class ConditionRules:
 
     width: int
     height: int
+    fine_width: int = 0
+    fine_height: int = 0
+    """Colours are gathered on this finer grid and averaged (0 = at the condition's own size): that avoids aliasing."""
     near_m: float = 1.0
     far_m: float = 100.0
     point_px: float = 1.0
-    """Side of the square a point covers, at the condition's resolution."""
+    """Side of the square a point covers, in pixels."""
     same_time_s: float = 0.06
     """Recorded images nearer in time than this may also colour moving things."""
     images_per_view: int = 4
@@ -186,41 +189,80 @@ def build_condition(
     camera that is nearest in time (black if there is none).
     Raises InputError for an empty list of views.
     """
+    return build_conditions(cloud, tracks, views, recorded, rules, sources)[0]
+
+
+def build_conditions(
+    cloud: FusedCloud,
+    tracks: Sequence[Track],
+    views: Sequence[View],
+    recorded: Sequence[Recorded],
+    rules: ConditionRules,
+    sources: dict[int, Source] | None = None,
+) -> tuple[Condition, Condition]:
+    """As `build_condition`, and the same condition on the fine grid (the same object if there is no finer one)."""
     if not views:
         raise InputError("a condition needs at least one view", where="clips.build_condition")
     small = [view.resized(rules.width, rules.height) for view in views]
     reference = _reference(small[0], recorded, rules)
     if rules.published:
-        return _published_condition(cloud, tracks, small, reference, rules)
+        condition = _published_condition(cloud, tracks, small, reference, rules)
+        return condition, condition
     sources = {} if sources is None else sources
+    size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
+    fine_views = tuple(view.resized(*size) for view in views)
+    looks = [_look(cloud, tracks, view, recorded, rules, sources) for view in fine_views]
+    color, depth, valid, warped, backdrop = (torch.stack(column) for column in zip(*looks))
+    fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
+                     warped, backdrop)  # fmt: skip
+    if size == (rules.width, rules.height):
+        return fine, fine
+
+    def reduced(x: Tensor) -> Tensor:
+        return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
+
+    own = [project_sparse(cloud, tracks, view, rules) for view in small]
+    own_depth = torch.stack([_filled(sparse, rules)[1] for sparse in own])[:, None]
+    own_valid = torch.stack([sparse.valid for sparse in own])[:, None]
+    condition = Condition(
+        tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5, reduced(backdrop)
+    )
+    return condition, fine
+
+
+def _look(
+    cloud: FusedCloud,
+    tracks: Sequence[Track],
+    view: View,
+    recorded: Sequence[Recorded],
+    rules: ConditionRules,
+    sources: dict[int, Source],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W] and backdrop f32[3,H,W] of one view, at its size."""
 
     def source(number: int) -> Source:
         if number not in sources:
-            sources[number] = _prepare_source(cloud, tracks, recorded[number], rules)
+            sources[number] = _prepare_source(cloud, tracks, recorded[number], view, rules)
         return sources[number]
 
-    columns: list[tuple[Tensor, ...]] = []
-    for view in small:
-        sparse = project_sparse(cloud, tracks, view, rules)
-        colour, depth, moving = _filled(sparse, rules)
-        found = torch.zeros_like(sparse.valid)
-        backdrop = colour
-        if rules.warp and recorded:
-            order = _order_of_images(view, recorded, rules)
-            far = torch.full((1, *depth.shape), rules.backdrop_m)
-            x, y, _ = carry(view, far, source(order[0]).view)
-            backdrop = look_up(source(order[0]).rgb, x, y)[0]
-            for number in order:
-                image = source(number)
-                fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
-                surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
-                rgb, new = warp(view, depth, image, surface, rules.hidden_share)
-                new = new & ~found if fresh else new & ~found & ~moving
-                colour = torch.where(new, rgb, colour)
-                found = found | new
-        columns.append((colour, depth[None], sparse.valid[None], found[None], backdrop))
-    color, depths, valid, warped, backdrops = (torch.stack(column) for column in zip(*columns))
-    return Condition(tuple(small), color, depths, valid, reference, warped, backdrops)
+    sparse = project_sparse(cloud, tracks, view, rules)
+    colour, depth, moving = _filled(sparse, rules)
+    found = torch.zeros_like(sparse.valid)
+    if not (rules.warp and recorded):
+        return colour, depth[None], sparse.valid[None], found[None], colour
+    order = _order_of_images(view, recorded, rules)
+    nearest = source(order[0])
+    x, y, _ = carry(view, torch.full((1, *depth.shape), rules.backdrop_m), nearest.view)
+    backdrop = look_up(nearest.rgb, x, y)[0]
+    for number in order:
+        image = source(number)
+        fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
+        surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
+        rgb, new = warp(view, depth, image, surface, rules.hidden_share)
+        new = new & ~found if fresh else new & ~found & ~moving
+        colour = torch.where(new, rgb, colour)
+        found = found | new
+    return colour, depth[None], sparse.valid[None], found[None], backdrop
 
 
 def _filled(sparse: Sparse, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor]:
@@ -263,9 +305,12 @@ def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionR
     return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
 
 
-def _prepare_source(cloud: FusedCloud, tracks: Sequence[Track], recorded: Recorded, rules: ConditionRules) -> Source:
+def _prepare_source(
+    cloud: FusedCloud, tracks: Sequence[Track], recorded: Recorded, target: View, rules: ConditionRules
+) -> Source:
+    """A recorded image brought to about as many pixels as the target view, with its depth."""
     camera = recorded.view.camera
-    scale = (rules.width * rules.height / (camera.width * camera.height)) ** 0.5
+    scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
     _, depth, moving = _filled(project_sparse(cloud, tracks, view, rules), rules)

@@ -12,7 +12,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -374,7 +374,10 @@ def ego_from_json(value: object, where: str) -> EgoPath:
 
 def _timed_poses(record: Record, times_key: str, poses_key: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     times = [finite_number(t, f"{record.at(times_key)}[{i}]") for i, t in enumerate(record.items(times_key))]
-    poses = [rigid_pose(p, f"{record.at(poses_key)}[{i}]") for i, p in enumerate(record.items(poses_key))]
+    items = record.items(poses_key)
+    poses = _poses_at_once(items)
+    if poses is None:  # something is wrong, or the rows are nested: one by one, so that the place can be named
+        poses = np.array([rigid_pose(p, f"{record.at(poses_key)}[{i}]") for i, p in enumerate(items)])
     if not times or len(times) != len(poses):
         raise InputError(
             "times and poses do not pair up",
@@ -392,7 +395,25 @@ def _timed_poses(record: Record, times_key: str, poses_key: str) -> tuple[NDArra
             got=problem,
             remedy="sort the poses by time and drop duplicates",
         )
-    return times_s, np.stack(poses)
+    return times_s, poses
+
+
+def _poses_at_once(items: list[Any]) -> NDArray[np.float64] | None:
+    """Many poses of 12 numbers each, f64[n, 4, 4]; None if anything is not as it should be."""
+    numbers = [number for item in items if isinstance(item, list) and len(item) == 12 for number in item]
+    if len(numbers) != 12 * len(items) or not all(type(number) in (float, int) for number in numbers):
+        return None
+    try:
+        rows = np.array(numbers, np.float64).reshape(len(items), 3, 4)
+    except OverflowError:
+        return None
+    rotations = rows[:, :, :3]
+    error = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0)
+    if not np.isfinite(rows).all() or error > RIGID_TOLERANCE or (np.linalg.det(rotations) < 0).any():
+        return None
+    poses = np.zeros((len(items), 4, 4))
+    poses[:, :3], poses[:, 3, 3] = rows, 1.0
+    return poses
 
 
 def source_from_json(value: object, where: str) -> Source:
@@ -511,7 +532,7 @@ def _parse_each(items: Iterable[tuple[Any, Any]], parse: Callable[[Any, Any], An
     return parsed
 
 
-def _split_from_json(top: Record, frames: Iterable[Frame]) -> dict[str, str]:
+def _split_from_json(top: Record, frames: Iterable[Frame]) -> dict[str, Literal["train", "test"]]:
     frame_ids = [frame.id for frame in frames]
     if "split" not in top:
         return dict.fromkeys(frame_ids, "train")

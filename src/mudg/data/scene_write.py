@@ -10,9 +10,10 @@ import threading
 import zipfile
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,7 @@ class SceneWriter:
             raise InputError(
                 "there is a scene here already", where=str(self.root), remedy="choose another folder or remove it"
             )
-        self._partial = self.root.with_name(f".{self.root.name}.{os.getpid()}-{threading.get_ident()}.part")
-        _remove_stale_partials(self.root)
+        self._partial = _partial_folder(self.root)
         try:
             self._partial.mkdir(parents=True)
         except OSError as error:
@@ -69,7 +69,7 @@ class SceneWriter:
         self._sweeps: dict[str, Sweep] = {}
         self._tracks: dict[str, Track] = {}
         self._ego: EgoPath | None = None
-        self._split: dict[str, str] = {}
+        self._split: dict[str, Literal["train", "test"]] = {}
         self._hashes: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
         self._slots = threading.Semaphore(_MAX_PENDING_WRITES)
@@ -206,7 +206,7 @@ class SceneWriter:
         """Set the path of the vehicle."""
         self._ego = ego
 
-    def set_split(self, split: Mapping[str, str]) -> None:
+    def set_split(self, split: Mapping[str, Literal["train", "test"]]) -> None:
         """Set which frames are held out: frame id -> ``train`` or ``test``. Frames not named are for training."""
         self._split = dict(split)
 
@@ -220,7 +220,7 @@ class SceneWriter:
             raise InputError("ego path was not set", where=where, remedy="call set_ego")
         order = {name: index for index, name in enumerate(self._cameras)}
         frames = sorted(self._frames.values(), key=lambda f: (f.view.time_s, order[f.view.camera.name]))
-        split = {frame.id: self._split.get(frame.id, "train") for frame in frames}
+        split: dict[str, Literal["train", "test"]] = {f.id: self._split.get(f.id, "train") for f in frames}
         scene = Scene(
             id=self._scene_id,
             root=str(self.root),
@@ -236,9 +236,11 @@ class SceneWriter:
         self._write("tracks.json", schema.tracks_to_json_text(scene.tracks).encode())
         self._write("scene.json", schema.scene_to_json_text(scene).encode())
         store.write_json(self._partial / store.MANIFEST, {"schema": 1, "files": dict(sorted(self._hashes.items()))})
+        store.sync_tree(self._partial)
+        checked = read_scene(self._partial)  # nothing is moved into place that could not be read back
         self._move_into_place()
         self._finished = True
-        return read_scene(self.root)
+        return replace(checked, root=str(self.root.absolute()))
 
     def _move_into_place(self) -> None:
         try:
@@ -276,27 +278,24 @@ class SceneWriter:
             future.result()
 
     def _write(self, ref: str, content: bytes) -> None:
-        store.atomic_write(self._partial / ref, content)
+        store.write_in_tree(self._partial / ref, content)
         with self._lock:
             self._hashes[ref] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
-def _remove_stale_partials(root: Path) -> None:
-    """Remove what a killed writer of the same scene left; another live process's work is not touched."""
-    for stale in root.parent.glob(f".{root.name}.*.part") if root.parent.is_dir() else ():
-        pid = stale.name.removeprefix(f".{root.name}.").split("-")[0]
-        if stale.is_dir() and pid.isdigit() and not _alive(int(pid)):
-            shutil.rmtree(stale, ignore_errors=True)
+def _partial_folder(root: Path) -> Path:
+    """Where to build a scene: inside its folder where that exists (a run's folder, a mounted one), else beside it.
 
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+    What a killed writer left there is removed; another live process's work is not touched.
+    """
+    root = root.absolute()
+    parent, prefix = (root, ".scene.") if root.is_dir() else (root.parent, f".{root.name}.")
+    for stale in parent.iterdir() if parent.is_dir() else ():
+        if stale.name.startswith(prefix) and stale.name.endswith(".part") and stale.is_dir():
+            pid = stale.name.removeprefix(prefix).split("-")[0]
+            if pid.isdigit() and not store.process_alive(int(pid)):
+                shutil.rmtree(stale, ignore_errors=True)
+    return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
 
 
 def _check_pose(pose: NDArray[np.float64], where: str) -> None:

@@ -3,7 +3,7 @@
 ``geometry`` holds no parameters and needs no download. It knows few classes and says 255 (unlabelled) where it cannot tell:
 
 * **road**: ground points (near a plane fitted to the LiDAR) and the image between and below them. Sidewalks are flat as well
-  and are called road; far beside the path with less confidence.
+  and are called road; far beside the path with less confidence. Green ground is **terrain**.
 * **car, truck, bus, train, person, rider, ...**: tracked boxes projected into the image where nothing nearer stands.
 * **sky**: bright or blue, smooth, above the horizon, joined to the top of the image, and without LiDAR returns.
 * **vegetation**: what rises from the ground, or stands above the horizon, and is green.
@@ -37,7 +37,9 @@ TRAIN_ID_OF: Final[Mapping[str, int]] = {
 GAP_DEG: Final = 0.6
 """Beams of a turning LiDAR are at most this far apart; between two returns closer than this the surface goes on."""
 GROUND_M: Final = 0.2
-NEAR_ROAD_M: Final = 6.0
+NEAR_ROAD_M: Final = 4.0
+_GRASS: Final = 6.0
+_THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +93,7 @@ def label_by_geometry(given: LabelInput) -> Labels:
     gap_px = max(1.5, np.deg2rad(GAP_DEG) * given.view.camera.fy)
     away_px, nearest = _nearest_return(returns, (height, width))
     elevation = ray_elevation(given.view)
-    sky = find_sky(given.rgb, elevation, away_px > gap_px)
+    sky = find_sky(given.rgb, elevation, away_px, gap_px)
     semantics = np.full((height, width), UNLABELLED, np.uint8)
     confidence = np.zeros((height, width), np.float32)
     if nearest is not None:
@@ -131,6 +133,7 @@ def fit_ground(
     xyz = np.asarray(xyz_world, np.float64)
     centre = path_world.mean(0)
     xyz = xyz[(np.abs(xyz[:, :2] - centre[:2]) < reach_m).all(1)]
+    xyz = xyz[:: max(1, len(xyz) // 60_000)]
     cells = np.floor(xyz[:, :2] / 2.0).astype(np.int64)
     key = cells[:, 0] * 1_000_003 + cells[:, 1]
     order = np.lexsort((xyz[:, 2], key))
@@ -227,7 +230,7 @@ def _paint_returns(
     covered = away_px <= gap_px
     ground_here = is_ground[nearest] & covered
     beside = returns.beside_m[nearest]
-    semantics[ground_here] = ID["road"]
+    semantics[ground_here] = np.where(greenness[ground_here] > _GRASS, ID["terrain"], ID["road"])
     closeness = 1 - 0.5 * away_px / gap_px
     confidence[ground_here] = (np.where(beside < NEAR_ROAD_M, 0.9, 0.5) * closeness)[ground_here]
     standing = covered & ~ground_here
@@ -265,26 +268,39 @@ def _paint_box(
     outline = box_outline(view, pose, track.size_m)
     if outline is None:
         return
+    reach = max(1, round(float(np.deg2rad(GAP_DEG)) * view.camera.fy / 2))
+    rows, columns = (_span(outline.any(axis), reach) for axis in (1, 0))
+    outline, depth, semantics, confidence = (m[rows, columns] for m in (outline, depth, semantics, confidence))
     half_diagonal = float(np.linalg.norm(track.size_m)) / 2
     middle = float((view.cam_from_world @ pose)[2, 3])
     in_front = np.isfinite(depth) & (depth < middle - half_diagonal)
-    inside = points_in_box(geometry.transform_points(geometry.invert(pose), returns.xyz_world), track.size_m, 0.1, 0.1)
-    sure = np.zeros(outline.shape, bool)
+    near = np.flatnonzero(np.abs(returns.depth_m - middle) <= half_diagonal + 0.5)
+    local = geometry.transform_points(geometry.invert(pose), returns.xyz_world[near])
+    inside = near[points_in_box(local, track.size_m, 0.1, 0.1)]
+    sure = np.zeros((view.camera.height, view.camera.width), bool)
     sure[returns.row[inside], returns.column[inside]] = True
-    reach = max(1, round(float(np.deg2rad(GAP_DEG)) * view.camera.fy / 2))
-    sure = _at_edges_too(ndimage.binary_closing, sure, reach) & outline
+    sure = _at_edges_too(ndimage.binary_closing, sure[rows, columns], reach) & outline
+    if len(inside) == 0 and np.isfinite(depth).any():
+        return  # the LiDAR sees around there and nothing is in the box: it is hidden, or empty
+    label = TRAIN_ID_OF[track.label]
     road_before_it = (semantics == ID["road"]) & (confidence > 0.4) & (depth < middle + half_diagonal)
     fill = outline & ~in_front & ~road_before_it
-    if not inside.any() and np.isfinite(depth).any():
-        return  # the LiDAR sees around there and nothing is in the box: it is hidden, or empty
-    semantics[fill], confidence[fill] = TRAIN_ID_OF[track.label], 0.5
-    semantics[sure], confidence[sure] = TRAIN_ID_OF[track.label], 0.9
+    if label in _THIN and len(inside):
+        fill &= ndimage.binary_dilation(sure, iterations=max(1, reach // 2))  # they fill little of their boxes
+    semantics[fill], confidence[fill] = label, 0.5
+    semantics[sure], confidence[sure] = label, 0.9
+
+
+def _span(present: NDArray[np.bool_], margin: int) -> slice:
+    """From the first to the last true entry, and ``margin`` more on either side."""
+    at = np.flatnonzero(present)
+    return slice(max(0, int(at[0]) - margin), int(at[-1]) + margin + 1)
 
 
 def box_outline(
     view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]
 ) -> NDArray[np.bool_] | None:
-    """Convex outline of a projected box bool[H, W], or None if it lies outside the image or reaches behind the camera."""
+    """Convex outline of a projected box bool[H, W], cut at the camera's near plane; None if it lies outside the image."""
     camera = view.camera
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
     corners = geometry.transform_points(view.cam_from_world @ world_from_box, signs * size_m)
@@ -331,32 +347,38 @@ def _greenness(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return green - np.maximum(red * 0.97, blue * 1.04) - 1.5
 
 
-def find_sky(rgb: NDArray[np.uint8], elevation: NDArray[np.float32], empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def find_sky(
+    rgb: NDArray[np.uint8], elevation: NDArray[np.float32], away_px: NDArray[np.float32], gap_px: float
+) -> NDArray[np.bool_]:
     """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, joined to the top of the image.
 
     Args:
         rgb: u8[H, W, 3].
         elevation: of the rays, radians, f32[H, W].
-        empty: bool[H, W], no LiDAR return near by.
+        away_px: distance to the nearest LiDAR return f32[H, W].
+        gap_px: sky is looked for farther from returns than this, and then grown up to them where it looks the same.
     """
-    candidates = (elevation > 0) & empty
+    candidates = (elevation > 0) & (away_px > gap_px)
     if not candidates.any():
         return candidates
     smooth = ndimage.uniform_filter(rgb.astype(np.float32), (3, 3, 1))
-    brightness = smooth.max(2)
     blueness = smooth[..., 2] - smooth[..., 0]
-    score = brightness + 1.5 * np.clip(blueness, 0, 60)
+    score = smooth.max(2) + 1.5 * np.clip(blueness, 0, 60)
     threshold = _two_group_threshold(score[candidates])
     rough = ndimage.gaussian_gradient_magnitude(smooth.mean(2), 1.0) > 20
-    sky = candidates & (score > threshold) & (blueness > -25) & ~rough
-    sky = _at_edges_too(ndimage.binary_opening, sky)
+    looks_so = (score > threshold) & (blueness > -25) & ~rough
+    sky = _at_edges_too(ndimage.binary_opening, candidates & looks_so)
     pieces, _ = ndimage.label(sky)
     top = np.flatnonzero(candidates.any(1))[0]
     joined = np.unique(pieces[top : top + 3])
     large = np.flatnonzero(np.bincount(pieces.ravel()) > 0.002 * sky.size)
     keep = np.union1d(joined, large)
     sky = np.isin(pieces, keep[keep > 0])
-    return _at_edges_too(ndimage.binary_closing, sky) & candidates
+    if not sky.any():
+        return sky
+    sky = _at_edges_too(ndimage.binary_closing, sky) & candidates
+    free = (elevation > 0) & (away_px > 1.5)
+    return ndimage.binary_dilation(sky, iterations=int(np.ceil(gap_px)) + 1, mask=free & (looks_so | sky))
 
 
 def _at_edges_too(

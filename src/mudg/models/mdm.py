@@ -477,12 +477,14 @@ class MDM(nn.Module):
         generator: torch.Generator,
         *,
         shares: Tensor | None = None,
+        class_weights: Tensor | None = None,
         depth_known: Tensor | None = None,
     ) -> Losses:
         """Denoising loss of a batch, steps and noise drawn from `generator`.
 
         truth        latents of `encode_truth`
         shares       class shares [B,T,19,h,w]; needed when semantics are coded as shares
+        class_weights  f32[19], weights of the classes in the cross-entropy; None = all 1
         depth_known  f32[B,T,1,h,w] share of the cell with true depth; None = everywhere
 
         x0 head: squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a
@@ -501,7 +503,8 @@ class MDM(nn.Module):
                 if m == "semantics" and log_shares is not None:
                     if shares is None:
                         raise UsageError("class shares are needed for the semantic loss", where="MDM.loss")
-                    part = -(shares * log_shares).sum(2).mean()
+                    weighted = shares if class_weights is None else shares * class_weights.view(-1, 1, 1)
+                    part = -(weighted * log_shares).sum(2).mean()
                 elif self.config.head == "v":
                     part = (stated[m] - self.schedule.velocity(truth[m], eps[m], t)).square().mean()
                 elif m == "depth":
@@ -550,8 +553,8 @@ class MDM(nn.Module):
         n_samples   > 1: the first sample is returned, the spread of all sets the confidence
         bf16        run the network in bfloat16
 
-        Measured depth (`condition.valid`) replaces generated depth where the two agree to a quarter; sky is set to the
-        codec's far distance. See `confidence_of` for the confidence.
+        Measured depth (`condition.valid`) replaces generated depth; sky is set to the codec's far distance. See
+        `confidence_of` for the confidence.
         """
         if sampler not in noise.SAMPLERS:
             raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
@@ -575,11 +578,17 @@ class MDM(nn.Module):
         if n_samples > 1:
             stacked = torch.stack([d.get("rgb", next(iter(d.values()))) for d in drawn])
             change = stacked.std(0).mean(2, keepdim=True) * 2
+        rgb = decoded.rgb
+        if rgb is not None and self.config.copy_condition:
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                carried = self.codec.decode({"rgb": encoded.copy["rgb"][0]}).rgb
+            if carried is not None:
+                rgb = restore_colour(rgb, carried, condition)
         confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
         depth = decoded.depth
         if depth is not None:
             depth = settle_depth(depth, condition, decoded.semantics, self.config.codec.far_m)
-        return Sample(decoded.rgb, depth, decoded.semantics, confidence, {m: z[0] for m, z in drawn[0].items()})
+        return Sample(rgb, depth, decoded.semantics, confidence, {m: z[0] for m, z in drawn[0].items()})
 
     def _denoise(
         self,
@@ -637,18 +646,32 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
 
 
-def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, far_m: float) -> Tensor:
-    """Generated depth made to agree with what was measured, f32[T,1,H,W] metres.
+def restore_colour(rgb: Tensor, carried: Tensor, condition: Condition) -> Tensor:
+    """Give back the colour that the latent code cannot carry, f32[T,3,H,W] in [0,1].
 
-    Where a point was seen and the generated depth is within a quarter of it, the measured depth is taken; farther apart, the
-    generated depth is kept unless the pixel's neighbourhood of generated depths reaches the measured one (an edge that is a
-    pixel off). Sky pixels without a measurement get `far_m`.
+    rgb      generated; carried: the condition's colour after coding and decoding, both f32[T,3,H,W]
+    Where the condition is seen and the generated colour agrees with `carried`, the difference between the condition and
+    `carried` (one axis of hue, fine texture) is added; the weight falls to nothing at a disagreement of 0.15.
     """
-    measured = condition.depth
-    highest = functional.max_pool2d(depth, 3, stride=1, padding=1) * 1.25
-    lowest = -functional.max_pool2d(-depth, 3, stride=1, padding=1) / 1.25
-    agrees = condition.valid & (measured >= lowest) & (measured <= highest)
-    settled = torch.where(agrees, measured, depth)
+    seen = condition.valid if condition.warped is None else condition.valid | condition.warped
+    apart = (rgb - carried).abs().amax(1, keepdim=True)
+    apart = functional.avg_pool2d(apart, 3, stride=1, padding=1, count_include_pad=False)
+    weight = (1 - apart / 0.15).clamp(0, 1) * seen
+    return (rgb + weight * (condition.color - carried)).clamp(0, 1)
+
+
+def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, far_m: float) -> Tensor:
+    """Generated depth brought to terms with what was measured, f32[T,1,H,W] metres.
+
+    Where a point was seen its depth is taken: the condition's points have passed a visibility test. Elsewhere the nearest
+    point's depth (`condition.depth` is filled) is taken if it lies within the range of generated depths of the 3x3
+    neighbourhood, widened by 30 %: on one and the same surface the measured neighbour is more exact, beyond an edge the
+    generated depth stands. Sky pixels without a measurement get `far_m`.
+    """
+    highest = functional.max_pool2d(depth, 3, stride=1, padding=1) * 1.3
+    lowest = -functional.max_pool2d(-depth, 3, stride=1, padding=1) / 1.3
+    same_surface = (condition.depth <= highest) & (condition.depth >= lowest)
+    settled = torch.where(condition.valid | same_surface, condition.depth, depth)
     if semantics is not None:
         sky = (semantics == SKY).unsqueeze(1) & ~condition.valid
         settled = torch.where(sky, torch.full_like(settled, far_m), settled)
@@ -712,6 +735,17 @@ def load(path: Path | str = "embedded") -> MDM:
         raise InputError("weights do not fit the configuration", where=str(folder), got=", ".join(wrong[:6]))
     model.load_state_dict({k: v.to(wanted[k].dtype) for k, v in state.items()})
     return model.eval()
+
+
+def facts(path: Path | str) -> dict[str, Any]:
+    """The facts (recipe, scores) that `save` was given for a model folder or "embedded"."""
+    content = store.read_json((EMBEDDED if str(path) == "embedded" else Path(path)) / MODEL_FILE)
+    return dict(content.get("facts", {}))
+
+
+def digest(path: Path | str) -> str:
+    """Digest of a model's description, which holds the hashes of its weights."""
+    return store.digest((EMBEDDED if str(path) == "embedded" else Path(path)) / MODEL_FILE)
 
 
 def truth_shares(semantics: Tensor) -> Tensor:

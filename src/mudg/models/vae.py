@@ -238,8 +238,8 @@ class PatchCodec(nn.Module):
         lead = next(iter(latents.values())).shape[:-3]
         flat: dict[Modality, Tensor] = {m: z.reshape(-1, *z.shape[-3:]) for m, z in latents.items()}
         rgb, depth, scores = self.decode_raw(flat)
-        out_rgb = ((rgb + 1) / 2).clamp(0, 1).unflatten(0, lead) if "rgb" in latents else None
-        out_depth = code_to_depth(depth, self.config).unflatten(0, lead) if "depth" in latents else None
+        out_rgb = ((rgb + 1) / 2).clamp(0, 1).reshape(*lead, *rgb.shape[1:]) if "rgb" in latents else None
+        out_depth = code_to_depth(depth, self.config).reshape(*lead, *depth.shape[1:]) if "depth" in latents else None
         if "semantics" not in latents:
             return Decoded(out_rgb, out_depth, None, None)
         if self.config.semantics_code == "palette":
@@ -248,8 +248,9 @@ class PatchCodec(nn.Module):
             colours = functional.pixel_shuffle(image, 2).permute(0, 2, 3, 1)
             scores = -torch.cdist(colours.flatten(0, 2), self.palette).unflatten(0, colours.shape[:3]).permute(0, 3, 1, 2)  # type: ignore[arg-type]
         best = scores.softmax(1).topk(2, dim=1)
-        margin = (best.values[:, :1] - best.values[:, 1:]).unflatten(0, lead)
-        return Decoded(out_rgb, out_depth, best.indices[:, 0].unflatten(0, lead), margin)
+        margin = best.values[:, :1] - best.values[:, 1:]
+        size = scores.shape[-2:]
+        return Decoded(out_rgb, out_depth, best.indices[:, 0].reshape(*lead, *size), margin.reshape(*lead, 1, *size))
 
 
 def semantic_shares(ids: Tensor, factor: int = 2) -> Tensor:
@@ -263,7 +264,7 @@ def semantic_shares(ids: Tensor, factor: int = 2) -> Tensor:
     for place in range(factor**2):
         counts.scatter_add_(1, cells[:, place : place + 1], torch.ones_like(counts[:, :1]))
     share = counts[:, :CLASSES]
-    return (share / share.sum(1, keepdim=True).clamp(min=1.0)).unflatten(0, lead)
+    return (share / share.sum(1, keepdim=True).clamp(min=1.0)).reshape(*lead, CLASSES, *cells.shape[-2:])
 
 
 CODECS: dict[str, type[PatchCodec]] = {"patch": PatchCodec}

@@ -290,114 +290,125 @@ inline bool intersect_convex(const Shape& s, const Plane* planes, Vec3 o, Vec3 d
   return true;
 }
 
+inline bool intersect_box(const Shape& s, const ShapePools& pools, Vec3 o, Vec3 d, float t_min, float t_max, Hit& hit) {
+  const Vec3 lo = to_yaw_frame(o - s.center, s.cs, s.sn), ld = to_yaw_frame(d, s.cs, s.sn);
+  if (s.type == kFacade) {
+    if (!intersect_facade(s, pools.facades[s.first], lo, ld, t_min, t_max, hit)) return false;
+  } else {
+    float t;
+    uint8_t face;
+    if (!enter_box(lo, ld, s.half, t_min, t_max, t, face)) return false;
+    hit.t = t;
+    hit.face = face;
+    hit.normal = face_normal(face);
+    hit.local = lo + ld * t;
+  }
+  hit.normal = from_yaw_frame(hit.normal, s.cs, s.sn);
+  return true;
+}
+
+inline bool intersect_cylinder(const Shape& s, Vec3 o, Vec3 d, float t_min, float t_max, Hit& hit) {
+  // from the point of the ray next to the base: the quadratic stays accurate far away
+  const float shift = dot(s.center - o, d);
+  const Vec3 r = o + d * shift - s.center, axis = s.half;
+  const float da = dot(d, axis), ra = dot(r, axis);
+  const float a = 1.0f - da * da, b = dot(r, d) - ra * da, c = dot(r, r) - ra * ra - s.p1 * s.p1;
+  if (a > 1e-9f) {
+    const float q = b * b - a * c;
+    if (q <= 0) return false;
+    const float t = (-b - std::sqrt(q)) / a, y = ra + t * da;
+    if (y >= 0 && y <= s.p0) {
+      if (t + shift <= t_min || t + shift >= t_max) return false;
+      hit.t = t + shift;
+      hit.local = r + d * t;
+      hit.normal = (hit.local - axis * y) * (1.0f / s.p1);
+      hit.face = 6;
+      hit.wall_u = y;
+      return true;
+    }
+  }
+  if (std::fabs(da) < 1e-9f) return false;
+  const float t = ((da > 0 ? 0.0f : s.p0) - ra) / da;
+  if (t + shift <= t_min || t + shift >= t_max) return false;
+  const Vec3 p = r + d * t;
+  const float along = dot(p, axis);
+  if (dot(p, p) - along * along > s.p1 * s.p1) return false;
+  hit.t = t + shift;
+  hit.local = p;
+  hit.normal = axis * (da > 0 ? -1.0f : 1.0f);
+  hit.face = da > 0 ? 4 : 5;
+  hit.wall_u = along;
+  return true;
+}
+
+inline bool intersect_ellipsoid(const Shape& s, Vec3 o, Vec3 d, float t_min, float t_max, Hit& hit) {
+  const float shift = dot(s.center - o, d);
+  const Vec3 lo = to_yaw_frame(o + d * shift - s.center, s.cs, s.sn), ld = to_yaw_frame(d, s.cs, s.sn);
+  const Vec3 inv{1.0f / s.half.x, 1.0f / s.half.y, 1.0f / s.half.z};
+  const Vec3 so = lo * inv, sd = ld * inv;
+  const float a = dot(sd, sd), b = dot(so, sd), c = dot(so, so) - 1.0f, q = b * b - a * c;
+  if (q <= 0) return false;
+  const float root = std::sqrt(q), t0 = (-b - root) / a, t1 = (-b + root) / a;
+  if (s.type == kEllipsoid) {
+    if (t0 + shift <= t_min || t0 + shift >= t_max) return false;
+    hit.t = t0 + shift;
+    hit.local = lo + ld * t0;
+    hit.normal = from_yaw_frame(normalize(hit.local * inv * inv), s.cs, s.sn);
+    return true;
+  }
+  const float in = std::max(t0, t_min - shift), out = std::min(t1, t_max - shift);
+  if (in >= out || !march_leaves(s, lo, ld, in, out, true, hit)) return false;
+  hit.t += shift;
+  hit.normal = from_yaw_frame(hit.normal, s.cs, s.sn);
+  return true;
+}
+
+inline bool intersect_leaf_box(const Shape& s, Vec3 o, Vec3 d, float t_min, float t_max, Hit& hit) {
+  const Vec3 lo = to_yaw_frame(o - s.center, s.cs, s.sn), ld = to_yaw_frame(d, s.cs, s.sn);
+  float t0 = t_min, t1 = t_max;
+  const float oo[3] = {lo.x, lo.y, lo.z}, dd[3] = {ld.x, ld.y, ld.z}, hh[3] = {s.half.x, s.half.y, s.half.z};
+  for (int a = 0; a < 3; ++a) {
+    if (std::fabs(dd[a]) < 1e-9f) {
+      if (std::fabs(oo[a]) > hh[a]) return false;
+      continue;
+    }
+    const float inv = 1.0f / dd[a], ta = (-hh[a] - oo[a]) * inv, tb = (hh[a] - oo[a]) * inv;
+    t0 = std::max(t0, std::min(ta, tb));
+    t1 = std::min(t1, std::max(ta, tb));
+  }
+  if (t0 >= t1 || !march_leaves(s, lo, ld, t0, t1, false, hit)) return false;
+  hit.normal = from_yaw_frame(hit.normal, s.cs, s.sn);
+  return true;
+}
+
+inline bool intersect_card(const Shape& s, Vec3 o, Vec3 d, float t_min, float t_max, Hit& hit) {
+  const Vec3 n{s.cs, s.sn, 0};
+  const float rate = dot(d, n);
+  if (std::fabs(rate) < 1e-9f) return false;
+  const Vec3 r = o - s.center;
+  const float t = -dot(r, n) / rate;
+  if (t <= t_min || t >= t_max) return false;
+  const Vec3 p = r + d * t;
+  const float a = -s.sn * p.x + s.cs * p.y;
+  if (std::fabs(a) > s.half.y || std::fabs(p.z) > s.half.z || !card_solid(s, a, p.z)) return false;
+  hit.t = t;
+  hit.normal = rate > 0 ? n * -1.0f : n;
+  hit.face = rate > 0 ? 0 : 1;  // 1: seen from the front
+  hit.local = {0, a, p.z};
+  return true;
+}
+
+// Nearest entry of the ray into a shape within (t_min, t_max); a shape that holds the origin is not hit from inside.
 inline bool intersect(const Shape& s, const ShapePools& pools, Vec3 o, Vec3 d, float t_min, float t_max, Hit& hit) {
   switch (s.type) {
     case kBox:
-    case kFacade: {
-      const Vec3 lo = to_yaw_frame(o - s.center, s.cs, s.sn), ld = to_yaw_frame(d, s.cs, s.sn);
-      if (s.type == kFacade) {
-        if (!intersect_facade(s, pools.facades[s.first], lo, ld, t_min, t_max, hit)) return false;
-      } else {
-        float t;
-        uint8_t face;
-        if (!enter_box(lo, ld, s.half, t_min, t_max, t, face)) return false;
-        hit.t = t;
-        hit.face = face;
-        hit.normal = face_normal(face);
-        hit.local = lo + ld * t;
-      }
-      hit.normal = from_yaw_frame(hit.normal, s.cs, s.sn);
-      return true;
-    }
-    case kCylinder: {
-      // from the point of the ray next to the base: the quadratic stays accurate far away
-      const float shift = dot(s.center - o, d);
-      const Vec3 r = o + d * shift - s.center, axis = s.half;
-      const float da = dot(d, axis), ra = dot(r, axis);
-      const float a = 1.0f - da * da, b = dot(r, d) - ra * da, c = dot(r, r) - ra * ra - s.p1 * s.p1;
-      if (a > 1e-9f) {
-        const float q = b * b - a * c;
-        if (q <= 0) return false;
-        const float t = (-b - std::sqrt(q)) / a, y = ra + t * da;
-        if (y >= 0 && y <= s.p0) {
-          if (t + shift <= t_min || t + shift >= t_max) return false;
-          hit.t = t + shift;
-          hit.local = r + d * t;
-          hit.normal = (hit.local - axis * y) * (1.0f / s.p1);
-          hit.face = 6;
-          hit.wall_u = y;
-          return true;
-        }
-      }
-      if (std::fabs(da) < 1e-9f) return false;
-      const float t = ((da > 0 ? 0.0f : s.p0) - ra) / da;
-      if (t + shift <= t_min || t + shift >= t_max) return false;
-      const Vec3 p = r + d * t;
-      const float along = dot(p, axis);
-      if (dot(p, p) - along * along > s.p1 * s.p1) return false;
-      hit.t = t + shift;
-      hit.local = p;
-      hit.normal = axis * (da > 0 ? -1.0f : 1.0f);
-      hit.face = da > 0 ? 4 : 5;
-      hit.wall_u = along;
-      return true;
-    }
+    case kFacade: return intersect_box(s, pools, o, d, t_min, t_max, hit);
+    case kCylinder: return intersect_cylinder(s, o, d, t_min, t_max, hit);
     case kEllipsoid:
-    case kLeafEllipsoid: {
-      const float shift = dot(s.center - o, d);
-      const Vec3 lo = to_yaw_frame(o + d * shift - s.center, s.cs, s.sn), ld = to_yaw_frame(d, s.cs, s.sn);
-      const Vec3 inv{1.0f / s.half.x, 1.0f / s.half.y, 1.0f / s.half.z};
-      const Vec3 so = lo * inv, sd = ld * inv;
-      const float a = dot(sd, sd), b = dot(so, sd), c = dot(so, so) - 1.0f, q = b * b - a * c;
-      if (q <= 0) return false;
-      const float root = std::sqrt(q), t0 = (-b - root) / a, t1 = (-b + root) / a;
-      if (s.type == kEllipsoid) {
-        if (t0 + shift <= t_min || t0 + shift >= t_max) return false;
-        hit.t = t0 + shift;
-        hit.local = lo + ld * t0;
-        hit.normal = from_yaw_frame(normalize(hit.local * inv * inv), s.cs, s.sn);
-        return true;
-      }
-      const float in = std::max(t0, t_min - shift), out = std::min(t1, t_max - shift);
-      if (in >= out || !march_leaves(s, lo, ld, in, out, true, hit)) return false;
-      hit.t += shift;
-      hit.normal = from_yaw_frame(hit.normal, s.cs, s.sn);
-      return true;
-    }
-    case kLeafBox: {
-      const Vec3 lo = to_yaw_frame(o - s.center, s.cs, s.sn), ld = to_yaw_frame(d, s.cs, s.sn);
-      float t0 = t_min, t1 = t_max;
-      const float oo[3] = {lo.x, lo.y, lo.z}, dd[3] = {ld.x, ld.y, ld.z}, hh[3] = {s.half.x, s.half.y, s.half.z};
-      for (int a = 0; a < 3; ++a) {
-        if (std::fabs(dd[a]) < 1e-9f) {
-          if (std::fabs(oo[a]) > hh[a]) return false;
-          continue;
-        }
-        const float inv = 1.0f / dd[a], ta = (-hh[a] - oo[a]) * inv, tb = (hh[a] - oo[a]) * inv;
-        t0 = std::max(t0, std::min(ta, tb));
-        t1 = std::min(t1, std::max(ta, tb));
-      }
-      if (t0 >= t1 || !march_leaves(s, lo, ld, t0, t1, false, hit)) return false;
-      hit.normal = from_yaw_frame(hit.normal, s.cs, s.sn);
-      return true;
-    }
+    case kLeafEllipsoid: return intersect_ellipsoid(s, o, d, t_min, t_max, hit);
+    case kLeafBox: return intersect_leaf_box(s, o, d, t_min, t_max, hit);
     case kConvex: return intersect_convex(s, pools.planes.data(), o, d, t_min, t_max, hit);
-    case kCard: {
-      const Vec3 n{s.cs, s.sn, 0};
-      const float rate = dot(d, n);
-      if (std::fabs(rate) < 1e-9f) return false;
-      const Vec3 r = o - s.center;
-      const float t = -dot(r, n) / rate;
-      if (t <= t_min || t >= t_max) return false;
-      const Vec3 p = r + d * t;
-      const float a = -s.sn * p.x + s.cs * p.y;
-      if (std::fabs(a) > s.half.y || std::fabs(p.z) > s.half.z || !card_solid(s, a, p.z)) return false;
-      hit.t = t;
-      hit.normal = rate > 0 ? n * -1.0f : n;
-      hit.face = rate > 0 ? 0 : 1;  // 1: seen from the front
-      hit.local = {0, a, p.z};
-      return true;
-    }
+    case kCard: return intersect_card(s, o, d, t_min, t_max, hit);
   }
   return false;
 }

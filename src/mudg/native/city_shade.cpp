@@ -275,6 +275,81 @@ void shade_sign(const Look& look, const Hit& hit, Surface& s) {
   }
 }
 
+void shade_foliage(const World& world, const Look& look, const Hit& hit, Surface& s) {
+  const int seed = static_cast<int>(look.seed);
+  const Vec3 p = hit.local;
+  const Shape& crown = world.shapes[hit.prim];
+  const float leaf = crown.type == kEllipsoid ? 0.4f + 0.5f * noise2(p.x * 0.3f + p.z, p.y * 0.3f - p.z, seed + 1) : hit.part * (1.0f / 255.0f);
+  if (crown.type == kLeafEllipsoid) {
+    const Vec3 out = normalize(Vec3{p.x / square(crown.half.x), p.y / square(crown.half.y), p.z / square(crown.half.z)});
+    s.normal = normalize(hit.normal * 0.6f + from_yaw_frame(out, crown.cs, crown.sn));
+  }
+  const float clump = noise2(p.x * 1.1f + p.z * 0.7f, p.y * 1.1f - p.z * 0.4f, seed);
+  s.albedo = look.rgb * (0.55f + 0.55f * leaf + 0.45f * clump);
+  s.albedo.x *= 0.9f + 0.35f * clump;
+  s.thin = 0.35f;
+  s.occlusion = 0.55f + 0.45f * leaf;
+}
+
+void shade_tyre(const World& world, const Look& look, const Hit& hit, Surface& s) {
+  const Vec3 p = hit.local;
+  if (hit.face == 4 || hit.face == 5) {
+    const Shape& shape = world.shapes[hit.prim];
+    const Vec3 q = p - shape.half * hit.wall_u;
+    const float r = std::sqrt(dot(q, q)) / shape.p1;
+    if (r < 0.66f) {
+      const float angle = std::atan2(q.z, q.x);
+      const bool spoke = std::fabs(fract(angle * (5.0f / (2 * kPi))) - 0.5f) < 0.30f || r > 0.58f || r < 0.16f;
+      s.albedo = spoke ? look.rgb2 : grey(0.03f);
+      s.gloss = 0.08f;
+    }
+  }
+}
+
+void shade_cargo(const World& world, const Look& look, const Hit& hit, float fp, Surface& s) {
+  const int seed = static_cast<int>(look.seed);
+  const Vec3 p = hit.local;
+  const float tone = 1 + 0.12f * fbm_filtered(p.x, p.z, 0.7f, fp, seed);
+  s.albedo = look.rgb * tone;
+  if (hit.face / 2 == 1 && fract(p.x / 0.55f) < 0.04f) s.albedo *= 0.82f;
+  if (hit.face == 0) {
+    if (std::fabs(p.y) < 0.012f) s.albedo *= 0.4f;
+    const Shape& shape = world.shapes[hit.prim];
+    if (p.z < -shape.half.z + 0.16f) s.albedo = std::fabs(p.y) > 0.75f * shape.half.y ? Vec3{0.4f, 0.015f, 0.015f} : grey(0.05f);
+  }
+  if (hit.face / 2 == 1 && hash01(seed, 8, 8) < 0.5f && std::fabs(p.z) < 0.35f && std::fabs(p.x) < 1.6f) s.albedo = Vec3{0.5f * hash01(seed, 1, 2), 0.3f * hash01(seed, 1, 3), 0.5f * hash01(seed, 1, 4)};
+}
+
+void shade_wood(const Look& look, const Hit& hit, float fp, Surface& s) {
+  const int seed = static_cast<int>(look.seed);
+  const Vec3 p = hit.local;
+  const float plank = std::floor(p.x / 0.14f);
+  s.albedo = look.rgb * (1 + 0.35f * (hash01(static_cast<int>(plank), 2, seed) - 0.5f) * clamp01(1.4f - fp * 5) + 0.3f * noise_filtered(p.x * 5, p.z * 0.6f, 4.0f, fp, seed));
+  if (fract(p.x / 0.14f) < 0.07f) s.albedo *= 0.55f;
+}
+
+void shade_tiles(const Look& look, Vec3 point, float fp, Surface& s) {
+  const int seed = static_cast<int>(look.seed);
+  if (std::fabs(s.normal.z) > 0.2f) {
+    const float row = point.z / 0.17f, tone = 1 + 0.3f * (hash01(ifloor(row), ifloor((point.x + point.y) * 2.2f), seed) - 0.5f) * clamp01(1.5f - fp * 4);
+    s.albedo = look.rgb * tone;
+    if (fract(row) < 0.12f) s.albedo *= 1 - 0.35f * clamp01(1.3f - fp * 4);
+  } else {
+    s.albedo = mix(look.rgb, grey(0.45f), 0.8f);
+  }
+}
+
+void shade_shop_sign(const World& world, const Look& look, const Hit& hit, Surface& s) {
+  const int seed = static_cast<int>(look.seed);
+  const Vec3 p = hit.local;
+  s.albedo = look.rgb;
+  const Shape& shape = world.shapes[hit.prim];
+  const float half = hit.face / 2 == 1 ? shape.half.x : shape.half.y, u = (hit.face / 2 == 1 ? p.x : p.y) / half, v = p.z / shape.half.z;
+  const Vec3 ink = dot(look.rgb, grey(0.33f)) > 0.25f ? grey(0.03f) : grey(0.75f);
+  if (std::fabs(u) < 0.62f && std::fabs(v) < 0.5f && hash01(ifloor(u * 10 * half), ifloor(v * 2), seed) < 0.55f && fract(u * 10 * half) > 0.25f) s.albedo = ink;
+  s.emission = s.albedo * (0.9f * world.light.night);
+}
+
 }  // namespace
 
 // Light of the sky in a mirrored direction; what stands along the street darkens it near the horizon.
@@ -294,84 +369,25 @@ Surface shade_surface(const World& world, const Hit& hit, Vec3 point, Vec3 d, fl
   const Vec3 p = hit.local;
   switch (look.material) {
     case kMatFacade: shade_facade(world, look, hit, point, d, fp, s); break;
-    case kMatFoliage: {
-      const Shape& crown = world.shapes[hit.prim];
-      const float leaf = crown.type == kEllipsoid ? 0.4f + 0.5f * noise2(p.x * 0.3f + p.z, p.y * 0.3f - p.z, seed + 1) : hit.part * (1.0f / 255.0f);
-      if (crown.type == kLeafEllipsoid) {
-        const Vec3 out = normalize(Vec3{p.x / square(crown.half.x), p.y / square(crown.half.y), p.z / square(crown.half.z)});
-        s.normal = normalize(hit.normal * 0.6f + from_yaw_frame(out, crown.cs, crown.sn));
-      }
-      const float clump = noise2(p.x * 1.1f + p.z * 0.7f, p.y * 1.1f - p.z * 0.4f, seed);
-      s.albedo = look.rgb * (0.55f + 0.55f * leaf + 0.45f * clump);
-      s.albedo.x *= 0.9f + 0.35f * clump;
-      s.thin = 0.35f;
-      s.occlusion = 0.55f + 0.45f * leaf;
-      break;
-    }
+    case kMatFoliage: shade_foliage(world, look, hit, s); break;
     case kMatBark: s.albedo = look.rgb * (1 + 0.9f * noise_filtered(p.x * 6 + p.y * 6, point.z, 2.2f, fp, seed)); break;
     case kMatMetal: s.gloss = 0.06f; break;
     case kMatCarBody: shade_car_body(world, look, hit, d, s); break;
     case kMatCarCabin: shade_car_cabin(look, hit, d, s); break;
-    case kMatTyre: {
-      if (hit.face == 4 || hit.face == 5) {
-        const Shape& shape = world.shapes[hit.prim];
-        const Vec3 q = p - shape.half * hit.wall_u;
-        const float r = std::sqrt(dot(q, q)) / shape.p1;
-        if (r < 0.66f) {
-          const float angle = std::atan2(q.z, q.x);
-          const bool spoke = std::fabs(fract(angle * (5.0f / (2 * kPi))) - 0.5f) < 0.30f || r > 0.58f || r < 0.16f;
-          s.albedo = spoke ? look.rgb2 : grey(0.03f);
-          s.gloss = 0.08f;
-        }
-      }
-      break;
-    }
+    case kMatTyre: shade_tyre(world, look, hit, s); break;
     case kMatBus: shade_big_vehicle(world, look, hit, hit.normal, d, s); break;
-    case kMatCargo: {
-      const float tone = 1 + 0.12f * fbm_filtered(p.x, p.z, 0.7f, fp, seed);
-      s.albedo = look.rgb * tone;
-      if (hit.face / 2 == 1 && fract(p.x / 0.55f) < 0.04f) s.albedo *= 0.82f;
-      if (hit.face == 0) {
-        if (std::fabs(p.y) < 0.012f) s.albedo *= 0.4f;
-        const Shape& shape = world.shapes[hit.prim];
-        if (p.z < -shape.half.z + 0.16f) s.albedo = std::fabs(p.y) > 0.75f * shape.half.y ? Vec3{0.4f, 0.015f, 0.015f} : grey(0.05f);
-      }
-      if (hit.face / 2 == 1 && hash01(seed, 8, 8) < 0.5f && std::fabs(p.z) < 0.35f && std::fabs(p.x) < 1.6f) s.albedo = Vec3{0.5f * hash01(seed, 1, 2), 0.3f * hash01(seed, 1, 3), 0.5f * hash01(seed, 1, 4)};
-      break;
-    }
+    case kMatCargo: shade_cargo(world, look, hit, fp, s); break;
     case kMatBrick: shade_brick(look, point, hit.face / 2 == 0 ? p.y : p.x, p.z + 3, fp, s); break;
-    case kMatWood: {
-      const float plank = std::floor(p.x / 0.14f);
-      s.albedo = look.rgb * (1 + 0.35f * (hash01(static_cast<int>(plank), 2, seed) - 0.5f) * clamp01(1.4f - fp * 5) + 0.3f * noise_filtered(p.x * 5, p.z * 0.6f, 4.0f, fp, seed));
-      if (fract(p.x / 0.14f) < 0.07f) s.albedo *= 0.55f;
-      break;
-    }
+    case kMatWood: shade_wood(look, hit, fp, s); break;
     case kMatSign: shade_sign(look, hit, s); break;
     case kMatSignal:
       if (look.p0 > 0.5f) s.emission = look.rgb * 2.2f;
       else s.albedo = look.rgb * 0.09f;
       break;
     case kMatLampHead: s.emission = Vec3{1.0f, 0.82f, 0.55f} * (world.light.night * 2.5f); break;
-    case kMatRoofTiles: {
-      if (std::fabs(s.normal.z) > 0.2f) {
-        const float row = point.z / 0.17f, tone = 1 + 0.3f * (hash01(ifloor(row), ifloor((point.x + point.y) * 2.2f), seed) - 0.5f) * clamp01(1.5f - fp * 4);
-        s.albedo = look.rgb * tone;
-        if (fract(row) < 0.12f) s.albedo *= 1 - 0.35f * clamp01(1.3f - fp * 4);
-      } else {
-        s.albedo = mix(look.rgb, grey(0.45f), 0.8f);
-      }
-      break;
-    }
+    case kMatRoofTiles: shade_tiles(look, point, fp, s); break;
     case kMatCloth: s.albedo = look.rgb * (1 + 0.35f * noise_filtered(p.x * 3 + p.y * 2, p.z * 3, 3.0f, fp, seed)); break;
-    case kMatShopSign: {
-      s.albedo = look.rgb;
-      const Shape& shape = world.shapes[hit.prim];
-      const float half = hit.face / 2 == 1 ? shape.half.x : shape.half.y, u = (hit.face / 2 == 1 ? p.x : p.y) / half, v = p.z / shape.half.z;
-      const Vec3 ink = dot(look.rgb, grey(0.33f)) > 0.25f ? grey(0.03f) : grey(0.75f);
-      if (std::fabs(u) < 0.62f && std::fabs(v) < 0.5f && hash01(ifloor(u * 10 * half), ifloor(v * 2), seed) < 0.55f && fract(u * 10 * half) > 0.25f) s.albedo = ink;
-      s.emission = s.albedo * (0.9f * world.light.night);
-      break;
-    }
+    case kMatShopSign: shade_shop_sign(world, look, hit, s); break;
     case kMatConcrete: s.albedo = look.rgb * (1 + 0.4f * fbm_filtered(point.x + point.y, point.z, 0.9f, fp, seed)); break;
     case kMatAwning:
       if (fract((point.x + point.y) / 0.5f) < 0.5f) s.albedo = grey(0.6f);

@@ -27,9 +27,7 @@ MUDG_INLINE unsigned project_lanes(const RasterScene& s, int first, SplatLanes& 
   for (int k = 0; k < 3; ++k) poison = mul_add(means[k], zero, mul_add(p.scale[k], zero, poison));
   for (int k = 0; k < 4; ++k) poison = mul_add(quats[k], zero, poison);
 
-  const Floats det = symmetric_determinant(p.cov_xx, p.cov_xy, p.cov_yy);
-  const Floats safe_det = max_of(det, splat(1e-10f));
-  if (s.antialias) opacity = opacity * compensation_of(p, safe_det).factor;
+  if (s.antialias) opacity = opacity * compensation_of(p);
   const Floats log_opacity = log2_of(max_of(opacity, splat(1e-30f)));
   const Floats inv_cov_yy = splat(1.0f) / p.cov_yy;
   // Squared Mahalanobis radius at which alpha falls to 1/255.
@@ -39,8 +37,8 @@ MUDG_INLINE unsigned project_lanes(const RasterScene& s, int first, SplatLanes& 
   store(out.depth, p.cam[2]);
   store(out.opacity, opacity);
   store(out.log_opacity, log_opacity);
-  store(out.determinant, det);
-  store(out.conic_xx, p.cov_yy / safe_det);
+  store(out.determinant, p.det);
+  store(out.conic_xx, p.cov_yy / max_of(p.det, splat(1e-10f)));
   store(out.shear, zero - p.cov_xy * inv_cov_yy);
   store(out.inv_cov_yy, inv_cov_yy);
   store(out.lean, p.cov_xy / p.cov_xx);

@@ -137,12 +137,13 @@ struct CovarianceGradient {
 
 // v_cov = -inv(cov) v_inverse inv(cov). Needle-like ellipses lose all digits here in float32, so it runs in double.
 MUDG_INLINE CovarianceGradient covariance_backward(const Projection& p, const GroupGradient& group) {
-  alignas(64) float xx[kLanes], xy[kLanes], yy[kLanes], out_xx[kLanes], out_xy[kLanes], out_yy[kLanes];
+  alignas(64) float xx[kLanes], xy[kLanes], yy[kLanes], det[kLanes], out_xx[kLanes], out_xy[kLanes], out_yy[kLanes];
   store(xx, p.cov_xx);
   store(xy, p.cov_xy);
   store(yy, p.cov_yy);
+  store(det, max_of(p.det, splat(1e-10f)));
   for (int l = 0; l < kLanes; ++l) {
-    const double a = xx[l], b = xy[l], d = yy[l], det = a * d - b * b, inv = 1.0 / (det > 1e-10 ? det : 1e-10);
+    const double a = xx[l], b = xy[l], d = yy[l], inv = 1.0 / det[l];
     const double ia = d * inv, ib = -b * inv, id = a * inv;
     const double v0 = group.inverse[0][l], v1 = 0.5 * group.inverse[1][l], v2 = group.inverse[2][l];
     const double t00 = ia * v0 + ib * v1, t01 = ia * v1 + ib * v2, t10 = ib * v0 + id * v1, t11 = ib * v1 + id * v2;
@@ -155,15 +156,15 @@ MUDG_INLINE CovarianceGradient covariance_backward(const Projection& p, const Gr
 
 // Splits the gradient of the compensated opacity into that of the opacity and a part of the covariance's.
 MUDG_INLINE Floats compensation_backward(const Projection& p, Floats opacity, Floats of_opacity, CovarianceGradient& of_cov) {
-  const Floats det = max_of(symmetric_determinant(p.cov_xx, p.cov_xy, p.cov_yy), splat(1e-10f));
-  const Compensation comp = compensation_of(p, det);
-  const Mask live = comp.factor > splat(1.5e-3f);
-  const Floats half = splat(0.5f) * of_opacity * opacity * comp.factor;  // gradient of ln(sharp_det / det)
-  const Floats inv_sharp = splat(1.0f) / select(live, comp.sharp_det, splat(1.0f)), inv_det = splat(1.0f) / det;
+  const Floats factor = compensation_of(p);
+  const Mask live = factor > splat(1.5e-3f);
+  const Floats half = splat(0.5f) * of_opacity * opacity * factor;  // gradient of ln(sharp_det / det)
+  const Floats inv_sharp = splat(1.0f) / select(live, p.sharp_det, splat(1.0f));
+  const Floats inv_det = splat(1.0f) / max_of(p.det, splat(1e-10f));
   of_cov.xx = of_cov.xx + keep(live, half * (p.sharp_yy * inv_sharp - p.cov_yy * inv_det));
   of_cov.yy = of_cov.yy + keep(live, half * (p.sharp_xx * inv_sharp - p.cov_xx * inv_det));
   of_cov.xy = of_cov.xy + keep(live, half * (p.cov_xy * inv_det - p.sharp_xy * inv_sharp));
-  return of_opacity * comp.factor;
+  return of_opacity * factor;
 }
 
 MUDG_INLINE void quaternion_backward(const Projection& p, const Floats v[3][3], Floats out[4]) {

@@ -43,6 +43,7 @@ struct Projection {
   Floats image_from_unit[2][3];  // J R Q S: maps the unit sphere to the ellipse
   Floats sharp_xx, sharp_xy, sharp_yy;  // covariance in pixels^2
   Floats cov_xx, cov_xy, cov_yy;        // plus the blur
+  Floats sharp_det, det;                // determinants of both
   Floats mean_x, mean_y;
 };
 
@@ -112,18 +113,17 @@ MUDG_INLINE void project_sixteen(const RasterScene& s, int first, Projection& p,
   p.cov_xx = p.sharp_xx + splat(s.blur_px2);
   p.cov_xy = p.sharp_xy;
   p.cov_yy = p.sharp_yy + splat(s.blur_px2);
-}
-
-// Anti-aliasing: the blur must not add light, so opacity shrinks by sqrt(det(sharp) / det(blurred)). The determinant of the
-// sharp covariance is the squared cross product of the two rows, which does not cancel. Below 1e-3 nothing is visible anyway.
-struct Compensation {
-  Floats sharp_det, factor;
-};
-MUDG_INLINE Compensation compensation_of(const Projection& p, Floats det) {
+  // By way of the cross product of the two rows: xx * yy - xy * xy would lose all digits for a long needle.
   const Floats *a = p.image_from_unit[0], *b = p.image_from_unit[1];
   const Floats cross[3] = {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-  const Floats sharp_det = dot3(cross, cross);
-  return {sharp_det, sqrt_of(max_of(sharp_det / det, splat(1e-6f)))};
+  p.sharp_det = dot3(cross, cross);
+  p.det = mul_add(splat(s.blur_px2), p.sharp_xx + p.cov_yy, p.sharp_det);
+}
+
+// Anti-aliasing: the blur must not add light, so opacity shrinks by sqrt(det(sharp) / det(blurred)). Below 1e-3 nothing is
+// visible anyway.
+MUDG_INLINE Floats compensation_of(const Projection& p) {
+  return sqrt_of(max_of(p.sharp_det / max_of(p.det, splat(1e-10f)), splat(1e-6f)));
 }
 
 }  // namespace

@@ -45,13 +45,6 @@ MUDG_INLINE Floats log2_of(Floats x) {
 // First `count` lanes set.
 MUDG_INLINE Mask first_lanes(int count) { return load(kLaneIndex) < splat(static_cast<float>(count)); }
 
-// a * c - b * b without cancellation (W. Kahan's fused form; exact to two units in the last place where fma is fused).
-MUDG_INLINE Floats symmetric_determinant(Floats a, Floats b, Floats c) {
-  const Floats square = b * b;
-  const Floats error = neg_mul_add(b, b, square);
-  return mul_add(a, c, splat(0.0f) - square) + error;
-}
-
 template <class T>
 MUDG_INLINE T smaller(T a, T b) {
   return b < a ? b : a;

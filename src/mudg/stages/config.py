@@ -78,6 +78,8 @@ class LearnConfig:
 
     seed: int = 0
     """Fixes the cities, the weights' start and every draw."""
+    start: str = ""
+    """Folder of a model to continue from, or "embedded" for the shipped one (empty = train from nothing)."""
     cities: int = Field(default=240, ge=1)
     """Generated cities to train on."""
     first_cities: int = Field(default=40, ge=1)
@@ -121,6 +123,8 @@ class LearnConfig:
     warmup_steps: int = Field(default=100, ge=0)
     decay_share: float = Field(default=0.5, gt=0, le=1)
     """Share of the steps, at the end, over which the learning rate falls."""
+    balance: float = Field(default=0.0, ge=0, le=1)
+    """How strongly rare classes count in the semantic loss: 0 = as often as they occur, 1 = all classes alike."""
     average_decay: float = Field(default=0.998, ge=0, lt=1)
     """Decay of the moving average of the weights."""
     checkpoint_every: int = Field(default=100, ge=1)
@@ -139,8 +143,8 @@ class SynthesizeConfig:
     """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded path."""
     model: str = "embedded"
     """The model shipped with the package, or the folder of one made by learn."""
-    steps: int = Field(default=8, ge=1, le=1000)
-    """Denoising steps."""
+    steps: int = Field(default=4, ge=1, le=1000)
+    """Denoising steps. More give more texture, and less agreement with the truth pixel by pixel."""
     eta: float = Field(default=1.0, ge=0, le=1)
     """Noise added between steps: 0 = deterministic sampler, 1 = ancestral."""
     overlap: int = Field(default=2, ge=0)
@@ -186,6 +190,8 @@ class FitConfig:
     """Static points are thinned to one per cube of this size (finer close to the drive)."""
     far_m: float = Field(default=150.0, gt=1)
     """Distance of what is neither sky nor within LiDAR reach."""
+    selective_adam: bool = False
+    """Update only the Gaussians that a step's view shows."""
     learn_poses: bool = False
     """Correct the boxes of moving objects while fitting (offset and yaw per key)."""
     densify: bool = True
@@ -198,8 +204,12 @@ class FitConfig:
     """mudg_s: how often a virtual view is taken instead of a recorded one (theta)."""
     virtual_start: float = Field(default=0.15, ge=0, le=1)
     """mudg_s: share of the iterations before virtual views join."""
+    virtual_stop: float = Field(default=1.0, ge=0, le=1)
+    """mudg_s: share of the iterations after which only recorded views are taken again."""
     virtual_seen_weight: float = Field(default=0.1, ge=0, le=1)
     """mudg_s: weight of virtual pixels whose surface a recorded view saw, beside 1 for those that none saw."""
+    virtual_gaussians: int = Field(default=8000, ge=0)
+    """mudg_s: at most so many Gaussians start at surfaces that only virtual views show."""
     virtual_color_weight: float = Field(default=1.0, ge=0)
     virtual_perceptual_weight: float = Field(default=0.1, ge=0)
     virtual_depth_weight: float = Field(default=0.1, ge=0)
@@ -260,14 +270,20 @@ class RunConfig:
 def run_preset(fast: bool = False) -> RunConfig:
     """The chain's settings before any file or flag; the first camera of whatever scene it is.
 
-    ``fast`` trades quality for time: fewer frames, denoising steps and iterations.
+    Sized for a few minutes on two cores. ``fast`` trades quality for time: a smaller city, fewer denoising steps and
+    iterations.
     """
     config = with_lines(RunConfig(), cameras=())
-    if not fast:
-        return config
+    frames, width, height, cameras, iterations, steps = 24, 480, 320, config.ingest.city.cameras, 600, 8
+    if fast:
+        frames, width, height, cameras, iterations, steps = 12, 240, 160, ("front",), 250, 4
+    city = replace(config.ingest.city, n_frames=frames, width=width, height=height, cameras=cameras)
     return replace(
-        config, fit=replace(config.fit, iterations=300), synthesize=replace(config.synthesize, steps=4)
-    )  # fmt: skip
+        config,
+        ingest=replace(config.ingest, city=city),
+        fit=replace(config.fit, iterations=iterations),
+        synthesize=replace(config.synthesize, steps=steps),
+    )
 
 
 def with_seed(config: RunConfig, seed: int) -> RunConfig:

@@ -41,7 +41,7 @@ from mudg.models.featnets import FilterBank
 from mudg.models.nodes import SceneModel, compose, composite_semantics, composite_sky
 from mudg.stages.config import FitConfig
 from mudg.stages.fit_start import StartSettings, start_model
-from mudg.stages.fit_trust import unseen_maps
+from mudg.stages.fit_trust import unseen_maps, unseen_rows
 from mudg.stages.fit_views import Sample, ViewSet, classes_of, load_recorded, load_virtual, training_frames
 
 VERSION = 1
@@ -158,14 +158,14 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
     that changes. Ctrl-C is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
     raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), FilterBank()
-    virtual_from = config.virtual_start * config.iterations
+    virtual_from, virtual_to = (share * config.iterations for share in (config.virtual_start, config.virtual_stop))
     with log.task(f"fit {config.method}", config.iterations, state.step) as bar, _interrupt_at_end_of_step() as interrupted:
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
             if step > virtual_from and state.unseen is None and state.views.virtual:
-                state.unseen = weigh_virtual_views(state, raster)
-            probability = config.virtual_probability if step > virtual_from else 0.0
+                state.unseen = admit_virtual_views(state, config, raster)
+            probability = config.virtual_probability if virtual_from < step <= virtual_to else 0.0
             sample = state.views.choose(config.seed, step, probability, state.unseen)
             observation = sample.observation
             recorded = observation.kind == "recorded"
@@ -177,7 +177,7 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             finite_or_refuse(terms, sample.name, step)
             torch.stack(list(terms.values())).sum().backward()
             gradients_or_refuse(state.model, sample.name, step)
-            adam_step(state.model, step, config)
+            adam_step(state.model, step, config, render.trace.visible)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.longest_to_middle)
             if growing:
@@ -199,9 +199,18 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
                 raise KeyboardInterrupt
 
 
-def weigh_virtual_views(state: FitState, raster: RasterConfig) -> Tensor:
-    """Maps u8[V, H, W] of what only virtual views see (padded to the largest of them); see ``fit_trust``."""
+def admit_virtual_views(state: FitState, config: FitConfig, raster: RasterConfig) -> Tensor:
+    """Before virtual views join: work out what only they see, and start Gaussians there (see ``fit_trust``).
+
+    Returns:
+        Maps u8[V, H, W], 1 where no recorded view saw what a virtual view shows; padded to the largest view.
+    """
     maps = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
+    if config.virtual_gaussians:
+        columns, labels = unseen_rows(state.model, state.views.virtual, maps, config.virtual_gaussians, config.seed)
+        state.model.table.append(columns, labels)
+        state.model.sort_rows()
+        state.stats = DensifyStats.zeros(len(state.model.table))
     height, width = (max(size) for size in zip(*(found.shape for found in maps)))
     stacked = torch.zeros(len(maps), height, width, dtype=torch.uint8)
     for index, found in enumerate(maps):
@@ -213,17 +222,23 @@ def weigh_virtual_views(state: FitState, raster: RasterConfig) -> Tensor:
 def recorded_terms(
     model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank
 ) -> dict[str, Tensor]:
-    """Weighted loss terms of a recorded view: colour, LiDAR depth, sky, semantics (those that apply)."""
+    """Weighted loss terms of a recorded view: colour, LiDAR depth, sky, semantics (those that apply).
+
+    The observation's confidence is that of its labels (a labeller may be unsure; the photograph is not).
+    """
     seen = sample.observation
-    rgb = losses.outside_mask_copied(composite_sky(model, seen.view, render.rgb, render.alpha), seen.rgb, seen.mask)
+    labels = seen.confidence * seen.mask
+    rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
+    rgb = losses.outside_mask_copied(rgb, seen.rgb, None if seen.mask.all() else seen.mask)
     terms = {"color": kernels.photometric(rgb, seen.rgb, config.ssim_weight)}
     if sample.lidar is not None and len(sample.lidar.pixel) and config.lidar_weight:
         terms["lidar"] = config.lidar_weight * losses.sparse_depth(render.depth, sample.lidar.pixel, sample.lidar.depth_m)
     if sample.sky is not None and config.sky_weight and model.sky is not None:
-        terms["sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), seen.mask)
+        terms["sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), labels)
     if render.extra is not None and seen.semantics is not None and config.semantic_weight:
         logits = composite_semantics(model, render.extra, render.alpha)
-        terms["semantics"] = config.semantic_weight * losses.weighted_mean(losses.semantic_map(logits, seen.semantics), seen.mask[0])
+        loss = losses.semantic_map(logits, seen.semantics)
+        terms["semantics"] = config.semantic_weight * losses.weighted_mean(loss, labels[0])
     return terms
 
 
@@ -236,7 +251,7 @@ def virtual_terms(
     rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
     terms: dict[str, Tensor] = {}
     if config.virtual_color_weight:
-        terms["virtual_color"] = config.virtual_color_weight * losses.weighted_mean(losses.l1_map(rgb, seen.rgb), weight)
+        terms["virtual_color"] = config.virtual_color_weight * losses.confident_mean(losses.l1_map(rgb, seen.rgb), weight)
     if config.virtual_perceptual_weight:
         with torch.no_grad():
             target = perception(seen.rgb)
@@ -244,12 +259,13 @@ def virtual_terms(
     if seen.depth is not None and config.virtual_depth_weight:
         valid = torch.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth < FARTHEST_VIRTUAL_DEPTH_M)
         loss = losses.dense_depth_map(render.depth, torch.where(valid, seen.depth, 1.0))
-        terms["virtual_depth"] = config.virtual_depth_weight * losses.weighted_mean(loss, weight * valid)
+        terms["virtual_depth"] = config.virtual_depth_weight * losses.confident_mean(loss, weight * valid)
     if sample.sky is not None and config.sky_weight and model.sky is not None:
-        terms["virtual_sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), weight)
+        terms["virtual_sky"] = config.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, sample.sky), weight)
     if render.extra is not None and seen.semantics is not None and config.virtual_semantic_weight:
         logits = composite_semantics(model, render.extra, render.alpha)
-        terms["virtual_semantics"] = config.virtual_semantic_weight * losses.weighted_mean(losses.semantic_map(logits, seen.semantics), weight[0])
+        loss = losses.semantic_map(logits, seen.semantics)
+        terms["virtual_semantics"] = config.virtual_semantic_weight * losses.confident_mean(loss, weight[0])
     return terms
 
 
@@ -272,7 +288,8 @@ def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
                 table.clear_gradients()
                 raise NumericsError(
                     "a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
-                    got=f"{count} values", remedy="the parameters are those of the step before; lower the learning rate or report the scene",
+                    got=f"{count} values",
+                    remedy="the parameters are those of the step before; report the scene, or leave this view out",
                 )  # fmt: skip
 
 
@@ -311,11 +328,17 @@ def densify_schedule(config: FitConfig) -> DensifySettings:
     )  # fmt: skip
 
 
-def adam_step(model: SceneModel, step: int, config: FitConfig) -> None:
-    """One Adam step on every table of the model, then gradients are dropped."""
+def adam_step(model: SceneModel, step: int, config: FitConfig, visible: Tensor) -> None:
+    """One Adam step on every table of the model, then gradients are dropped.
+
+    Args:
+        visible: bool[N], the Gaussians this step's view shows; with ``config.selective_adam`` the others rest.
+    """
     rates = learning_rates(step, config.iterations)
-    for table in (model.table, *model.node_tables().values()):
+    model.table.adam_step(step, rates, kernels.adam, visible if config.selective_adam else None)
+    for table in model.node_tables().values():
         table.adam_step(step, rates, kernels.adam)
+    for table in (model.table, *model.node_tables().values()):
         table.clear_gradients()
 
 
@@ -404,8 +427,9 @@ def render_view(model: SceneModel, view: View, raster: RasterConfig, sky_below_a
         if model.sky is not None:
             semantics = torch.where(covered[0], semantics, palette.ID["sky"])
             depth = torch.where(semantics[None] == palette.ID["sky"], torch.nan, depth)
-    confidence = render.alpha.clamp(0, 1) if model.sky is None else torch.where(covered, render.alpha, 1 - render.alpha).clamp(0, 1)
-    return Observation(view, rgb, depth, semantics, confidence, torch.ones_like(covered), "virtual", source or str(model.facts.get("method", "fit")))
+    confidence = render.alpha if model.sky is None else torch.where(covered, render.alpha, 1 - render.alpha)
+    source = source or str(model.facts.get("method", "fit"))
+    return Observation(view, rgb, depth, semantics, confidence.clamp(0, 1), torch.ones_like(covered), "virtual", source)
 
 
 def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:

@@ -22,7 +22,14 @@ from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
 from mudg.core.table import Table
 from mudg.models.nodes import (
-    RigidNode, SceneModel, SkyNode, StaticNode, box_grid, columns_from_points, neighbour_scale, voxel_filter,
+    RigidNode,
+    SceneModel,
+    SkyNode,
+    StaticNode,
+    box_grid,
+    columns_from_points,
+    neighbour_scale,
+    voxel_filter,
 )  # fmt: skip
 from mudg.stages.fit_views import StoredView
 
@@ -184,8 +191,8 @@ def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns
     column, row = (uv[inside, 0] // FILL_CELL_PX).astype(int), (uv[inside, 1] // FILL_CELL_PX).astype(int)
     depth = np.full((rows, columns), np.inf)
     np.minimum.at(depth, (row, column), z[inside])
-    beside = np.minimum(np.pad(depth, ((0, 0), (1, 0)), constant_values=np.inf)[:, :-1], np.pad(depth, ((0, 0), (0, 1)), constant_values=np.inf)[:, 1:])
-    return np.where(np.isfinite(depth), depth, beside)
+    padded = np.pad(depth, ((0, 0), (1, 1)), constant_values=np.inf)
+    return np.where(np.isfinite(depth), depth, np.minimum(padded[:, :-2], padded[:, 2:]))
 
 
 def _painted_sky(views: Sequence[StoredView]) -> SkyNode:

@@ -4,7 +4,8 @@ A generated view is the best there is behind a parked bus, and worse than the ph
 pixels is asked: is the surface you show seen by any recorded view? The pixel's point (at the depth the virtual view itself
 claims) is carried to a number of recorded views, with its moving object if it lies in one's box, and compared with the depth
 the model renders there: if the recorded view looks at or through that point, the pixel is *seen*. Points that are hidden in
-every recorded view, or in none's image, are *unseen*, and there the virtual view keeps its full weight.
+every recorded view, or in none's image, are *unseen*, and there the virtual view keeps its full weight. Since nothing was
+measured there, nothing could start there either: ``unseen_rows`` makes Gaussians from what the virtual views show.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mudg.base import geometry, log
+from mudg.base import geometry, log, seeds
+from mudg.base.palette import UNLABELLED
 from mudg.base.types import View
 from mudg.core.raster import RasterConfig, rasterize
-from mudg.models.nodes import RigidNode, SceneModel, compose
+from mudg.models.nodes import RigidNode, SceneModel, columns_from_points, compose, voxel_filter
 from mudg.stages.fit_views import StoredView
 
 WITNESSES = 36
@@ -28,6 +30,10 @@ STRIDE_PX = 2
 TOLERANCE = 0.15
 SKY_AT_M = 1000.0
 WITNESS_WIDTH_PX = 160
+SEED_STRIDE_PX = 3
+SEED_NEAREST_M, SEED_FARTHEST_M = 2.0, 80.0
+SEED_CONFIDENCE = 0.2
+"""Least confidence of a virtual pixel that may become a Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +75,12 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
     depth = np.full(len(row), SKY_AT_M) if stored.depth is None else stored.depth[row, column].astype(np.float64)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, SKY_AT_M)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), depth)
-    carried = [(node, inside, local) for node in objects if (found := _in_box(node, points, stored.view.time_s)) for inside, local in [found]]
+    carried = [(node, found) for node in objects if (found := _in_box(node, points, stored.view.time_s)) is not None]
     seen = np.zeros(len(points), bool)
     for witness in witnesses:
         moved = points.copy()
         exists = np.ones(len(points), bool)
-        for node, inside, local in carried:
+        for node, (inside, local) in carried:
             pose = _pose(node, witness.view.time_s)
             exists[inside] = pose is not None
             if pose is not None:
@@ -82,6 +88,79 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
         seen |= exists & _looks_at_or_through(witness, moved)
     coarse = ~seen.reshape(shape)
     return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """Points of one node, in its own frame."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    train_id: NDArray[np.uint8]
+    scale_m: NDArray[np.float32]
+
+
+def unseen_rows(
+    model: SceneModel, virtual: Sequence[StoredView], unseen: Sequence[NDArray[np.bool_]], most: int, run_seed: int
+) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Table rows (columns, labels) at the surfaces that only virtual views show, thinned to one per place, at most ``most``.
+
+    A point in the box of a moving object belongs to that object.
+    """
+    objects = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
+    found: dict[int, list[_Seeds]] = {index: [] for index in range(len(model.nodes))}
+    for stored, unseen_here in zip(virtual, unseen):
+        for index, seeds_here in _seeds_of(stored, unseen_here, objects, model.classes):
+            found[index].append(seeds_here)
+    columns, owners = [], []
+    total = sum(len(part.xyz) for parts in found.values() for part in parts)
+    for index, parts in found.items():
+        if not parts:
+            continue
+        xyz, scale = np.concatenate([p.xyz for p in parts]), np.concatenate([p.scale_m for p in parts])
+        rows = voxel_filter(xyz, np.maximum(2.0 * scale, 0.08))
+        share = max(1, most * sum(len(p.xyz) for p in parts) // total)
+        rows = rows[np.sort(seeds.numpy_rng(run_seed, index, "unseen rows").permutation(len(rows))[:share])]
+        rgb, train_id = np.concatenate([p.rgb for p in parts])[rows], np.concatenate([p.train_id for p in parts])[rows]
+        columns.append(columns_from_points(xyz[rows], rgb, train_id, model.classes, model.sh_degree, scale_m=scale[rows]))
+        owners.append(torch.full((len(rows),), index, dtype=torch.int32))
+    if not columns:
+        return {name: value.detach()[:0] for name, value in model.table.columns.items()}, {"node": torch.zeros(0, dtype=torch.int32)}
+    return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}
+
+
+def _seeds_of(
+    stored: StoredView, unseen: NDArray[np.bool_], objects: dict[int, RigidNode], classes: tuple[int, ...]
+) -> list[tuple[int, _Seeds]]:
+    """Points of one virtual view's unseen pixels, by node index."""
+    if stored.depth is None:
+        return []
+    height, width = stored.rgb.shape[:2]
+    row, column = np.mgrid[SEED_STRIDE_PX // 2 : height : SEED_STRIDE_PX, SEED_STRIDE_PX // 2 : width : SEED_STRIDE_PX]
+    row, column = row.ravel(), column.ravel()
+    z = stored.depth[row, column]
+    with np.errstate(invalid="ignore"):
+        kept = unseen[row, column] & (z > SEED_NEAREST_M) & (z < SEED_FARTHEST_M)
+    if stored.mask is not None:
+        kept &= stored.mask[row, column]
+    if stored.confidence is not None:
+        kept &= stored.confidence[row, column] >= SEED_CONFIDENCE * 255
+    row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
+    points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
+    channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channel is None else stored.channel[row, column]
+    train_id = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))[np.minimum(channel, len(classes))]
+    scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
+    rgb = stored.rgb[row, column]
+    owner = np.zeros(len(row), np.int64)
+    local = points.copy()
+    for index, node in objects.items():
+        inside = _in_box(node, points, stored.view.time_s)
+        if inside is not None:
+            owner[inside[0]], local[inside[0]] = index, inside[1]
+    return [
+        (int(index), _Seeds(local[mine].astype(np.float32), rgb[mine], train_id[mine], scale[mine]))
+        for index in np.unique(owner) for mine in [owner == index]
+    ]  # fmt: skip
 
 
 def _looks_at_or_through(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:

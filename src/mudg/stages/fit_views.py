@@ -60,7 +60,7 @@ class Sample:
 @dataclass(frozen=True)
 class StoredView:
     """One view in bytes: rgb u8[H, W, 3]; channel u8[H, W] or None; sky, mask bool[H, W] or None; depth f16 m (NaN = none)
-    and confidence u8 for virtual views."""
+    of virtual views; confidence u8 of all a virtual view shows, of the labels alone for a recorded one (None = 1)."""
 
     name: str
     view: View
@@ -169,8 +169,9 @@ def load_recorded(
         size = (view.camera.width, view.camera.height)
         labels = {
             name: resized_labels(scenefile.read_label(scene, frame, name), size) if name in frame.labels else None
-            for name in ("semantics", "sky", "ego")
+            for name in ("semantics", "sky", "ego", "semantics_confidence")
         }
+        confidence = labels["semantics_confidence"]
         semantics = labels["semantics"]
         sky = labels["sky"] if labels["sky"] is not None else (None if semantics is None else semantics == ID["sky"])
         lidar = points.pixels_of(view) if with_lidar else None
@@ -180,6 +181,7 @@ def load_recorded(
                 frame.id, view, "recorded", "camera", resized_rgb(scenefile.read_image(scene, frame), size),
                 None if semantics is None or not classes else to_channels(semantics, classes), sky,
                 None if labels["ego"] is None else ~labels["ego"].astype(bool), lidar,
+                confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
             )
         )  # fmt: skip
     if with_lidar and without_lidar:

@@ -126,7 +126,10 @@ def draw_top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Imag
     pixel = ((xyz[:, :2] - low) * scale).astype(int)
     inside = ((pixel >= 0) & (pixel < [width, height])).all(1)
     order = np.flatnonzero(inside)[np.argsort(xyz[inside, 2], kind="stable")]  # higher points on top
-    canvas[height - 1 - pixel[order, 1], pixel[order, 0]] = rgb[order]
+    dot = 2 if len(order) < 400_000 else 1
+    for down, right in np.ndindex(dot, dot):
+        rows, columns = height - 1 - pixel[order, 1] + down, pixel[order, 0] + right
+        canvas[rows.clip(0, height - 1), columns.clip(0, width - 1)] = rgb[order]
     image = Image.fromarray(canvas)
     draw = ImageDraw.Draw(image)
 

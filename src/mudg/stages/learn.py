@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from mudg.base import checkpoint, log, seeds, store
 from mudg.base.config import to_dict
-from mudg.base.errors import NumericsError, ResourceError
+from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.data import city_clips, clip_shards
 from mudg.data.clip_shards import Batch
 from mudg.models import mdm
@@ -41,25 +41,37 @@ HELD_OUT = 1_000_000
 
 
 def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
-    """Train a model from nothing; returns the folder of the exported model (`OUT/model`).
+    """Train a model, from nothing or from an earlier one; returns the folder of the exported model (`OUT/model`).
 
     Raises:
         NumericsError: a loss or gradient is not finite (names the term and the step; parameters are untouched).
         ResourceError, UsageError: see `RunDir.open`.
     """
-    directory = store.RunDir.open(out, verb="learn", config=to_dict(config), inputs={}, overwrite=overwrite)
+    before = mdm.load(config.start) if config.start else None
+    if before is not None and before.config != model_config(config):
+        raise UsageError(
+            "the model to continue from is of another kind", where=config.start, expected=str(model_config(config)),
+            got=str(before.config), remedy="give its widths, blocks, attention, patch and window",
+        )  # fmt: skip
+    inputs = {"start": mdm.digest(config.start)} if config.start else {}
+    directory = store.RunDir.open(out, verb="learn", config=to_dict(config), inputs=inputs, overwrite=overwrite)
     if directory.complete:
         return directory.reused() / "model"
     bf16 = choose_bf16(config.precision)
     torch.set_num_threads(config.threads)
     clips = Path(config.clips) if config.clips else out / "clips"
     with _making_clips(config, clips):
-        model = MDM(model_config(config))
-        _train_codec(model, config, directory, clips, bf16)
+        model = before or MDM(model_config(config))
+        if before is None:
+            _train_codec(model, config, directory, clips, bf16)
+            _draw_weights(model.net, config.seed, "weights")
+        model.codec.requires_grad_(False)
         _train_network(model, config, directory, clips, bf16)
     scores = learn_score.score(model, held_out(config), clips, steps=config.score_steps, seed=config.seed, bf16=bf16)
     store.write_json(out / "metrics.json", scores)
     facts = {"recipe": to_dict(config), "held_out": scores}
+    if config.start:
+        facts["continued_from"] = mdm.facts(config.start)
     mdm.save(model, out / "model", learn_score.model_card(model, config, scores), facts)
     directory.finish({"held_out": scores["average"]})
     log.info(learn_score.table(scores))
@@ -103,7 +115,7 @@ def clip_rules(config: LearnConfig) -> city_clips.CityClipRules:
     )
 
 
-class _making_clips:  # noqa: N801 - used as a context manager
+class _making_clips:
     """Processes that make the missing clips, held-out cities first, while the block runs."""
 
     def __init__(self, config: LearnConfig, folder: Path) -> None:
@@ -132,7 +144,7 @@ class _making_clips:  # noqa: N801 - used as a context manager
                 raise future.exception()  # type: ignore[misc]
 
 
-def _stop_all_on_error(futures: list[concurrent.futures.Future[int]]):  # noqa: ANN202
+def _stop_all_on_error(futures: list[concurrent.futures.Future[int]]):
     def stop(done: concurrent.futures.Future[int]) -> None:
         if not done.cancelled() and done.exception() is not None:
             for other in futures:
@@ -179,6 +191,7 @@ def _train_codec(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder:
         _load_moments(optimizer, saved.tensors("optimizer"))
         start = saved.step
     else:
+        _draw_weights(codec, config.seed, "codec weights")
         first = [draw_batch(config, folder, n, 8, 1, "codec fit") for n in range(config.codec_fit_batches)]
         codec.fit_colour(torch.cat([b.rgb.flatten(0, 1) for b in first]))
         codec.fit_depth(torch.cat([b.depth.flatten(0, 1) for b in first]))
@@ -204,7 +217,6 @@ def _train_codec(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder:
                 recent = []
             if done % 200 == 0 or done == config.codec_steps:
                 checkpoint.save(out, done, {"codec": codec.state_dict(), "optimizer": _moments(optimizer)}, {})
-    codec.requires_grad_(False)
 
 
 def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -252,7 +264,6 @@ def frames_at(config: LearnConfig, step: int) -> int:
 def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool) -> None:
     """Train the denoising network; on return the model holds the moving average of the weights."""
     net, out = model.net, run_dir.path / "steps"
-    _init_network(net, config.seed)
     average = {k: v.detach().clone() for k, v in net.state_dict().items()}
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
     saved = checkpoint.latest(out)
@@ -264,6 +275,7 @@ def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folde
         start = saved.step
         log.info(f"learn: continues at step {start}")
     net.train()
+    weights = class_weights(folder, min(config.first_cities, 20), config.balance)
     recent: list[dict[str, float]] = []
     clock = time.monotonic()
     with log.task("network", config.steps, start) as bar:
@@ -279,7 +291,8 @@ def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folde
                     batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop, batch.reference
                 )
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-                losses = model.loss(truth, encoded, seeds.torch_generator(config.seed, step, "noise"), shares=shares)
+                losses = model.loss(truth, encoded, seeds.torch_generator(config.seed, step, "noise"), shares=shares,
+                                    class_weights=weights)  # fmt: skip
             _check_finite(losses.terms, step, "network")
             optimizer.zero_grad(set_to_none=True)
             losses.total.backward()
@@ -306,6 +319,22 @@ def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folde
     net.eval()
 
 
+def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
+    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over the first cities.
+
+    Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.
+    """
+    counts = torch.zeros(256, dtype=torch.float64)
+    for city in range(cities):
+        _await_shard(folder, city)
+        ids = clip_shards.read_batch(folder, [(city, 0, range(1))]).semantics
+        counts += torch.bincount(ids.flatten(), minlength=256)
+    share = counts[: mdm.CLASSES] / counts[: mdm.CLASSES].sum().clamp(min=1)
+    floor = max(float(share[share > 0].min()) if bool((share > 0).any()) else 1.0, 1e-3)
+    weight = share.clamp(min=floor) ** -balance
+    return (weight / (weight * share).sum().clamp(min=1e-9)).float()
+
+
 def _look(
     model: MDM, average: dict[str, Tensor], config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool
 ) -> None:
@@ -322,9 +351,9 @@ def _look(
     log.info(f"step {step}\n{learn_score.table(scores)}")
 
 
-def _init_network(net: torch.nn.Module, seed: int) -> None:
+def _draw_weights(net: torch.nn.Module, seed: int, purpose: str) -> None:
     """Draw all weights that are not zero at the start from the run's seed (the constructor's own draw is not used)."""
-    generator = seeds.torch_generator(seed, 0, "weights")
+    generator = seeds.torch_generator(seed, 0, purpose)
     with torch.no_grad():
         for name, value in net.named_parameters():
             if value.ndim >= 2 and bool(value.any()):

@@ -249,18 +249,23 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any]) -> st
     """Text that travels with the weights: what it is, how it was made, what it can and cannot do."""
     count = sum(p.numel() for p in model.parameters()) / 1e6
     samples = config.steps * config.batch_frames
+    continued = f", continued from an earlier model ({config.start})" if config.start else ""
     return f"""# Small multi-modal diffusion model
 
-Turns a projected, coloured LiDAR cloud (and recorded images warped with it) into dense colour, depth and semantic frames,
-{config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million parameters, stored in float16. All three modalities come from one pass.
+Turns a projected, coloured LiDAR cloud (and recorded images warped with it) into dense colour, depth and semantic
+frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million parameters, stored in
+float16. All three modalities come from one pass.
 
-**Training data**: generated cities only (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of {config.window} frames each, about two thirds of
-them beside the recorded path. No real image, and no weight of any other model, was used.
+**Training data**: generated cities only (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of
+{config.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any
+other model, was used.
 
-**Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`: {config.steps} steps of {config.batch_frames} frames
-({samples:,} frames in all), AdamW, moving average {config.average_decay}, x0 prediction with the loss weight 1 + SNR clipped to [1, 5].
+**Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`{continued}: {config.steps}
+steps of {config.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {config.average_decay}, x0
+prediction with the loss weight 1 + SNR clipped to [1, 5].
 
-**Held-out score** ({scores['clips']} clips of cities from number 1000000 on, {scores['steps']} denoising steps, against exact truth):
+**Held-out score** ({scores["clips"]} clips of cities from number 1000000 on, {scores["steps"]} denoising steps, against exact
+truth):
 
 ```
 {table(scores)}

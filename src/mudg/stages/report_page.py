@@ -104,8 +104,9 @@ def headline(scores: Mapping[str, Any]) -> tuple[str, str]:
         verdict = "diffusion makes no difference to colour"
     else:
         verdict = f"diffusion {'adds' if gain > 0 else 'costs'} {abs(gain):.1f} dB"
+    place = distance_title(scores, far)
     words = [
-        f"{far:g} m to either side of the driven line, colour reaches {with_['psnr']:.1f} dB against exact truth "
+        f"{place} of the driven line, colour reaches {with_['psnr']:.1f} dB against exact truth "
         f"({without['psnr']:.1f} dB without diffusion)."
     ]
     for metric, text in (("abs_rel", "relative depth error"), ("miou", "class overlap (mIoU)")):
@@ -307,7 +308,7 @@ def _tables(scores: Mapping[str, Any]) -> str:
         )
     return f"""<section aria-labelledby="scores-title">
 <h2 id="scores-title">Scores</h2>
-<p class="soft">Best value of each column marked. Both sides of the road are averaged.</p>
+<p class="soft">Best value of each column marked. Where both sides of the road were rendered, they are averaged.</p>
 {_charts(scores)}
 {blocks}
 {absent_words}
@@ -321,9 +322,8 @@ def _group_table(
     distances: Sequence[float],
 ) -> str:  # fmt: skip
     metrics = [m for n in names for m in scores["metrics"] if m["name"] == n]
-    held_out = scores["scene"]["held_out"]
     top = "".join(
-        f'<th class="group" colspan="{len(metrics)}" scope="colgroup">{escape(distance_title(d, held_out))}</th>'
+        f'<th class="group" colspan="{len(metrics)}" scope="colgroup">{escape(distance_title(scores, d))}</th>'
         for d in distances
     )
     arrows = {"higher": "higher is better", "lower": "lower is better"}

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +23,7 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from mudg import native
 from mudg.base import config as configuration
 from mudg.base import geometry, log, palette, store
 from mudg.base.errors import InputError, UsageError
@@ -32,6 +35,7 @@ from mudg.data.scenefile import read_image, read_label, read_points, read_scene
 from mudg.stages import score_tables
 from mudg.stages.config import ScoreConfig
 
+Made = TypeVar("Made")
 BASELINE: Final = "nearest_fill"
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
 DEPTH_LIMIT_M: Final = 80.0
@@ -325,11 +329,9 @@ def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[]
             truths = stack.enter_context(writer)
         if by.baseline is not None:
             fills = stack.enter_context(ObservationWriter(out / BASELINE / course.name, course.name, BASELINE))
-        for number, (view, frame) in enumerate(zip(course.views, course.frames, strict=True)):
-            true = by.truth.at(view, frame)
-            found = {m: of[course.indices[m][number]] for m, of in course.sets.items()}
-            if by.baseline is not None and fills is not None:
-                found = {BASELINE: by.baseline(view), **found}
+        for number, (true, found) in enumerate(_ahead(lambda number: _seen(course, by, number), len(course.views))):
+            frame = course.frames[number]
+            if fills is not None:
                 fills.add(found[BASELINE])
             if true is not None:
                 if truths is not None:
@@ -346,6 +348,25 @@ def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[]
         {"method": name, "trajectory": course.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
         for name, of in sums.items()
     ]
+
+
+def _seen(course: Course, by: Yardstick, number: int) -> tuple[Observation | None, dict[str, Observation]]:
+    """Truth and what each method has for one view."""
+    true = by.truth.at(course.views[number], course.frames[number])
+    found = {m: of[course.indices[m][number]] for m, of in course.sets.items()}
+    return true, found if by.baseline is None else {BASELINE: by.baseline(course.views[number]), **found}
+
+
+def _ahead(make: Callable[[int], Made], count: int) -> Iterator[Made]:
+    """``make(0)``, ``make(1)``, ... in order, a few of them made beforehand by other threads."""
+    with ThreadPoolExecutor(native.default_threads()) as pool:
+        waiting: deque[Future[Made]] = deque()
+        for number in range(count):
+            waiting.append(pool.submit(make, number))
+            if len(waiting) > 2 * native.default_threads():
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def _update(

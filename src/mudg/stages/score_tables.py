@@ -84,10 +84,12 @@ def by_distance(
     table = []
     for distance in distances:
         here = [c["name"] for c in courses if c["shift_m"] is not None and abs(float(c["shift_m"])) == distance]
+        signs = {float(c["shift_m"]) > 0 for c in courses if c["name"] in here}
+        sides = "recorded" if distance == 0 else "both" if len(signs) == 2 else "left" if signs == {True} else "right"
         for method in methods:
             of = [r for r in results if r["method"] == method and r["trajectory"] in here]
             table.append(
-                {"method": method, "distance_m": distance, "trajectories": [r["trajectory"] for r in of],
+                {"method": method, "distance_m": distance, "sides": sides, "trajectories": [r["trajectory"] for r in of],
                  "values": {name: _mean([r["values"].get(name) for r in of]) for name in names}}
             )  # fmt: skip
     return table
@@ -110,11 +112,12 @@ def best_of(better: str, values: Mapping[str, Any], metric: str) -> set[str]:
     return {m for m, v in numbers.items() if v == best}
 
 
-def distance_title(distance_m: float, held_out: int) -> str:
+def distance_title(document: Mapping[str, Any], distance_m: float) -> str:
     """Heading of a distance."""
-    if distance_m == 0:
-        return "recorded path, held-out frames" if held_out else "recorded path, all frames"
-    return f"{distance_m:g} m to either side"
+    sides = {row["sides"] for row in document["by_distance"] if row["distance_m"] == distance_m}
+    if sides == {"recorded"}:
+        return f"recorded path, {'held-out' if document['scene']['held_out'] else 'all'} frames"
+    return f"{distance_m:g} m to {'either side' if sides == {'both'} else 'the ' + ' and '.join(sorted(sides))}"
 
 
 def _lookup(document: Mapping[str, Any]) -> dict[tuple[str, float], Mapping[str, Any]]:
@@ -128,7 +131,7 @@ def plain(document: Mapping[str, Any]) -> str:
     columns = [m for m in document["metrics"] if m["name"] in SHOWN]
     lines = []
     for distance in distances:
-        lines.append(distance_title(distance, document["scene"]["held_out"]))
+        lines.append(distance_title(document, distance))
         heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
         lines.append("  " + " " * 28 + "".join(f"{head:>14}" for head in heads))
         for method in document["methods"]:

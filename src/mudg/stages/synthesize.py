@@ -31,7 +31,7 @@ from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
 from mudg.core import trajectory
-from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
+from mudg.data.clips import ConditionRules, Recorded, Source, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scenefile import read_image, read_scene
@@ -69,8 +69,8 @@ def run(config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, overwr
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
-    model = mdm.load(config.model)
-    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": model_digest(config.model)}
+    mdm.load(config.model)  # fails now rather than in every process
+    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": mdm.digest(config.model)}
     directory = store.RunDir.open(out, "synthesize", to_dict(config), inputs, _VERSION, overwrite)
     if directory.complete:
         return directory.reused()
@@ -89,12 +89,6 @@ def run(config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, overwr
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
     return out
-
-
-def model_digest(name: str) -> str:
-    """Digest of the model's description, which holds the hashes of its weights."""
-    folder = mdm.EMBEDDED if name == "embedded" else Path(name)
-    return store.digest(folder / mdm.MODEL_FILE)
 
 
 def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
@@ -128,7 +122,7 @@ def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
     return made
 
 
-class _quiet_openmp:  # noqa: N801 - used as a context manager
+class _quiet_openmp:
     """Environment for child processes: one thread, and waiting without spinning."""
 
     _wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": "1"}
@@ -217,7 +211,9 @@ def make_trajectory(job: Job) -> int:
     camera = path.views[0].camera
     area = TRAINED_AREA
     width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
-    maker = ViewMaker(model, scene, cloud, recorded_images(scene, config.held_out_images), width, height, config)
+    fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
+    rules = ConditionRules(width, height, *fine)
+    maker = ViewMaker(model, scene, cloud, recorded_images(scene, config.held_out_images), rules, config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -270,18 +266,15 @@ class ViewMaker:
         scene: Scene,
         cloud: FusedCloud,
         recorded: Sequence[Recorded],
-        width: int,
-        height: int,
+        rules: ConditionRules,
         config: SynthesizeConfig,
     ) -> None:
-        model.check_size(height, width)
+        model.check_size(rules.height, rules.width)
         if not recorded:
             log.warn("synthesize: no recorded image may be used; holes take the nearest point's colour")
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
-        self._rules = ConditionRules(width, height)
+        self._rules, self._config = rules, config
         self._sources: dict[int, Source] = {}
-        self._full_sources: dict[int, Source] = {}
-        self._config = config
         self._bf16 = choose_bf16(config.precision)
 
     def sized(self, view: View) -> View:
@@ -292,8 +285,9 @@ class ViewMaker:
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
     ) -> tuple[Sample, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
-        tracks = self._scene.tracks
-        condition = build_condition(self._cloud, tracks, views, self._recorded, self._rules, self._sources)
+        condition, fine = build_conditions(
+            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources
+        )
         config = self._config
         sample = self._model.sample(
             condition, steps=config.steps, seed=config.seed, index=number, eta=config.eta, known=known, bf16=self._bf16
@@ -302,36 +296,36 @@ class ViewMaker:
             raise InputError("the model does not produce all modalities", where=config.model)
         sky = (sample.semantics == mdm.SKY).unsqueeze(1) & ~condition.valid
         depth = torch.where(sky, torch.nan, sample.depth)
+        rgb, ids, trust, shown = sample.rgb, sample.semantics, sample.confidence, condition
         if config.full_size:
-            return sample, condition, self._full(views, condition, sample, depth)
+            rgb, depth, ids, trust = enlarge(sample, depth, condition, fine)
+            shown = fine
+        everything = torch.ones_like(trust[0], dtype=torch.bool)
         made = [
-            Observation(
-                view, sample.rgb[i], depth[i], sample.semantics[i], sample.confidence[i],
-                torch.ones_like(sample.confidence[i], dtype=torch.bool), "virtual", SOURCE,
-            )
-            for i, view in enumerate(condition.views)
-        ]  # fmt: skip
+            Observation(view, rgb[i], depth[i], ids[i], trust[i], everything, "virtual", SOURCE)
+            for i, view in enumerate(shown.views)
+        ]
         return sample, condition, made
 
-    def _full(self, views: Sequence[View], condition: Condition, sample: Sample, depth: Tensor) -> list[Observation]:
-        """Observations at the cameras' size: the sample enlarged, plus fine detail of the recorded images (see `add_detail`)."""
-        camera = views[0].camera
-        rules = ConditionRules(camera.width, camera.height, point_px=max(1.0, camera.width / self._rules.width))
-        tracks = self._scene.tracks
-        full = build_condition(self._cloud, tracks, views, self._recorded, rules, self._full_sources)
-        size = (camera.height, camera.width)
-        rgb = add_detail(sample.rgb, condition, full)  # type: ignore[arg-type]
-        near = {"size": size, "mode": "nearest-exact"}
-        big_depth = functional.interpolate(depth, **near)
-        known = functional.interpolate(depth.nan_to_num(nan=-1.0), **near)
-        close = full.valid & ((full.depth - known).abs() < 0.1 * known)
-        big_depth = torch.where(close, full.depth, big_depth)
-        ids = functional.interpolate(sample.semantics.unsqueeze(1).float(), **near)[:, 0].long()  # type: ignore[union-attr]
-        trust = functional.interpolate(sample.confidence, size=size, mode="bilinear", align_corners=False)
-        return [
-            Observation(view, rgb[i], big_depth[i], ids[i], trust[i], torch.ones_like(trust[i], dtype=torch.bool), "virtual", SOURCE)
-            for i, view in enumerate(full.views)
-        ]
+
+def enlarge(
+    sample: Sample, depth: Tensor, condition: Condition, fine: Condition
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Colour, depth, classes and confidence of a sample at the size of the fine condition.
+
+    Colour: see `add_detail`. Depth f32[T,1,h,w] (NaN = none): nearest pixel, then the fine measured depth where it is
+    within a tenth of that. Classes: nearest pixel. Confidence: bilinear.
+    """
+    if sample.rgb is None or sample.semantics is None:
+        raise InputError("a sample without colour or classes cannot be enlarged", where="synthesize.enlarge")
+    size = fine.color.shape[-2:]
+    rgb = add_detail(sample.rgb, condition, fine)
+    big_depth = functional.interpolate(depth, size=size, mode="nearest-exact")
+    close = fine.valid & ((fine.depth - big_depth).abs() < 0.1 * big_depth)
+    big_depth = torch.where(close, fine.depth, big_depth)
+    ids = functional.interpolate(sample.semantics.unsqueeze(1).float(), size=size, mode="nearest-exact")[:, 0].long()
+    trust = functional.interpolate(sample.confidence, size=size, mode="bilinear", align_corners=False)
+    return rgb, big_depth, ids, trust
 
 
 def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
@@ -341,14 +335,14 @@ def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
     from its own reduced copy) is added; the weight falls with the disagreement, to nothing at a difference of 0.12.
     """
     size = full.color.shape[-2:]
-    enlarge = lambda x: functional.interpolate(x, size=size, mode="bicubic", align_corners=False)  # noqa: E731
+    larger = lambda x: functional.interpolate(x, size=size, mode="bicubic", align_corners=False)  # noqa: E731
     reduced = functional.interpolate(full.color, size=rgb.shape[-2:], mode="area")
-    detail = full.color - enlarge(reduced)
+    detail = full.color - larger(reduced)
     apart = torch.maximum((rgb - small.color).abs(), (rgb - reduced).abs()).amax(1, keepdim=True)
-    seen = small.valid | (small.warped if small.warped is not None else small.valid)
+    seen = small.valid if small.warped is None else small.valid | small.warped
     weight = (1 - functional.max_pool2d(apart, 3, stride=1, padding=1) / 0.12).clamp(0, 1) * seen
     weight = functional.interpolate(weight, size=size, mode="bilinear", align_corners=False)
-    return (enlarge(rgb) + weight * detail).clamp(0, 1)
+    return (larger(rgb) + weight * detail).clamp(0, 1)
 
 
 def _sheet_row(condition: Condition, sample: Sample, i: int) -> np.ndarray:

@@ -83,7 +83,7 @@ def _building_row(f: Furnisher, side: int, front: float) -> None:
         u = side * (front + setback + 0.012 * length)
         gap_chance = 0.1 if plan.urban else 0.12
         if f.blocked(s + length / 2, u, length / 2, 0.3):
-            u = plan.ego_u + side * (f._reach + 0.6)
+            u = plan.ego_u + side * (f.reach + 0.6)
         if f.chance(gap_chance):
             _green_lot(f, side, front, s, length)
         else:

@@ -31,7 +31,7 @@ class Furnisher:
         self.rng = seeds.numpy_rng(config.seed, 0, "city furniture")
         self.plan = plan
         self.rows: list[list[float]] = []
-        self._reach = config.shift_margin_m + CLEARANCE_M
+        self.reach = config.shift_margin_m + CLEARANCE_M
         self._from_s, self._to_s = -2.5, plan.drive_length + 4.5
 
     def seed(self) -> int:
@@ -55,12 +55,12 @@ class Furnisher:
     def blocked(self, s: float, u: float, along: float, across: float) -> bool:
         """Would something of half extents (along, across) at (s, u) stand in the corridor of the shifted cameras?"""
         inside = self._from_s - along < s < self._to_s + along
-        return inside and abs(u - self.plan.ego_u) < self._reach + across
+        return inside and abs(u - self.plan.ego_u) < self.reach + across
 
     def free_u(self, s: float, u: float, along: float, across: float, side: int, limit: float) -> float | None:
         """``u``, moved outwards if the corridor needs it; None when there is no room before ``limit`` (|u| of a wall)."""
         if self.blocked(s, u, along, across):
-            u = self.plan.ego_u + side * (self._reach + across + 0.05)
+            u = self.plan.ego_u + side * (self.reach + across + 0.05)
         return u if abs(u) + across < abs(limit) else None
 
     def near_crossing(self, s: float, margin: float) -> bool:

@@ -50,7 +50,7 @@ def parse_frame_range(text: str) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
-def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[str, str]:
+def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[str, Literal["train", "test"]]:
     """Every ``test_every``-th moment (4, 8, 12, ... for 4; never the first) is held out, all cameras together.
 
     Args:

@@ -1,0 +1,210 @@
+"""The build back-end: which compiler is chosen, what happens when one fails, what the wheel is called."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "build_backend"
+pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="the build back-end is part of the source tree only")
+
+
+def _load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def mc() -> ModuleType:
+    """build_backend/mudg_compile.py."""
+    return _load("mudg_compile")
+
+
+def _completed(code: int = 0, out: str = "", error: str = "") -> subprocess.CompletedProcess[str]:
+    return subprocess.CompletedProcess([], code, out, error)
+
+
+def test_system_compilers_are_tried_in_order(mc: ModuleType) -> None:
+    found = {"c++": "/bin/c++", "clang++": "/bin/clang++"}
+    commands = [c.command for c in mc.system_candidates({"CXX": "ccache my-c++ -m64"}, which=found.get)]
+    assert commands == [("ccache", "my-c++", "-m64"), ("/bin/c++",), ("/bin/clang++",)]
+    assert [c.command for c in mc.system_candidates({"CXX": "/bin/c++"}, which=found.get)] == [("/bin/c++",), ("/bin/clang++",)]
+    assert mc.system_candidates({}, which=lambda name: None) == []
+
+
+def test_the_first_compiler_that_works_is_taken_and_the_log_says_why(mc: ModuleType) -> None:
+    broken, good, spare = (mc.Compiler((name,), "system") for name in ("broken", "good", "spare"))
+
+    def check(compiler: object) -> object:
+        works = compiler is not broken
+        return mc.ProbeResult(works, "" if works else "cannot build a small C++17 library: no headers", "good 1.0", True)
+
+    chosen, notes = mc.find_compiler([broken, good, spare], check)
+    assert chosen.command == ("good",)
+    assert chosen.x86_64
+    assert "no headers" in notes[0]
+    assert notes[1].startswith("using good")
+    assert mc.find_compiler([broken], check)[0] is None
+
+
+def test_the_probe_reports_every_way_to_fail(mc: ModuleType) -> None:
+    compiler = mc.Compiler(("cc",), "system")
+
+    def missing(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        raise FileNotFoundError("cc")
+
+    assert "cannot be started" in mc.probe(compiler, missing).reason
+    refusing = mc.probe(compiler, lambda command: _completed(1, error="error: unknown flag"))
+    assert not refusing.works
+    assert "unknown flag" in refusing.reason
+
+    def foreign(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        if command[0] == "cc":
+            Path(command[-1]).write_bytes(b"")
+            return _completed()
+        return _completed(1, error="OSError: wrong ELF class")
+
+    assert "wrong ELF class" in mc.probe(compiler, foreign).reason
+
+
+def _build(mc: ModuleType, tmp_path: Path, mode: str, failing: set[str], working: Sequence[str]) -> object:
+    candidates = [mc.Compiler((name,), "ziglang" if name == "zig" else "system") for name in working]
+
+    def compile_with(compiler: object, library: Path, objects: Path) -> list[str]:
+        name = compiler.command[0]  # type: ignore[attr-defined]
+        if name in failing:
+            raise mc.CompileError(f"raster.cpp does not compile with {name}")
+        library.write_bytes(b"library")
+        return []
+
+    return mc.build(tmp_path, tmp_path / "objects", {"MUDG_NATIVE": mode}, candidates=candidates,
+                    check=lambda c: mc.ProbeResult(True, version="1"), compile_with=compile_with)  # fmt: skip
+
+
+def test_a_failing_compile_hands_over_to_the_next_compiler(mc: ModuleType, tmp_path: Path) -> None:
+    outcome = _build(mc, tmp_path, "auto", {"gcc"}, ["gcc", "zig"])
+    assert outcome.library == tmp_path / mc.LIBRARY_NAME
+    assert outcome.compiler.kind == "ziglang"
+    assert any("does not compile with gcc" in note for note in outcome.notes)
+
+
+def test_without_any_compiler_the_build_goes_on_and_says_so(mc: ModuleType, tmp_path: Path) -> None:
+    outcome = _build(mc, tmp_path, "auto", set(), [])
+    assert outcome.library is None
+    assert "no C++ compiler was found" in outcome.reason
+    assert "pure Python" in mc.report(outcome)
+    assert "ziglang" in mc.report(outcome)
+    stored = json.loads(mc.write_build_info(outcome, tmp_path).read_text())
+    assert stored["native"] is False
+    assert "no C++ compiler" in stored["reason"]
+
+
+def test_sources_that_do_not_compile_are_reported_in_words(mc: ModuleType, tmp_path: Path) -> None:
+    outcome = _build(mc, tmp_path, "auto", {"gcc", "zig"}, ["gcc", "zig"])
+    assert outcome.library is None
+    assert "does not compile with zig" in outcome.reason
+
+
+def test_require_turns_no_library_into_an_error(mc: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(mc.CompileError, match="MUDG_NATIVE=require"):
+        _build(mc, tmp_path, "require", {"gcc"}, ["gcc"])
+    assert _build(mc, tmp_path, "require", set(), ["gcc"]).library is not None
+
+
+def test_off_compiles_nothing(mc: ModuleType, tmp_path: Path) -> None:
+    outcome = _build(mc, tmp_path, "off", set(), ["gcc"])
+    assert outcome.library is None
+    assert "off" in outcome.reason
+
+
+def test_an_unknown_mode_is_refused(mc: ModuleType) -> None:
+    with pytest.raises(mc.CompileError, match="auto, require, off"):
+        mc.native_mode({"MUDG_NATIVE": "maybe"})
+    assert mc.native_mode({}) == mc.native_mode({"MUDG_NATIVE": ""}) == "auto"
+    assert mc.native_mode({"MUDG_NATIVE": " Off "}) == "off"
+
+
+def test_flags_follow_the_file_name_and_the_compiler(mc: ModuleType) -> None:
+    gcc, zig = mc.Compiler(("g++",), "system", x86_64=True), mc.Compiler(("zig",), "ziglang", x86_64=True)
+    assert "-mavx512f" in mc.flags_for(gcc, Path("kernels_avx512.cpp"))
+    assert "-mavx2" in mc.flags_for(gcc, Path("kernels_avx2.cpp"))
+    assert not [f for f in mc.flags_for(gcc, Path("zbuffer.cpp")) if f.startswith("-m")]
+    assert "-mcpu=baseline" in mc.flags_for(zig, Path("zbuffer.cpp"))
+    assert any("avx512f" in f for f in mc.flags_for(zig, Path("kernels_avx512.cpp")))
+    for compiler in (gcc, zig):
+        flags = mc.flags_for(compiler, Path("kernels_avx2.cpp"))
+        assert "-ffp-contract=off" in flags
+        assert "-ffast-math" not in flags
+
+
+def test_other_processors_compile_no_x86_variants(mc: ModuleType) -> None:
+    names = {p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=False))}
+    assert "kernels_portable.cpp" in names
+    assert not [n for n in names if "avx" in n]
+    assert {"kernels_avx2.cpp", "kernels_avx512.cpp"} <= {p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=True))}
+
+
+def test_object_files_are_named_after_all_they_depend_on(mc: ModuleType, tmp_path: Path) -> None:
+    compiler = mc.Compiler(("c++",), "system", "1.0")
+    (tmp_path / "a.cpp").write_text('#include "b.h"\nint x;\n')
+    (tmp_path / "b.h").write_text('#  include "c.h"\n')
+    (tmp_path / "c.h").write_text("// one\n")
+    first = mc.digest_of(compiler, ("-O3",), tmp_path / "a.cpp")
+    assert first == mc.digest_of(compiler, ("-O3",), tmp_path / "a.cpp")
+    assert first != mc.digest_of(compiler, ("-O2",), tmp_path / "a.cpp")
+    assert first != mc.digest_of(mc.Compiler(("c++",), "system", "2.0"), ("-O3",), tmp_path / "a.cpp")
+    (tmp_path / "c.h").write_text("// two\n")
+    assert first != mc.digest_of(compiler, ("-O3",), tmp_path / "a.cpp")
+
+
+def test_zig_is_asked_for_only_where_it_exists(mc: ModuleType) -> None:
+    assert mc.zig_is_offered("linux", "x86_64")
+    assert mc.zig_is_offered("darwin", "arm64")
+    assert not mc.zig_is_offered("linux", "sparc64")
+    assert not mc.zig_is_offered("sunos5", "x86_64")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("setuptools") is None, reason="setuptools is not installed")
+def test_the_backend_asks_for_ziglang_only_without_a_system_compiler(mc: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("setuptools.command.bdist_wheel")
+    backend = _load("mudg_build")
+    monkeypatch.delenv("MUDG_NATIVE", raising=False)
+    monkeypatch.setattr(backend.mudg_compile, "find_compiler", lambda candidates: (mc.Compiler(("c++",), "system"), []))
+    assert backend.extra_requirements() == []
+    monkeypatch.setattr(backend.mudg_compile, "find_compiler", lambda candidates: (None, ["c++ is broken"]))
+    monkeypatch.setattr(backend.mudg_compile, "zig_is_offered", lambda: True)
+    assert backend.extra_requirements() == ["ziglang"]
+    monkeypatch.setattr(backend.mudg_compile, "zig_is_offered", lambda: False)
+    assert backend.extra_requirements() == []
+    monkeypatch.setenv("MUDG_NATIVE", "off")
+    monkeypatch.setattr(backend.mudg_compile, "zig_is_offered", lambda: True)
+    assert backend.extra_requirements() == []
+
+
+@pytest.mark.slow
+def test_variants_share_no_function_with_the_rest(mc: ModuleType, tmp_path: Path) -> None:
+    """A weak symbol in an AVX object could be picked by the linker for every processor."""
+    compiler, _ = mc.find_compiler(mc.system_candidates({}))
+    if compiler is None or not compiler.x86_64 or shutil.which("nm") is None:
+        pytest.skip("needs a system compiler for x86-64 and nm")
+    for name in ("kernels_avx2", "kernels_avx512"):
+        source, target = mc.NATIVE_SOURCES / f"{name}.cpp", tmp_path / f"{name}.o"
+        subprocess.run([*compiler.command, *mc.flags_for(compiler, source), "-c", str(source), "-o", str(target)], check=True)
+        symbols = subprocess.run(["nm", "--defined-only", str(target)], capture_output=True, text=True, check=True).stdout
+        kinds = {line.split()[-1]: line.split()[-2] for line in symbols.splitlines()}
+        assert any(name in symbol for symbol in kinds)
+        assert [s for s, kind in kinds.items() if kind in "WVu"] == []
+        assert [s for s in kinds if "GLOBAL__sub_I" in s] == []  # nothing runs when the library is loaded

@@ -1,0 +1,267 @@
+"""Conditions for the diffusion model: geometry of the warp, what is removed, filled and marked; training clips."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Clip, Condition, FusedCloud, PointCloud, Track, View
+from mudg.data import clip_shards, clips
+from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
+
+CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
+RULES = ConditionRules(48, 32, occluder_m=0.0)
+# camera axes in the world: x right = -y, y down = -z, z forward = x
+LOOKING_ALONG_X = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def view_at(x=0.0, y=0.0, time_s=0.0, camera=CAMERA):
+    pose = LOOKING_ALONG_X.copy()
+    pose[:3, 3] = [x, y, 0]
+    return View(camera, pose, time_s)
+
+
+def wall(x_m, colour_of_y, y_range=(-20, 20), z_range=(-9, 9), step=0.05):
+    """A wall across the view at x = x_m with colours by lateral position."""
+    y, z = np.meshgrid(np.arange(*y_range, step), np.arange(*z_range, step))
+    xyz = np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], 1).astype(np.float32)
+    return PointCloud(xyz, colour_of_y(y.ravel()).astype(np.uint8), "world")
+
+
+def stripes(y):
+    """Smooth stripes so that bilinear look-ups can be compared."""
+    return np.stack([127 + 120 * np.sin(y), 127 + 120 * np.cos(0.7 * y), 60 + 0 * y], -1)
+
+
+def image_of_wall(view, x_m):
+    """What the striped wall looks like from a view: exact, per pixel centre."""
+    camera = view.camera
+    u = np.arange(camera.width) + 0.5
+    y = view.center_world[1] - (u - camera.cx) / camera.fx * (x_m - view.center_world[0])
+    return np.broadcast_to(stripes(y)[None], (camera.height, camera.width, 3)).round().astype(np.uint8).copy()
+
+
+def test_warp_of_a_plane_is_exact():
+    """A striped wall 10 m ahead, seen from 1.5 m beside: the warped recorded image equals the true one."""
+    recorded, target = view_at(), view_at(y=1.5)
+    source = Source(recorded, clips._tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0)
+    rgb, found = clips.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
+    truth = clips._tensor(image_of_wall(target, 10.0))
+    assert float(found.float().mean()) > 0.85
+    assert float((rgb - truth).abs()[:, found].max()) < 0.01
+
+
+def test_warp_moves_left_when_the_camera_moves_left():
+    """At depth Z a shift s to the left moves content f s / Z pixels to the right in the new image."""
+    recorded, target = view_at(), view_at(y=1.0)
+    x, _, _ = clips.carry(target, torch.full((1, 32, 48), 10.0), recorded)
+    assert float((x[0, 0] - (torch.arange(48) + 0.5)).mean()) == pytest.approx(-40.0 * 1.0 / 10.0)
+
+
+def test_hidden_pixels_are_not_taken():
+    recorded, target = view_at(), view_at(y=1.0)
+    rgb = torch.zeros(3, 32, 48)
+    surface = torch.full((32, 48), 10.0)
+    surface[:, 20:28] = 4.0  # something near stands there in the recorded image
+    _, found = clips.warp(target, torch.full((32, 48), 10.0), Source(recorded, rgb, surface, surface < 0), surface, 0.08)
+    x, _, _ = clips.carry(target, torch.full((1, 32, 48), 10.0), recorded)
+    behind = (x[0] > 20.5) & (x[0] < 27.5)
+    assert bool(behind.any())
+    assert not bool(found[behind].any())
+
+
+def test_shine_through_is_removed_and_edges_stay():
+    depth = np.full((20, 20), 5.0, np.float32)
+    valid = np.ones((20, 20), bool)
+    depth[10, 10] = 30.0  # a far point seen through a near wall
+    depth[:, :6] = 30.0  # an ordinary edge: far on one side only
+    kept = clips.remove_shine_through(depth, valid)
+    assert not kept[10, 10]
+    assert int((~kept).sum()) == 1
+
+
+def test_condition_of_a_wall():
+    """Shifted view of a striped wall: depth exact where measured, colour near the truth, masks where they should be."""
+    cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
+    recorded = [Recorded(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
+    target = view_at(y=2.0, time_s=0.1)
+    condition = build_condition(cloud, [], [target], recorded, RULES)
+    valid = condition.valid[0, 0]
+    assert condition.color.shape == (1, 3, 32, 48)
+    assert bool(valid[-8:].all())
+    assert not bool(valid[:4].any())
+    assert torch.allclose(condition.depth[0, 0][valid], torch.tensor(12.0), atol=1e-4)
+    assert torch.allclose(condition.depth, torch.full_like(condition.depth, 12.0), atol=1e-3)
+    truth = clips._tensor(image_of_wall(target, 12.0))
+    warped = condition.warped[0, 0]
+    assert float((condition.color[0] - truth).abs()[:, warped].max()) < 0.02
+    assert bool(warped[:4, 10:38].all())
+    assert torch.equal(condition.reference, clips._tensor(recorded[1].rgb))
+
+
+def test_backdrop_of_the_recorded_view_is_the_image():
+    cloud = FusedCloud(wall(12.0, stripes), {})
+    recorded = [Recorded(view_at(), image_of_wall(view_at(), 12.0))]
+    condition = build_condition(cloud, [], [view_at()], recorded, RULES)
+    assert torch.allclose(condition.backdrop[0], clips._tensor(recorded[0].rgb), atol=1e-5)
+
+
+def test_moving_things_take_no_colour_from_another_time():
+    """The car's points are green; the only recorded image, one second older, shows red where the car now stands."""
+    red = np.zeros((32, 48, 3), np.uint8)
+    red[..., 0] = 255
+    grid = np.stack(np.meshgrid([-2.0], np.arange(-1, 1, 0.02), np.arange(-0.7, 0.7, 0.02)), -1).reshape(-1, 3)
+    green = np.tile(np.array([[0, 255, 0]], np.uint8), (len(grid), 1))
+    poses = np.stack([np.eye(4), np.eye(4)])
+    poses[:, 0, 3] = 10.0
+    track = Track("car-1", "car", np.array([4.0, 2.0, 1.5]), np.array([0.0, 1.0]), poses)
+    static = wall(30.0, lambda y: np.tile([[0, 0, 255]], (len(y), 1)), step=0.1)
+    cloud = FusedCloud(static, {"car-1": PointCloud(grid.astype(np.float32), green, "object")})
+    old, fresh = Recorded(view_at(time_s=0.0), red), Recorded(view_at(time_s=1.0), red)
+    target = view_at(time_s=1.0)
+    car = (slice(14, 18), slice(22, 26))
+    held = build_condition(cloud, [track], [target], [old], RULES)
+    assert torch.equal(held.color[0][:, car[0], car[1]].amax((1, 2)), torch.tensor([0.0, 1.0, 0.0]))
+    assert not bool(held.warped[0, 0][car].any())
+    now = build_condition(cloud, [track], [target], [fresh], RULES)
+    assert torch.allclose(now.color[0][:, car[0], car[1]].amax((1, 2)), torch.tensor([1.0, 0.0, 0.0]), atol=1e-5)
+
+
+def test_published_condition_is_zero_where_nothing_was_seen():
+    cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
+    recorded = [Recorded(view_at(), image_of_wall(view_at(), 12.0))]
+    condition = build_condition(cloud, [], [view_at(y=1.0)], recorded, replace(RULES, published=True))
+    hole = ~condition.valid
+    assert bool(hole.any())
+    assert float(condition.depth[hole].abs().max()) == 0
+    assert float((condition.color * hole).abs().max()) == 0
+    assert condition.warped is None
+
+
+def test_nothing_in_view_gives_a_far_grey_nothing_not_an_error():
+    cloud = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
+    condition = build_condition(cloud, [], [view_at()], [], RULES)
+    assert not bool(condition.valid.any())
+    assert float(condition.depth.min()) == RULES.far_m
+    with pytest.raises(InputError):
+        build_condition(cloud, [], [], [], RULES)
+
+
+def test_sizes_follow_the_rules_and_mixed_image_sizes_work():
+    cloud = FusedCloud(wall(12.0, stripes), {})
+    big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
+    recorded = [Recorded(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
+    condition = build_condition(cloud, [], [view_at(y=0.5, camera=big)], recorded, RULES)
+    assert condition.views[0].camera.width == 48
+    truth = clips._tensor(image_of_wall(view_at(y=0.5), 12.0))
+    warped = condition.warped[0, 0]
+    assert float((condition.color[0] - truth).abs()[:, warped].mean()) < 0.02
+
+
+def test_fine_grid_gives_the_same_geometry_and_cleaner_colour():
+    cloud = FusedCloud(wall(12.0, stripes), {})
+    big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
+    recorded = [Recorded(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
+    target = view_at(y=0.5, camera=big)
+    plain = build_condition(cloud, [], [target], recorded, RULES)
+    small, fine = clips.build_conditions(cloud, [], [target], recorded, replace(RULES, fine_width=96, fine_height=64))
+    assert fine.color.shape[-2:] == (64, 96)
+    assert small.color.shape == plain.color.shape
+    assert torch.equal(small.depth, plain.depth)
+    assert torch.equal(small.valid, plain.valid)
+    truth = clips._tensor(image_of_wall(target, 12.0))
+    truth = torch.nn.functional.interpolate(truth[None], size=(32, 48), mode="area")[0]
+    both = plain.warped[0, 0] & small.warped[0, 0]
+    error = [float((c.color[0] - truth).abs()[:, both].mean()) for c in (small, plain)]
+    assert error[0] <= error[1] + 1e-4
+
+
+# training clips -------------------------------------------------------------------------------------------------------
+
+
+def some_clip(frames=3, height=16, width=24):
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
+    condition = Condition(
+        tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames)), draw(frames, 3, height, width),
+        50 * draw(frames, 1, height, width), draw(frames, 1, height, width) > 0.5, draw(3, height, width),
+        draw(frames, 1, height, width) > 0.5, draw(frames, 3, height, width),
+    )  # fmt: skip
+    depth = 80 * draw(frames, 1, height, width)
+    return Clip(condition, draw(frames, 3, height, width), depth, depth > 5, torch.randint(0, 19, (frames, height, width)))
+
+
+def test_shards_give_back_what_was_packed(tmp_path):
+    clip = some_clip()
+    clip_shards.write_shard(tmp_path, 3, clip_shards.pack_clips([clip, clip], [1.5, 0.0]))
+    assert clip_shards.clips_in(tmp_path, 3) == 2
+    batch = clip_shards.read_batch(tmp_path, [(3, 0, [0, 2]), (3, 1, [1, 2])])
+    assert batch.shift_m == (1.5, 0.0)
+    assert torch.allclose(batch.rgb[0], clip.rgb[[0, 2]], atol=0.5 / 255 + 1e-6)
+    assert torch.allclose(batch.color[1], clip.condition.color[[1, 2]], atol=0.5 / 255 + 1e-6)
+    assert torch.equal(batch.valid[0], clip.condition.valid[[0, 2]])
+    assert torch.equal(batch.warped[1], clip.condition.warped[[1, 2]])
+    assert torch.equal(batch.semantics[0], clip.semantics[[0, 2]])
+    known = clip.depth_valid[[0, 2]]
+    assert torch.allclose(batch.depth[0][known], clip.depth[[0, 2]][known], rtol=1e-3)
+    assert bool((batch.depth[0][~known] == clip_shards.FAR_M).all())
+
+
+def test_missing_shard_is_named(tmp_path):
+    with pytest.raises(InputError, match="city_0000007"):
+        clip_shards.read_batch(tmp_path, [(7, 0, [0])])
+
+
+def test_variation_treats_truth_and_condition_alike(tmp_path):
+    clip = some_clip()
+    same = replace(clip, condition=replace(clip.condition, color=clip.rgb, backdrop=clip.rgb))
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([same], [2.0]))
+    batch = clip_shards.read_batch(tmp_path, [(0, 0, [0, 1, 2])])
+    flips = set()
+    for seed in range(6):
+        varied = clip_shards.vary(batch, np.random.default_rng(seed))
+        assert float((varied.rgb - varied.color).abs().mean()) < 0.04
+        assert torch.equal(varied.semantics.flip(-1), batch.semantics) or torch.equal(varied.semantics, batch.semantics)
+        flips.add(varied.shift_m)
+        again = clip_shards.vary(batch, np.random.default_rng(seed))
+        assert torch.equal(varied.rgb, again.rgb)
+    assert flips == {(2.0,), (-2.0,)}
+
+
+def test_city_clips_are_a_function_of_seed_and_number():
+    from mudg import native
+    from mudg.data import city_clips
+    from mudg.data.city_clips import CityClipRules
+
+    if native.library() is None:
+        pytest.skip("the native library is not built")
+    rules = CityClipRules(width=48, height=32, window=2, clips=2)
+    first, shifts = city_clips.make_clips(rules, 5)
+    again, _ = city_clips.make_clips(rules, 5)
+    other, _ = city_clips.make_clips(rules, 6)
+    assert len(first) == len(shifts) == 2
+    for name in ("rgb", "depth", "semantics"):
+        assert torch.equal(getattr(first[0], name), getattr(again[0], name)), name
+    assert torch.equal(first[0].condition.color, again[0].condition.color)
+    assert not torch.equal(first[0].rgb, other[0].rgb)
+    measured = first[0].condition.valid & first[0].depth_valid
+    error = (first[0].condition.depth - first[0].depth).abs() / first[0].depth
+    assert float(measured.float().mean()) > 0.1
+    assert float(error[measured].median()) < 0.05
+
+
+def test_held_out_cities_have_the_stated_shifts():
+    from mudg.data.city_clips import HELD_OUT, CityClipRules, shifts_of
+
+    rules = CityClipRules()
+    assert shifts_of(rules, HELD_OUT) == (2.0, -3.0, 4.0, 0.0)
+    assert shifts_of(rules, HELD_OUT + 1) == (-2.0, 3.0, -4.0, 0.0)
+    for city in range(20):
+        shifts = shifts_of(rules, city)
+        assert len(shifts) == 4
+        assert min(shifts) < 0 < max(shifts)
+        assert shifts[-1] == 0.0
+        assert all(0.5 <= abs(s) <= 4.2 for s in shifts[:-1])

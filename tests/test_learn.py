@@ -1,0 +1,178 @@
+"""Training: resume is invisible, schedules are what they say, bad numbers never reach the weights."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mudg.base import checkpoint
+from mudg.base.errors import NumericsError, ResourceError, UsageError
+from mudg.base.types import Camera, Clip, Condition, View
+from mudg.data import clip_shards
+from mudg.models import mdm
+from mudg.stages import learn, learn_score
+from mudg.stages.config import LearnConfig
+
+WIDTH, HEIGHT, WINDOW = 48, 32, 4
+
+
+def made_up_clip(seed):
+    """A clip with structure: a horizon, a box, a noisy half-seen condition."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.arange(HEIGHT).view(1, 1, HEIGHT, 1).expand(WINDOW, 1, HEIGHT, WIDTH)
+    colour = torch.rand(2, 3, 1, 1, generator=generator)
+    rgb = torch.where(rows < 12, colour[0], colour[1])
+    depth = torch.where(rows < 12, torch.tensor(1000.0), 200.0 / (rows - 8).clamp(min=1).float())
+    ids = torch.where(rows < 12, 10, 0)[:, 0].clone()
+    box = int(torch.randint(4, WIDTH - 14, (), generator=generator))
+    rgb[:, :, 8:20, box : box + 10] = torch.rand(3, 1, 1, generator=generator)
+    depth[:, :, 8:20, box : box + 10] = 9.0
+    ids[:, 8:20, box : box + 10] = 13
+    valid = torch.rand(depth.shape, generator=generator) > 0.4
+    camera = Camera("front", WIDTH, HEIGHT, 40.0, 40.0, WIDTH / 2, HEIGHT / 2)
+    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(WINDOW))
+    seen = torch.where(valid, rgb, torch.rand(rgb.shape, generator=generator))
+    condition = Condition(views, seen, torch.where(valid, depth, 20.0).clamp(max=100), valid, rgb[0], valid, rgb)
+    return Clip(condition, rgb, depth, depth < 500, ids)
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips")
+    for number in [*range(3), learn.HELD_OUT]:
+        made = [made_up_clip(number * 7 + k) for k in range(2)]
+        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0]))
+    return folder
+
+
+def tiny(clips, **changes):
+    config = LearnConfig(
+        cities=3, first_cities=2, clips_per_city=2, held_out=1, watched=1, clips=str(clips), workers=0, precision="float32",
+        width=WIDTH, height=HEIGHT, window=WINDOW, widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True),
+        temporal_attention=(False, True), codec_steps=3, codec_batch=2, codec_fit_batches=1, steps=4, batch_frames=4,
+        full_window_share=0.5, warmup_steps=1, checkpoint_every=2, sample_every=100, sample_steps=1, score_steps=1,
+    )  # fmt: skip
+    return replace(config, **changes)
+
+
+def weights(folder):
+    return mdm.load(folder).state_dict()
+
+
+def test_resume_equals_the_uninterrupted_run(clips, tmp_path, monkeypatch):
+    config = tiny(clips)
+    whole = learn.run(config, tmp_path / "whole")
+    save = checkpoint.save
+
+    def save_then_stop(folder, step, *args, **kwargs):
+        result = save(folder, step, *args, **kwargs)
+        if folder.name == "steps" and step == 2:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(checkpoint, "save", save_then_stop)
+    with pytest.raises(KeyboardInterrupt):
+        learn.run(config, tmp_path / "parts")
+    monkeypatch.setattr(checkpoint, "save", save)
+    assert not (tmp_path / "parts" / "model").exists()
+    parts = learn.run(config, tmp_path / "parts")
+    first, second = weights(whole), weights(parts)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    scores = [json.loads((p.parent / "metrics.json").read_text()) for p in (whole, parts)]
+    assert scores[0] == scores[1]
+
+
+def test_outputs_and_reuse(clips, tmp_path):
+    out = tmp_path / "run"
+    model_folder = learn.run(tiny(clips, sample_every=4), out)
+    assert (out / "samples" / "0000004.png").stat().st_size > 1000
+    assert (out / "loss.png").is_file()
+    content = json.loads((model_folder / "model.json").read_text())
+    assert content["facts"]["recipe"]["steps"] == 4
+    assert content["facts"]["held_out"]["clips"] == 2
+    assert "held-out" in (model_folder / "MODEL_CARD.md").read_text().lower()
+    before = (model_folder / "model.json").stat().st_mtime_ns
+    assert learn.run(tiny(clips, sample_every=4), out) == model_folder
+    assert (model_folder / "model.json").stat().st_mtime_ns == before
+    with pytest.raises(UsageError):
+        learn.run(tiny(clips, steps=5), out)
+
+
+def test_training_continues_from_a_model(clips, tmp_path):
+    first = learn.run(tiny(clips), tmp_path / "first")
+    second = learn.run(tiny(clips, start=str(first), seed=1), tmp_path / "second")
+    before, after = weights(first), weights(second)
+    assert all(torch.equal(before[n], after[n]) for n in before if n.startswith("codec."))
+    assert any(not torch.equal(before[n], after[n]) for n in before if n.startswith("net."))
+    assert json.loads((second / "model.json").read_text())["facts"]["continued_from"]["recipe"]["steps"] == 4
+    with pytest.raises(UsageError, match="another kind"):
+        learn.run(tiny(clips, start=str(first), widths=(32, 32)), tmp_path / "third")
+
+
+def test_class_weights_lift_rare_classes(clips):
+    assert torch.equal(learn.class_weights(clips, 2, 0.0), torch.ones(19))
+    weight = learn.class_weights(clips, 2, 0.5)
+    assert float(weight[13]) > float(weight[0])
+
+
+def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
+    with pytest.raises(NumericsError, match=r"network(.|\n)*step \d"):
+        learn.run(tiny(clips, lr=1e30, steps=20, checkpoint_every=1), tmp_path / "run")
+    saved = checkpoint.latest(tmp_path / "run" / "steps")
+    if saved is not None:
+        assert saved.step < 20
+
+
+def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
+    out = tmp_path / "run"
+    learn.run(tiny(clips, steps=60, lr=3e-3, checkpoint_every=100, batch_frames=8), out)
+    totals = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    totals = [entry["total"] for entry in totals if "total" in entry]
+    assert totals[-1] < totals[0]
+
+
+def test_batches_depend_on_step_only(clips):
+    config = tiny(clips)
+    first = learn.draw_batch(config, clips, 7, 2, 2, "batch")
+    again = learn.draw_batch(config, clips, 7, 2, 2, "batch")
+    other = learn.draw_batch(config, clips, 8, 2, 2, "batch")
+    assert torch.equal(first.rgb, again.rgb)
+    assert not torch.equal(first.rgb, other.rgb)
+
+
+def test_schedules(clips):
+    config = tiny(clips, steps=1000, warmup_steps=100, decay_share=0.5, lr=1e-3, cities=3, first_cities=1)
+    assert learn.learning_rate(config, 0) == pytest.approx(1e-5)
+    assert learn.learning_rate(config, 300) == pytest.approx(1e-3)
+    assert learn.learning_rate(config, 750) == pytest.approx(5e-4)
+    assert learn.learning_rate(config, 999) == pytest.approx(2e-5)
+    assert learn.cities_at(config, 0) == 1
+    assert learn.cities_at(config, 600) == 3
+    assert [learn.frames_at(config, s) for s in (0, 499, 500)] == [2, 2, 4]
+
+
+def test_clips_that_never_come_are_an_error(tmp_path):
+    with pytest.raises(ResourceError, match="not arriving"):
+        learn._await_shard(tmp_path, 1, patience_s=0.0)
+
+
+def test_perfect_samples_score_perfectly(clips):
+    batch = clip_shards.read_batch(clips, [(learn.HELD_OUT, 0, range(WINDOW))])
+    depth = batch.depth[0].clamp(max=100.0)
+    sample = mdm.Sample(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
+    row, counts = learn_score.score_clip(batch, sample)
+    assert row["psnr"] == float("inf")
+    assert row["abs_rel"] == pytest.approx(0.0, abs=1e-6)
+    assert row["sharpness"] == pytest.approx(1.0)
+    assert row["sky_near"] == 0.0
+    assert row["edges_agree"] == 1.0
+    assert int(counts[:, :-1].diagonal().sum()) == int(counts.sum())
+
+
+def test_confidence_score_ranks():
+    error = torch.linspace(0, 1, 1000)
+    assert learn_score._auc(1 - error, error) > 0.99
+    assert learn_score._auc(error, error) < 0.01
+    assert learn_score._auc(torch.ones(1000), error) == pytest.approx(0.5)

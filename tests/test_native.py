@@ -1,0 +1,301 @@
+"""The native library: loading it, its thread pool, and the fused training kernels against their plain twins."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from mudg import native
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.core import fused, losses
+from mudg.core.table import torch_adam
+
+needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
+
+
+@pytest.fixture
+def pool() -> Any:
+    """(sum function, restores the thread setting)."""
+    library = native.require("the test")
+    before = native.threads()
+    library.mudg_parallel_sum.argtypes = [ctypes.c_int64, ctypes.c_int64]
+    library.mudg_parallel_sum.restype = ctypes.c_int64
+    yield library.mudg_parallel_sum
+    native.set_threads(before)
+
+
+@pytest.fixture(params=["avx512", "avx2", "portable"])
+def isa(request: pytest.FixtureRequest) -> Any:
+    try:
+        native.set_isa(request.param)
+    except (UsageError, ResourceError) as error:
+        pytest.skip(str(error))
+    yield request.param
+    native.set_isa("")
+
+
+# ---- loading -------------------------------------------------------------------------------------------------------
+
+
+@needs_native
+def test_status_names_what_is_in_use() -> None:
+    words = native.status()
+    assert native.isa() in words
+    assert f"{native.threads()} threads" in words
+
+
+def _forget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "_loaded", None)
+    monkeypatch.setattr(native, "_problem", "")
+
+
+def test_a_missing_library_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    _forget(monkeypatch)
+    monkeypatch.setattr(native, "LIBRARY_PATH", tmp_path / "nothing.so")
+    monkeypatch.setattr(native, "FOLDER", tmp_path)
+    (tmp_path / "build_info.json").write_text('{"native": false, "reason": "no C++ compiler was found"}')
+    assert native.library() is None
+    assert "no C++ compiler was found" in native.status()
+    assert "ziglang" in native.status()
+    assert native.threads() == 1
+    with pytest.raises(ResourceError, match="drawing a picture needs the native library"):
+        native.require("drawing a picture")
+
+
+def test_a_file_that_is_no_library_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    _forget(monkeypatch)
+    monkeypatch.setattr(native, "LIBRARY_PATH", tmp_path / "broken.so")
+    (tmp_path / "broken.so").write_bytes(b"not a library")
+    assert native.library() is None
+    assert "does not load" in native.status()
+
+
+@needs_native
+def test_a_library_of_another_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    _forget(monkeypatch)
+    monkeypatch.setattr(native, "ABI_VERSION", 999)
+    assert native.library() is None
+    assert "build it again" in native.status()
+
+
+def test_the_environment_can_switch_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    _forget(monkeypatch)
+    monkeypatch.setenv("MUDG_NATIVE", "off")
+    assert native.library() is None
+    assert "MUDG_NATIVE=off" in native.status()
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "many", "1.5"])
+def test_a_wrong_thread_count_is_refused(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setenv("MUDG_THREADS", text)
+    with pytest.raises(UsageError, match="MUDG_THREADS"):
+        native.default_threads()
+
+
+def test_the_thread_count_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUDG_THREADS", "3")
+    assert native.default_threads() == 3
+    monkeypatch.delenv("MUDG_THREADS")
+    assert native.default_threads() >= 1
+
+
+@needs_native
+def test_unknown_instruction_sets_and_no_threads_are_refused() -> None:
+    before = native.isa()
+    with pytest.raises(UsageError, match="instruction set"):
+        native.set_isa("mmx")
+    assert native.isa() == before
+    with pytest.raises(UsageError, match="at least 1"):
+        native.set_threads(0)
+
+
+# ---- the pool ------------------------------------------------------------------------------------------------------
+
+
+@needs_native
+@pytest.mark.parametrize("threads", [1, 2, 7])
+def test_every_index_is_visited_exactly_once(pool: Any, threads: int) -> None:
+    native.set_threads(threads)
+    for count, grain in ((0, 1), (1, 1), (5, 100), (1000, 1), (100_003, 64), (64, 0)):
+        assert pool(count, grain) == count * (count - 1) // 2
+
+
+@needs_native
+def test_loops_from_several_threads_at_once(pool: Any) -> None:
+    native.set_threads(4)
+    wrong: list[int] = []
+
+    def work() -> None:
+        for _ in range(200):
+            if pool(5000, 16) != 5000 * 4999 // 2:
+                wrong.append(1)
+
+    workers = [threading.Thread(target=work) for _ in range(4)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert not wrong
+
+
+@needs_native
+@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork on this system")
+def test_a_forked_child_gets_a_pool_of_its_own() -> None:
+    script = """
+import os, warnings
+warnings.simplefilter("ignore")
+from mudg import native
+library = native.require()
+native.set_threads(3)
+expected = 100000 * 99999 // 2
+import ctypes
+library.mudg_parallel_sum.argtypes = [ctypes.c_int64, ctypes.c_int64]
+library.mudg_parallel_sum.restype = ctypes.c_int64
+assert library.mudg_parallel_sum(100000, 100) == expected
+child = os.fork()
+if child == 0:
+    os._exit(0 if library.mudg_parallel_sum(100000, 100) == expected else 1)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+assert library.mudg_parallel_sum(100000, 100) == expected
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+# ---- photometric loss ----------------------------------------------------------------------------------------------
+
+
+def _images(shape: tuple[int, int, int], seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(shape, generator=generator)
+    return (target + 0.1 * torch.randn(shape, generator=generator)).clamp(0, 1), target
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 1), (3, 5, 7), (1, 40, 33), (3, 37, 64), (2, 70, 16), (3, 33, 129)])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_photometric_equals_its_float64_twin(isa: str, shape: tuple[int, int, int], weight: float) -> None:
+    prediction, target = _images(shape)
+    mine = prediction.clone().requires_grad_()
+    exact = prediction.double().requires_grad_()
+    got, want = fused.photometric(mine, target, weight), losses.photometric(exact, target.double(), weight)
+    assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
+    (3 * got).backward()
+    (3 * want).backward()
+    assert mine.grad is not None
+    assert exact.grad is not None
+    assert (mine.grad.double() - exact.grad).norm() <= 2e-6 * exact.grad.norm()
+
+
+@needs_native
+def test_photometric_of_equal_images_is_zero_and_flat() -> None:
+    _, target = _images((3, 30, 40))
+    image = target.clone().requires_grad_()
+    value = fused.photometric(image, target)
+    value.backward()
+    assert abs(value.item()) < 1e-6
+    assert image.grad is not None
+    assert image.grad.abs().max() < 1e-6
+
+
+@needs_native
+def test_photometric_does_not_depend_on_the_number_of_threads(pool: Any) -> None:
+    prediction, target = _images((3, 90, 70))
+    results = []
+    for threads in (1, 3):
+        native.set_threads(threads)
+        image = prediction.clone().requires_grad_()
+        value = fused.photometric(image, target)
+        value.backward()
+        results.append((value.item(), image.grad))
+    assert results[0][0] == results[1][0]
+    assert torch.equal(results[0][1], results[1][1])
+
+
+def test_photometric_refuses_what_does_not_fit() -> None:
+    with pytest.raises(InputError, match="one shape"):
+        fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 5))
+    with pytest.raises(UsageError, match="SSIM"):
+        fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 1.5)
+
+
+def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    prediction, target = _images((3, 20, 20))
+    parameter, gradient = torch.ones(4, 3), torch.full((4, 3), 0.5)
+    with_library = fused.photometric(prediction, target).item()
+    monkeypatch.setattr(native, "_loaded", None)
+    monkeypatch.setattr(native, "_problem", "not built: test")
+    assert fused.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
+    fused.adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
+    torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
+
+
+# ---- Adam ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(1,), (1000,), (257, 3), (40, 16, 3), (0, 4)])
+@pytest.mark.parametrize("sparse", [False, True])
+def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    parameter = torch.randn(shape, generator=generator)
+    visible = torch.rand(shape[:1], generator=generator) > 0.4 if sparse else None
+    mine = [parameter.clone(), torch.zeros(shape), torch.zeros(shape)]
+    exact = [t.double() for t in mine]
+    for step in range(1, 6):
+        gradient = torch.randn(shape, generator=generator)
+        fused.adam(mine[0], gradient, mine[1], mine[2], 1e-2, step, visible)
+        torch_adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
+    for got, want in zip(mine, exact):
+        torch.testing.assert_close(got.double(), want, rtol=2e-6, atol=2e-6)
+    if visible is not None:
+        assert torch.equal(mine[0][~visible], parameter[~visible])
+        assert mine[1][~visible].abs().sum() == 0
+
+
+@needs_native
+def test_adam_moves_every_element_alike_wherever_it_lies(pool: Any) -> None:
+    """Same history, same result: bit for bit, at any position, number of threads, dense or sparse."""
+    native.set_threads(3)
+    values = [torch.full((70_001,), x) for x in (0.3, 0.01, 0.02)]
+    fused.adam(values[0], torch.full((70_001,), 0.7), values[1], values[2], 1e-3, 4)
+    assert all(len(torch.unique(value)) == 1 for value in values)
+    rows = [torch.full((701, 5), x) for x in (0.3, 0.01, 0.02)]
+    visible = torch.arange(701) % 3 != 0
+    fused.adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4, visible)
+    for dense, sparse in zip(values, rows):
+        assert (sparse[visible] == dense[0]).all()
+
+
+@needs_native
+def test_adam_tells_autograd_that_values_have_changed() -> None:
+    weight = torch.ones(5, requires_grad=True)
+    loss = (weight * weight).sum()
+    fused.adam(weight.detach(), torch.ones(5), torch.zeros(5), torch.zeros(5), 0.1, 1)
+    with pytest.raises(RuntimeError, match="inplace"):
+        loss.backward()
+
+
+@needs_native
+def test_adam_drops_moments_too_small_to_matter() -> None:
+    parameter, first, second = torch.ones(40), torch.full((40,), 1e-37), torch.full((40,), 1e-37)
+    fused.adam(parameter, torch.zeros(40), first, second, 0.1, 500)
+    assert first.abs().max() == 0
+    assert second.max() == 0
+    assert torch.isfinite(parameter).all()
+
+
+def test_adam_refuses_what_does_not_fit() -> None:
+    a, b = torch.zeros(4, 2), torch.zeros(4, 3)
+    with pytest.raises(InputError, match="one shape"):
+        fused.adam(a, b, a, a, 0.1, 1)
+    with pytest.raises(InputError, match="visible"):
+        fused.adam(a, a, a, a, 0.1, 1, torch.ones(3, dtype=torch.bool))
+    with pytest.raises(UsageError, match="from 1"):
+        fused.adam(a, a, a, a, 0.1, 0)

@@ -1,0 +1,586 @@
+"""The rasteriser: known answers, the float64 specification, invariants, poison, the adapter to gsplat."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mudg import native
+from mudg.base import geometry
+from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
+from mudg.base.types import Camera, Gaussians, Render, View
+from mudg.core import raster, raster_gsplat
+from mudg.core.raster import BACKENDS, RasterConfig, rasterize
+
+needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
+CPU, TORCH = RasterConfig(backend="cpu"), RasterConfig(backend="torch")
+GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")
+Parameters = dict[str, Tensor]
+
+
+def _instruction_sets() -> list[str]:
+    found = []
+    if native.library() is not None:
+        for name in ("avx512", "avx2", "portable"):
+            try:
+                native.set_isa(name)
+            except UsageError:
+                continue
+            found.append(name)
+        native.set_isa("")
+    return found
+
+
+@pytest.fixture(params=_instruction_sets() or ["none"])
+def isa(request: pytest.FixtureRequest) -> Any:
+    if request.param == "none":
+        pytest.skip(native.status())
+    native.set_isa(request.param)
+    yield request.param
+    native.set_isa("")
+
+
+@pytest.fixture
+def restore_threads() -> Any:
+    before = native.threads()
+    yield
+    if native.library() is not None:
+        native.set_threads(before)
+
+
+def _view(width: int = 50, height: int = 37) -> View:
+    """A camera that is neither centred nor aligned with the world."""
+    turn = geometry.matrix_from_quaternion([0.97, 0.05, -0.1, 0.08])
+    pose = geometry.from_rotation_translation(turn, [0.3, -0.2, 0.1])
+    return View(Camera("front", width, height, 0.9 * width, 0.93 * width, 0.53 * width, 0.47 * height), pose, 0.0)
+
+
+def _axis_view(width: int, height: int, focal: float = 20.0) -> View:
+    """Looks along world z; the optical axis hits a pixel centre for odd sizes."""
+    return View(Camera("front", width, height, focal, focal, width / 2, height / 2), np.eye(4), 0.0)
+
+
+def _parameters(count: int, seed: int = 0, degree: int = 3, channels: int = 5, dtype: torch.dtype = torch.float32) -> Parameters:
+    """A cloud in front of `_view`, with large, small, flat, faint and nearly opaque Gaussians, some behind the camera."""
+    rng = np.random.default_rng(seed)
+    z = np.exp(rng.uniform(np.log(1.5), np.log(40), count)) * np.where(rng.random(count) < 0.08, -1, 1)
+    xyz = np.stack([z * rng.uniform(-0.7, 0.7, count), z * rng.uniform(-0.6, 0.6, count), z], 1)
+    scales = np.abs(z)[:, None] * np.exp(rng.uniform(np.log(0.004), np.log(0.12), (count, 3)))
+    scales[::7, 0] *= 0.02
+    values = {
+        "means": xyz, "quats": rng.standard_normal((count, 4)), "scales": scales,
+        "opacity": np.where(rng.random(count) < 0.4, rng.uniform(0.6, 0.998, count), rng.uniform(0.01, 0.5, count)),
+        "sh": 0.3 * rng.standard_normal((count, (degree + 1) ** 2, 3)), "extra": rng.standard_normal((count, channels)),
+    }  # fmt: skip
+    return {name: torch.tensor(value, dtype=torch.float32).to(dtype) for name, value in values.items()}
+
+
+def _gaussians(p: Parameters) -> Gaussians:
+    return Gaussians(p["means"], p["quats"], p["scales"], p["opacity"], p["sh"], p.get("extra"),
+                     torch.zeros(len(p["means"]), dtype=torch.int32))  # fmt: skip
+
+
+def _leaves(p: Parameters, dtype: torch.dtype = torch.float32) -> Parameters:
+    return {name: value.detach().to(dtype).clone().requires_grad_() for name, value in p.items()}
+
+
+def _one(mean: tuple[float, float, float], scale: float, opacity: float, rgb: tuple[float, float, float]) -> Parameters:
+    sh = (torch.tensor(rgb) - 0.5) / 0.2820947917738781
+    return {
+        "means": torch.tensor([mean]), "quats": torch.tensor([[1.0, 0, 0, 0]]), "scales": torch.full((1, 3), scale),
+        "opacity": torch.tensor([opacity]), "sh": sh[None, None], "extra": torch.tensor([[2.0]]),
+    }  # fmt: skip
+
+
+@pytest.fixture(params=["torch", pytest.param("cpu", marks=needs_native)])
+def config(request: pytest.FixtureRequest) -> RasterConfig:
+    return RasterConfig(backend=request.param)
+
+
+# ---- known answers -------------------------------------------------------------------------------------------------
+
+
+def test_one_gaussian_on_the_axis_has_the_alpha_of_the_formula(config: RasterConfig) -> None:
+    view, scale, z, opacity = _axis_view(21, 15), 0.4, 5.0, 0.8
+    out = rasterize(_gaussians(_one((0, 0, z), scale, opacity, (0.9, 0.5, 0.1))), view, config)
+    variance = (20.0 * scale / z) ** 2 + 0.3  # pixels^2
+    ys, xs = np.mgrid[0:15, 0:21]
+    alpha = opacity * np.exp(-0.5 * ((xs - 10.0) ** 2 + (ys - 7.0) ** 2) / variance)
+    alpha[alpha < 1 / 255] = 0
+    np.testing.assert_allclose(out.alpha[0].numpy(), alpha, atol=2e-6)
+    for channel, value in enumerate((0.9, 0.5, 0.1)):
+        np.testing.assert_allclose(out.rgb[channel].numpy(), alpha * value, atol=2e-6)
+    assert out.extra is not None
+    np.testing.assert_allclose(out.extra[0].numpy(), alpha * 2, atol=4e-6)
+    np.testing.assert_allclose(out.depth[0].numpy(), np.where(alpha > 0, z, 0), rtol=2e-5)
+    assert out.trace.visible.tolist() == [True]
+    np.testing.assert_allclose(out.trace.means2d.numpy(), [[10.5, 7.5]], atol=1e-5)
+    reach = np.sqrt(2 * np.log(opacity * 255) * variance)
+    np.testing.assert_allclose(out.trace.radii.numpy(), np.ceil([[reach, reach]]), atol=1)
+
+
+def test_the_nearer_of_two_covers_the_farther_whatever_their_order(config: RasterConfig) -> None:
+    near, far = _one((0, 0, 4.0), 3.0, 0.6, (1, 0, 0)), _one((0, 0, 8.0), 6.0, 0.5, (0, 1, 0))
+    for first, second in ((near, far), (far, near)):
+        both = {name: torch.cat([first[name], second[name]]) for name in first}
+        out = rasterize(_gaussians(both), _axis_view(5, 5), config)
+        centre = [float(out.rgb[0, 2, 2]), float(out.rgb[1, 2, 2]), float(out.alpha[0, 2, 2])]
+        np.testing.assert_allclose(centre, [0.6, 0.4 * 0.5, 1 - 0.4 * 0.5], atol=1e-5)
+        assert float(out.depth[0, 2, 2]) == pytest.approx((0.6 * 4 + 0.2 * 8) / 0.8, rel=1e-5)
+
+
+def test_alpha_is_capped_and_the_background_shows_through_the_rest(config: RasterConfig) -> None:
+    background = torch.tensor([0.2, 0.4, 1.0])
+    huge = _gaussians(_one((0, 0, 5.0), 1e4, 1.0, (0, 0, 0)))
+    out = rasterize(huge, _axis_view(33, 18), replace(config, alpha_max=0.9), background=background)
+    torch.testing.assert_close(out.alpha, torch.full((1, 18, 33), 0.9), atol=1e-5, rtol=0)
+    torch.testing.assert_close(out.rgb, (0.1 * background)[:, None, None].expand(3, 18, 33), atol=1e-5, rtol=0)
+    image = background[:, None, None].expand(3, 18, 33).contiguous()
+    same = rasterize(huge, _axis_view(33, 18), replace(config, alpha_max=0.9), background=image)
+    torch.testing.assert_close(same.rgb, out.rgb, atol=1e-6, rtol=0)
+
+
+def test_antialiasing_dims_a_gaussian_smaller_than_a_pixel_by_the_ratio_of_areas(config: RasterConfig) -> None:
+    dot = _gaussians(_one((0, 0, 5.0), 0.05, 0.9, (1, 1, 1)))  # sigma 0.2 px
+    plain = float(rasterize(dot, _axis_view(15, 15), config).alpha[0, 7, 7])
+    careful = float(rasterize(dot, _axis_view(15, 15), replace(config, antialias=True)).alpha[0, 7, 7])
+    sharp = (20 * 0.05 / 5) ** 2
+    assert plain == pytest.approx(0.9, rel=1e-5)
+    assert careful == pytest.approx(0.9 * sharp / (sharp + 0.3), rel=1e-5)
+
+
+def test_colours_follow_the_viewing_direction_and_are_clamped_at_zero(config: RasterConfig) -> None:
+    p = _one((0, 0, 5.0), 1.0, 0.5, (0.5, 0.5, 0.5))
+    p["sh"] = torch.cat([p["sh"], torch.zeros(1, 3, 3)], 1)
+    p["sh"][0, 2] = torch.tensor([1.0, -2.0, 0.0])  # the band along z, seen along +z
+    centre = rasterize(_gaussians(p), _axis_view(9, 9), config).rgb[:, 4, 4]
+    expected = torch.tensor([0.5 + 0.48860251190292, 0.0, 0.5]) * 0.5
+    torch.testing.assert_close(centre, expected, atol=1e-5, rtol=0)
+    flat = rasterize(_gaussians(p), _axis_view(9, 9), replace(config, sh_degree=0)).rgb[:, 4, 4]
+    torch.testing.assert_close(flat, torch.full((3,), 0.25), atol=1e-5, rtol=0)
+
+
+def test_means2d_are_those_of_the_one_projection(config: RasterConfig) -> None:
+    p, view = _parameters(200), _view()
+    trace = rasterize(_gaussians(p), view, config).trace
+    uv, z = geometry.project(view, p["means"].numpy())
+    seen = trace.visible.numpy()
+    assert seen.sum() > 100
+    assert (z[seen] > 0).all()
+    np.testing.assert_allclose(trace.means2d.numpy()[seen], uv[seen], atol=2e-3)
+    assert (trace.means2d.numpy()[~seen] == 0).all()
+
+
+# ---- against the float64 specification -----------------------------------------------------------------------------
+
+
+def _weighted(out: Render, weights: dict[str, Tensor]) -> Tensor:
+    return torch.stack([(getattr(out, name) * weight.to(out.rgb)).sum() for name, weight in weights.items()]).sum()
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_native_agrees_with_the_float64_reference(isa: str, antialias: bool, seed: int) -> None:
+    view, p = _view(53, 38), _parameters(400, seed)
+    single, double = _leaves(p), _leaves(p, torch.float64)
+    pose32 = torch.tensor(view.world_from_cam, dtype=torch.float32, requires_grad=True)
+    pose64 = pose32.detach().double().requires_grad_()
+    color32 = torch.tensor([0.2, 0.5, 0.7], requires_grad=True)
+    color64 = color32.detach().double().requires_grad_()
+    got = rasterize(_gaussians(single), view, replace(CPU, antialias=antialias), background=color32, world_from_cam=pose32, absgrad=True)
+    want = rasterize(_gaussians(double), view, replace(TORCH, antialias=antialias), background=color64, world_from_cam=pose64, absgrad=True)
+
+    # A pixel on the very edge of the alpha cut or of the stopping rule may fall to either side: such pixels (the stated band)
+    # may be at most 0.5 % and are left out of the rest.
+    names = ("rgb", "depth", "alpha", "extra")
+    errors = []
+    for n in names:
+        mine, exact = getattr(got, n).detach().double(), getattr(want, n).detach()
+        errors.append(((mine - exact).abs() / exact.abs().max()).amax(0))
+    band = torch.stack(errors).amax(0) > 1e-5
+    assert band.double().mean() < 0.005
+    generator = torch.Generator().manual_seed(seed)
+    weights = {n: torch.randn(getattr(got, n).shape, generator=generator) * ~band for n in names}
+    _weighted(got, weights).backward()
+    _weighted(want, weights).backward()
+    pairs = {name: (single[name].grad, double[name].grad) for name in GROUPS}
+    pairs |= {"pose": (pose32.grad, pose64.grad), "background": (color32.grad, color64.grad)}
+    pairs |= {"means2d": (got.trace.means2d.grad, want.trace.means2d.grad), "abs": (got.trace.abs_grad2d, want.trace.abs_grad2d)}
+    for name, (mine, reference) in pairs.items():
+        assert mine is not None
+        assert reference is not None
+        assert reference.norm() > 0, name
+        assert (mine.double() - reference).norm() / reference.norm() < 1e-4, name
+    assert torch.equal(got.trace.visible, want.trace.visible)
+
+
+def test_reference_gradients_match_finite_differences() -> None:
+    view = _view(7, 5)
+    values = _parameters(3, seed=3, degree=1, channels=1)
+    values["scales"] *= 4
+    values["opacity"] = torch.tensor([0.5, 0.7, 0.3])
+    p = _leaves(values, torch.float64)
+    pose = torch.tensor(view.world_from_cam, requires_grad=True)
+    background = torch.tensor([0.3, 0.1, 0.9], dtype=torch.float64, requires_grad=True)
+
+    def draw(*values: Tensor) -> tuple[Tensor, ...]:
+        parts, (pose, background) = dict(zip(GROUPS, values)), values[-2:]
+        config = replace(TORCH, antialias=True)
+        out = rasterize(_gaussians(parts), view, config, background=background, world_from_cam=pose)
+        assert out.extra is not None
+        return out.rgb, out.depth * out.alpha, out.alpha, out.extra
+
+    inputs = (*(p[n] for n in GROUPS), pose, background)
+    assert draw(*inputs)[2].max() > 0.3
+    assert torch.autograd.gradcheck(draw, inputs, eps=1e-7, atol=1e-4, rtol=1e-4)
+
+
+# ---- invariants ----------------------------------------------------------------------------------------------------
+
+
+def _everything(p: Parameters, view: View, config: RasterConfig) -> list[Tensor]:
+    leaves = _leaves(p)
+    out = rasterize(_gaussians(leaves), view, config, absgrad=True)
+    assert out.extra is not None
+    generator = torch.Generator().manual_seed(5)
+    weights = {n: torch.randn(getattr(out, n).shape, generator=generator) for n in ("rgb", "depth", "alpha", "extra")}
+    _weighted(out, weights).backward()
+    gradients = [leaves[n].grad for n in GROUPS]
+    images = (out.rgb, out.depth, out.alpha, out.extra)
+    everything = (*images, out.trace.means2d.grad, out.trace.abs_grad2d, *gradients)
+    return [t.detach() for t in everything if t is not None]
+
+
+@needs_native
+def test_results_do_not_depend_on_the_number_of_threads(restore_threads: None) -> None:
+    p, view = _parameters(3000), _view(90, 70)
+    results = []
+    for threads in (1, 2, 5):
+        native.set_threads(threads)
+        results.append(_everything(p, view, CPU))
+    assert len(results[0]) == 12
+    for other in results[1:]:
+        for mine, theirs in zip(results[0], other):
+            assert torch.equal(mine, theirs)
+
+
+def test_the_order_of_the_gaussians_does_not_matter(config: RasterConfig) -> None:
+    p, view = _parameters(300), _view()
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(1))
+    plain = rasterize(_gaussians(p), view, config)
+    mixed = rasterize(_gaussians({n: v[order] for n, v in p.items()}), view, config)
+    for name in ("rgb", "depth", "alpha"):
+        torch.testing.assert_close(getattr(plain, name), getattr(mixed, name), atol=1e-6, rtol=1e-6)
+    assert torch.equal(plain.trace.visible[order], mixed.trace.visible)
+
+
+@needs_native
+@pytest.mark.parametrize("channels", [0, 1, 4, 5, 8, 9, 13, 17, 20, 21, 24, 25, 28])
+def test_any_number_of_channels_gives_the_same_numbers(channels: int) -> None:
+    p, view = _parameters(300, channels=28), _view()
+    full = _leaves(p)
+    part = _leaves({**p, "extra": p["extra"][:, :channels]})
+    a, b = rasterize(_gaussians(full), view, CPU), rasterize(_gaussians(part), view, CPU)
+    assert a.extra is not None
+    assert b.extra is not None
+    assert torch.equal(a.rgb, b.rgb)
+    assert torch.equal(a.extra[:channels], b.extra)
+    (a.extra[:channels].square().sum() + a.rgb.sum()).backward()
+    (b.extra.square().sum() + b.rgb.sum()).backward()
+    torch.testing.assert_close(full["means"].grad, part["means"].grad, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(full["extra"].grad[:, :channels], part["extra"].grad, rtol=1e-5, atol=1e-5)  # type: ignore[index]
+
+
+def test_no_features_means_none(config: RasterConfig) -> None:
+    p = _parameters(20)
+    del p["extra"]
+    assert rasterize(_gaussians(p), _view(), config).extra is None
+
+
+@needs_native
+def test_far_from_the_origin_nothing_is_lost() -> None:
+    p, view = _parameters(500), _view()
+    p["means"] = (p["means"] * 64).round() / 64  # exactly representable at 4096 m, too
+    shift = np.array([4096.0, -2048.0, 512.0])
+    pose = view.world_from_cam.copy()
+    pose[:3, 3] += shift
+    moved = {**p, "means": p["means"] + torch.tensor(shift, dtype=torch.float32)}
+    here = rasterize(_gaussians(p), view, CPU)
+    there = rasterize(_gaussians(moved), View(view.camera, pose, 0.0), CPU)
+    torch.testing.assert_close(here.rgb, there.rgb, atol=1e-5, rtol=0)
+
+
+@needs_native
+def test_several_graphs_may_be_alive_and_end_in_any_order() -> None:
+    view = _view()
+    scenes = [_leaves(_parameters(200, seed)) for seed in range(3)]
+    alone = []
+    for scene in scenes:
+        rasterize(_gaussians(scene), view, CPU).rgb.square().sum().backward()
+        alone.append(scene["means"].grad.clone())  # type: ignore[union-attr]
+        scene["means"].grad = None
+    losses = [rasterize(_gaussians(scene), view, CPU).rgb.square().sum() for scene in scenes]
+    for index in (1, 2, 0):
+        losses[index].backward()
+    for scene, expected in zip(scenes, alone):
+        assert torch.equal(scene["means"].grad, expected)  # type: ignore[arg-type]
+
+
+@needs_native
+def test_threads_of_python_may_draw_at_the_same_time() -> None:
+    view, p = _view(), _parameters(500)
+    expected = _everything(p, view, CPU)
+    results: list[list[Tensor]] = [[] for _ in range(4)]
+
+    def work(slot: int) -> None:
+        for _ in range(5):
+            results[slot] = _everything(p, view, CPU)
+
+    workers = [threading.Thread(target=work, args=(slot,)) for slot in range(4)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    for result in results:
+        assert all(torch.equal(a, b) for a, b in zip(result, expected))
+
+
+def test_backward_twice_adds_up_and_editing_an_input_is_refused(config: RasterConfig) -> None:
+    p = _leaves(_parameters(50))
+    loss = rasterize(_gaussians(p), _view(), config).rgb.sum()
+    loss.backward(retain_graph=True)
+    once = p["means"].grad.clone()  # type: ignore[union-attr]
+    loss.backward(retain_graph=True)
+    torch.testing.assert_close(p["means"].grad, 2 * once)
+    if config.backend == "torch":
+        return  # torch keeps copies, so an edit does no harm there
+    with torch.no_grad():
+        p["quats"].add_(1.0)
+    with pytest.raises(RuntimeError, match="inplace"):
+        loss.backward()
+
+
+def test_no_gradient_is_recorded_where_none_is_wanted(config: RasterConfig) -> None:
+    out = rasterize(_gaussians(_parameters(50)), _view(), config, absgrad=True)
+    assert not out.rgb.requires_grad
+    assert not out.trace.means2d.requires_grad
+    with torch.no_grad():
+        assert not rasterize(_gaussians(_leaves(_parameters(50))), _view(), config).rgb.requires_grad
+
+
+# ---- odd sizes and poison ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 40), (33, 1), (16, 16), (17, 15)])
+@pytest.mark.parametrize("count", [0, 1, 17])
+def test_odd_sizes(config: RasterConfig, width: int, height: int, count: int) -> None:
+    p = _leaves({n: v[:count] for n, v in _parameters(20, seed=2).items()})
+    background = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
+    out = rasterize(_gaussians(p), _view(width, height), config, background=background)
+    assert out.rgb.shape == (3, height, width)
+    assert out.depth.shape == out.alpha.shape == (1, height, width)
+    (out.rgb.sum() + out.depth.sum()).backward()
+    torch.testing.assert_close(background.grad, (1 - out.alpha.detach()).sum().expand(3), rtol=1e-5, atol=1e-5)
+    for value in p.values():
+        assert value.grad is None or torch.isfinite(value.grad).all()
+
+
+def test_everything_behind_the_camera_leaves_the_background(config: RasterConfig) -> None:
+    p = _leaves(_parameters(40))
+    with torch.no_grad():
+        p["means"][:, 2] = -p["means"][:, 2].abs() - 2
+    out = rasterize(_gaussians(p), _view(), config, background=torch.tensor([0.5, 0.25, 1.0]))
+    assert not out.trace.visible.any()
+    assert out.alpha.abs().max() == 0
+    assert out.depth.abs().max() == 0
+    assert torch.equal(out.rgb[1], torch.full_like(out.rgb[1], 0.25))
+    out.rgb.sum().backward()
+    assert p["means"].grad is None or p["means"].grad.abs().max() == 0
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacity", "sh", "extra"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+def test_parameters_that_are_not_finite_are_refused_by_name(config: RasterConfig, name: str, bad: float) -> None:
+    p = _parameters(40)
+    seen = int(torch.nonzero(rasterize(_gaussians(p), _view(), config).trace.visible)[3, 0])
+    p[name][seen].view(-1)[0] = bad
+    with pytest.raises(NumericsError) as caught:
+        rasterize(_gaussians(p), _view(), config)
+    if name in ("means", "quats", "scales", "opacity"):
+        assert f"Gaussian {seen}" in str(caught.value)
+        assert name in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [("means", 1e38), ("means", -1e38), ("means", 1e-40), ("quats", 0.0), ("quats", 1e-30), ("quats", 1e38), ("scales", 0.0),
+     ("scales", 1e-40), ("scales", 1e38), ("scales", 1e15), ("scales", -0.5), ("opacity", 0.0), ("opacity", 1.0), ("opacity", 1 / 255),
+     ("opacity", 1e-40), ("opacity", -1.0), ("opacity", 7.0)],
+)  # fmt: skip
+@pytest.mark.parametrize("antialias", [False, True])
+def test_finite_poison_is_drawn_or_culled_and_never_spreads(config: RasterConfig, name: str, bad: float, antialias: bool) -> None:
+    p = _leaves(_parameters(60))
+    with torch.no_grad():
+        p[name][::3] = bad
+    out = rasterize(_gaussians(p), _view(), replace(config, antialias=antialias), absgrad=True)
+    assert out.extra is not None
+    for image in (out.rgb, out.depth, out.alpha, out.extra):
+        assert torch.isfinite(image).all()
+    (out.rgb.sum() + out.depth.sum() + out.extra.sum()).backward()
+    for value in p.values():
+        assert value.grad is not None
+        assert torch.isfinite(value.grad).all()
+    assert (out.alpha.detach() >= 0).all()
+    assert (out.alpha.detach() < 1).all()
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-6, -1e-6])
+def test_the_near_plane_is_exclusive(config: RasterConfig, shift: float) -> None:
+    p = _one((0, 0, 2.0), 0.1, 0.5, (1, 1, 1))
+    p["means"][0, 2] = 2.0 + shift
+    out = rasterize(_gaussians(p), _axis_view(9, 9), replace(config, near_m=2.0))
+    assert bool(out.trace.visible[0]) == (float(p["means"][0, 2]) > 2.0)
+
+
+@needs_native
+def test_a_long_needle_across_the_image_matches_the_reference() -> None:
+    p = _one((0, 0, 5.0), 0.01, 0.9, (1, 1, 1))
+    p["scales"] = torch.tensor([[30.0, 1e-4, 1e-4]])
+    p["quats"] = torch.tensor([[0.92, 0.1, 0.05, 0.37]])
+    a, b = _leaves(p), _leaves(p, torch.float64)
+    view = _axis_view(200, 150, 90.0)
+    got, want = rasterize(_gaussians(a), view, CPU), rasterize(_gaussians(b), view, TORCH)
+    clear = want.alpha > 1.1 / 255  # the rim of a needle is where the alpha cut falls this way or that
+    assert clear.sum() > 300
+    torch.testing.assert_close(got.alpha.double()[clear], want.alpha[clear], atol=2e-5, rtol=0)
+
+
+# ---- the front door ------------------------------------------------------------------------------------------------
+
+
+def test_bad_requests_are_refused_in_words() -> None:
+    depths = ({"near_m": 0.0}, {"near_m": 5.0, "far_m": 1.0})
+    for wrong in (*depths, {"alpha_max": 1.0}, {"blur_px2": -1.0}, {"sh_degree": 4}, {"backend": "cuda"}):
+        with pytest.raises(UsageError):
+            RasterConfig(**wrong)  # type: ignore[arg-type]
+    p = _parameters(5)
+    with pytest.raises(InputError, match="coefficients"):
+        rasterize(_gaussians({**p, "sh": p["sh"][:, :4]}), _view(), replace(TORCH, sh_degree=2))
+    with pytest.raises(InputError, match="feature channels"):
+        rasterize(_gaussians({**p, "extra": torch.zeros(5, 29)}), _view(), TORCH)
+    with pytest.raises(InputError, match="background"):
+        rasterize(_gaussians(p), _view(), TORCH, background=torch.zeros(4))
+    with pytest.raises(InputError, match="background"):
+        rasterize(_gaussians(p), _view(), TORCH, background=torch.zeros(3, 2, 2))
+    with pytest.raises(InputError, match="share"):
+        rasterize(_gaussians({**p, "quats": p["quats"].double()}), _view(), TORCH)
+    with pytest.raises(InputError, match="world_from_cam"):
+        rasterize(_gaussians(p), _view(), TORCH, world_from_cam=torch.eye(3))
+
+
+@needs_native
+def test_float64_goes_to_the_reference_and_is_refused_by_the_native_backend() -> None:
+    p = _parameters(5, dtype=torch.float64)
+    assert rasterize(_gaussians(p), _view()).rgb.dtype == torch.float64
+    with pytest.raises(InputError, match="float32"):
+        rasterize(_gaussians(p), _view(), CPU)
+
+
+def test_without_the_library_auto_takes_torch_and_cpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "_loaded", None)
+    monkeypatch.setattr(native, "_problem", "not built: test")
+    used: list[str] = []
+    monkeypatch.setitem(BACKENDS, "torch", lambda request: used.append("torch") or raster.raster_torch.render(request))
+    rasterize(_gaussians(_parameters(5)), _view())
+    assert used == ["torch"]
+    with pytest.raises(ResourceError, match="not available"):
+        rasterize(_gaussians(_parameters(5)), _view(), CPU)
+
+
+def test_gsplat_is_refused_where_it_is_missing() -> None:
+    if not raster_gsplat.problem():
+        pytest.skip("gsplat is installed here")
+    with pytest.raises(ResourceError, match="gsplat"):
+        rasterize(_gaussians(_parameters(5)), _view(), RasterConfig(backend="gsplat"))
+
+
+class _FakeGsplat(SimpleNamespace):
+    """Records the call and returns images whose values depend on the inputs in a simple way."""
+
+    def __init__(self) -> None:
+        super().__init__(calls=[])
+
+    def spherical_harmonics(self, degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
+        self.calls.append(("sh", degree, directions))
+        return coefficients[:, 0]
+
+    def rasterization(self, **arguments: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        self.calls.append(("draw", arguments))
+        colors, height, width = arguments["colors"], arguments["height"], arguments["width"]
+        means2d = arguments["means"][None, :, :2] * 1.0
+        if means2d.requires_grad:
+            means2d.retain_grad()
+            means2d.register_hook(lambda g: setattr(means2d, "absgrad", 2 * g.abs()))
+        channels = torch.cat([colors.sum(0), means2d.sum()[None]])
+        image = channels.expand(1, height, width, -1)
+        alpha = torch.full((1, height, width, 1), 0.25)
+        return image, alpha, {"means2d": means2d, "radii": torch.ones(1, len(colors), 2, dtype=torch.int32)}
+
+
+def test_the_gsplat_adapter_maps_every_argument() -> None:
+    fake, view = _FakeGsplat(), _view(6, 4)
+    p = _leaves(_parameters(7, degree=2, channels=3))
+    config = RasterConfig(near_m=0.2, far_m=90.0, blur_px2=0.1, antialias=True)
+    pose = torch.tensor(view.world_from_cam, dtype=torch.float32)
+    request = raster.Request(_gaussians(p), view, config, 2, torch.tensor([0.0, 0.0, 1.0]), pose, True)
+    out = raster_gsplat.render(request, module=fake)  # type: ignore[arg-type]
+    (_, degree, directions), (_, draw) = fake.calls
+    assert degree == 2
+    torch.testing.assert_close(directions, torch.nn.functional.normalize(p["means"] - pose[:3, 3], dim=1))
+    assert draw["near_plane"] == 0.2
+    assert draw["far_plane"] == 90.0
+    assert draw["eps2d"] == 0.1
+    assert draw["rasterize_mode"] == "antialiased"
+    assert draw["render_mode"] == "RGB+D"
+    assert draw["absgrad"] is True
+    assert draw["packed"] is False
+    assert draw["sh_degree"] is None
+    assert (draw["width"], draw["height"]) == (6, 4)
+    torch.testing.assert_close(draw["viewmats"][0], torch.tensor(view.cam_from_world, dtype=torch.float32))
+    np.testing.assert_allclose(draw["Ks"][0].numpy(), view.camera.matrix, rtol=1e-6)
+    torch.testing.assert_close(draw["opacities"], p["opacity"])
+    torch.testing.assert_close(draw["colors"][:, 3:], p["extra"])
+    torch.testing.assert_close(draw["colors"][:, :3], (p["sh"][:, 0] + 0.5).clamp_min(0))
+    assert out.extra is not None
+    torch.testing.assert_close(out.extra[:, 0, 0], p["extra"].sum(0))
+    torch.testing.assert_close(out.rgb[2, 0, 0], (p["sh"][:, 0, 2] + 0.5).clamp_min(0).sum() + 0.75)
+    torch.testing.assert_close(out.depth * out.alpha, p["means"][:, :2].sum().expand(1, 4, 6))
+    out.depth.sum().backward()
+    assert out.trace.means2d.grad is not None
+    torch.testing.assert_close(out.trace.means2d.grad, torch.full((7, 2), 4 * 24.0))
+    assert out.trace.abs_grad2d is not None
+    torch.testing.assert_close(out.trace.abs_grad2d, torch.full((7, 2), 8 * 24.0))
+    assert out.trace.visible.all()
+
+
+@needs_native
+@pytest.mark.slow
+def test_five_million_gaussians() -> None:
+    generator = torch.Generator().manual_seed(0)
+    count = 5_000_000
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([60.0, 30.0, 90.0]) - torch.tensor([30.0, 15.0, 0.0])
+    p = {"means": means, "quats": torch.randn(count, 4, generator=generator), "scales": torch.full((count, 3), 0.03),
+         "opacity": torch.full((count,), 0.2), "sh": torch.zeros(count, 1, 3)}  # fmt: skip
+    leaves = _leaves(p)
+    out = rasterize(_gaussians(leaves), _axis_view(480, 320, 400.0), CPU)
+    out.rgb.sum().backward()
+    assert torch.isfinite(out.rgb).all()
+    assert torch.isfinite(leaves["means"].grad).all()  # type: ignore[arg-type]
+    assert int(out.trace.visible.sum()) > 100_000

@@ -1,0 +1,174 @@
+"""synthesize: every frame is made, windows join, interruptions leave no trace, sizes fit."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from toy_scene import ToyStreet
+
+from mudg.base.errors import InputError, UsageError
+from mudg.data.observations import list_observation_sets, read_observations
+from mudg.models import mdm
+from mudg.models.mdm import MDM, MDMConfig
+from mudg.models.vae import CodecConfig
+from mudg.stages import fuse, synthesize
+from mudg.stages.config import FuseConfig, SynthesizeConfig
+
+FRAMES = 7
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A made-up street as a scene, its fused cloud, and a tiny model with a window of four frames."""
+    root = tmp_path_factory.mktemp("street")
+    ToyStreet(times=[0.1 * n for n in range(FRAMES)]).write(root / "scene", width=96, height=64)
+    fuse.run(FuseConfig(), root / "scene", root / "fused")
+    torch.manual_seed(0)
+    model = MDM(
+        MDMConfig(
+            widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4,
+            embed_width=16, codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+        )
+    )  # fmt: skip
+    mdm.save(model, root / "model", "", {})
+    config = SynthesizeConfig(
+        cameras=("front",), shifts_m=(1.0,), model=str(root / "model"), steps=2, width_px=48, full_size=False,
+        precision="float32", processes=1,
+    )  # fmt: skip
+    return root, config
+
+
+def made(world, out, **changes):
+    root, config = world
+    return synthesize.run(replace(config, **changes), root / "scene", root / "fused", out)
+
+
+def frames_of(path):
+    found = read_observations(path)
+    return [found[i] for i in range(len(found))]
+
+
+def test_every_frame_is_made(world, tmp_path):
+    out = made(world, tmp_path / "out")
+    sets = list_observation_sets(out)
+    assert list(sets) == ["front_shift+1.0"]
+    found = read_observations(sets["front_shift+1.0"])
+    assert len(found) == FRAMES
+    assert [round(v.time_s, 3) for v in found.views] == [round(0.1 * n, 3) for n in range(FRAMES)]
+    assert float(found.views[3].center_world[1]) == pytest.approx(1.0)
+    first = found[0]
+    assert first.rgb.shape == (3, 32, 48)
+    assert first.kind == "virtual"
+    assert first.source == "mudg_r"
+    assert float(first.confidence.max()) <= 1
+    finite = torch.isfinite(first.depth)
+    assert bool(finite.any())
+    assert float(first.depth[finite].min()) > 0
+    assert (out / "front_shift+1.0" / "overview.png").is_file()
+    assert not (out / "front_shift+1.0" / "state").exists()
+
+
+def test_interruption_leaves_no_trace(world, tmp_path, monkeypatch):
+    whole = frames_of(made(world, tmp_path / "whole") / "front_shift+1.0")
+    make = synthesize.ViewMaker.make
+
+    def stop_in_second_window(self, views, number, known):
+        if number == 1:
+            raise KeyboardInterrupt
+        return make(self, views, number, known)
+
+    monkeypatch.setattr(synthesize.ViewMaker, "make", stop_in_second_window)
+    with pytest.raises(KeyboardInterrupt):
+        made(world, tmp_path / "parts")
+    monkeypatch.setattr(synthesize.ViewMaker, "make", make)
+    with pytest.raises(InputError):
+        read_observations(tmp_path / "parts" / "front_shift+1.0")
+    parts = frames_of(made(world, tmp_path / "parts") / "front_shift+1.0")
+    for index, (a, b) in enumerate(zip(whole, parts, strict=True)):
+        assert torch.equal(a.rgb, b.rgb), index
+        assert torch.equal(a.depth.nan_to_num(), b.depth.nan_to_num()), index
+        assert torch.equal(a.semantics, b.semantics), index
+
+
+def test_processes_give_the_same_as_one(world, tmp_path):
+    one = made(world, tmp_path / "one", shifts_m=(1.0, -1.0))
+    two = made(world, tmp_path / "two", shifts_m=(1.0, -1.0), processes=2)
+    for name in ("front_shift+1.0", "front_shift-1.0"):
+        for a, b in zip(frames_of(one / name), frames_of(two / name), strict=True):
+            assert torch.equal(a.rgb, b.rgb)
+
+
+def test_full_size_views_have_the_cameras_size(world, tmp_path):
+    out = made(world, tmp_path / "out", full_size=True)
+    first = read_observations(out / "front_shift+1.0")[2]
+    assert first.rgb.shape == (3, 64, 96)
+    assert first.semantics.shape == (64, 96)
+    assert first.view.camera.width == 96
+
+
+def test_finished_result_is_reused(world, tmp_path, monkeypatch):
+    made(world, tmp_path / "out")
+    monkeypatch.setattr(synthesize, "make_trajectory", None)
+    made(world, tmp_path / "out")
+    with pytest.raises(UsageError, match="another configuration"):
+        made(world, tmp_path / "out", steps=3)
+
+
+@pytest.mark.parametrize("frames", [1, 3, 8, 9, 13, 24, 199])
+@pytest.mark.parametrize("overlap", [0, 2, 7])
+def test_windows_cover_every_frame(frames, overlap):
+    spans = synthesize.windows(frames, 8, overlap)
+    assert spans[0].start == 0
+    assert spans[-1].stop == frames
+    assert sorted({i for span in spans for i in span}) == list(range(frames))
+    for before, after in zip(spans, spans[1:]):
+        assert before.stop - after.start >= overlap
+        assert after.stop > before.stop
+        assert len(after) == 8
+
+
+def test_overlap_must_leave_something_new():
+    with pytest.raises(UsageError):
+        synthesize.windows(20, 8, 8)
+
+
+def test_model_size_keeps_aspect_and_area():
+    assert synthesize.model_size(480, 320, 16, 128 * 192) == (192, 128)
+    assert synthesize.model_size(1920, 1280, 16, 128 * 192) == (192, 128)
+    width, height = synthesize.model_size(1242, 375, 16, 128 * 192)
+    assert width % 16 == height % 16 == 0
+    assert abs(width / height / (1242 / 375) - 1) < 0.1
+    assert abs(width * height / (128 * 192) - 1) < 0.3
+    assert synthesize.model_size(480, 320, 16, 1, width_px=100) == (96, 64)
+
+
+def test_detail_is_given_back_where_the_sample_agrees(world):
+    generator = torch.Generator().manual_seed(0)
+    fine = torch.rand(2, 3, 32, 48, generator=generator)
+    coarse = torch.nn.functional.interpolate(fine, size=(16, 24), mode="area")
+
+    def stand_in(color):
+        shape = (2, 1, *color.shape[-2:])
+        return type("C", (), {"color": color, "valid": torch.ones(shape) > 0, "warped": torch.ones(shape) > 0})()
+
+    full = synthesize.add_detail(coarse, stand_in(coarse), stand_in(fine))
+    assert torch.allclose(full, fine, atol=1e-4)
+    changed = (coarse + 0.5).clamp(0, 1)
+    other = synthesize.add_detail(changed, stand_in(coarse), stand_in(fine))
+    enlarged = torch.nn.functional.interpolate(changed, size=(32, 48), mode="bicubic", align_corners=False).clamp(0, 1)
+    moved = (changed - coarse).abs().amax(1, keepdim=True) > 0.12
+    untouched = -torch.nn.functional.max_pool2d(-moved.float(), 5, stride=1, padding=2) > 0
+    untouched = torch.nn.functional.interpolate(untouched.float(), size=(32, 48)) > 0
+    assert bool(untouched.any())
+    assert torch.allclose((other * untouched), enlarged * untouched, atol=1e-5)
+
+
+def test_bad_requests(world, tmp_path):
+    with pytest.raises(InputError, match="no diffusion model"):
+        made(world, tmp_path / "a", model=str(tmp_path / "nowhere"))
+    with pytest.raises((InputError, UsageError)):
+        made(world, tmp_path / "b", cameras=("roof",))
+    with pytest.raises(UsageError, match="nothing to synthesize"):
+        made(world, tmp_path / "c", shifts_m=())
+    with pytest.raises(UsageError, match="same trajectory"):
+        made(world, tmp_path / "d", shifts_m=(1.0, 1.01))
