@@ -67,7 +67,7 @@ class _Context:
 
     def __del__(self) -> None:
         if getattr(self, "handle", None):
-            _Context._free.append(self.handle)
+            type(self)._free.append(self.handle)
 
 
 def _statistics(library: ctypes.CDLL, handle: int) -> dict[str, float]:
@@ -181,7 +181,7 @@ class _Rasterize(torch.autograd.Function):
         status = call.library.mudg_raster_backward(ctx.context.handle, ctypes.byref(image), ctypes.byref(gradient))
         if status != 0:
             _raise(status, ctx.context, parts)
-        if absolute is not None:
+        if absolute is not None and call.abs_grad2d is not None:
             call.abs_grad2d.add_(absolute)
         of_background = torch.tensor(list(gradient.background), dtype=ctx.background_type) if needs[6] else None
         of_pose = _pose_gradient(gradient, ctx.pose_type) if needs[7] else None

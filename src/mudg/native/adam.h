@@ -13,7 +13,8 @@ constexpr float kTinyMoment = 1e-37f;
 struct AdamLanes {
   Floats parameter, moment1, moment2;
 };
-MUDG_INLINE AdamLanes adam_lanes(const AdamJob& job, Floats parameter, Floats gradient, Floats moment1, Floats moment2) {
+MUDG_INLINE AdamLanes adam_lanes(const AdamJob& job, Floats parameter, Floats gradient, Floats moment1,
+                                 Floats moment2) {
   const Floats tiny = splat(kTinyMoment);
   moment1 = mul_add(splat(1.0f - job.beta1), gradient - moment1, moment1);
   moment2 = mul_add(splat(1.0f - job.beta2), gradient * gradient, splat(job.beta2) * moment2);
@@ -33,7 +34,8 @@ MUDG_INLINE void adam_range(const AdamJob& job, std::size_t begin, std::size_t e
     store_unaligned(job.moment2 + i, next.moment2);
   }
   if (i == end) return;
-  const std::size_t bytes = (end - i) * sizeof(float);  // the rest through copies, so that every element sees the same arithmetic
+  const std::size_t bytes =
+      (end - i) * sizeof(float);  // the rest through copies, so that every element sees the same arithmetic
   alignas(64) float p[kLanes] = {}, g[kLanes] = {}, m[kLanes] = {}, v[kLanes] = {};
   std::memcpy(p, job.parameter + i, bytes);
   std::memcpy(g, job.gradient + i, bytes);

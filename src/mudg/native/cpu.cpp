@@ -13,7 +13,8 @@ namespace mudg {
 namespace {
 
 #if defined(__x86_64__)
-// Read from the processor directly: __builtin_cpu_supports needs a run-time part that not every tool chain brings along.
+// Read from the processor directly: __builtin_cpu_supports needs a run-time part that not every tool chain brings
+// along.
 struct X86Features {
   bool avx2 = false, avx512 = false;
 
@@ -26,7 +27,8 @@ struct X86Features {
     __asm__ volatile("xgetbv" : "=a"(state_low), "=d"(state_high) : "c"(0));
     const bool has_avx2 = ((b >> 5) & 1u) && ((b >> 3) & 1u) && ((b >> 8) & 1u);  // AVX2, BMI1, BMI2
     avx2 = has_avx2 && (state_low & 0x6u) == 0x6u;
-    const bool has_avx512 = ((b >> 16) & 1u) && ((b >> 17) & 1u) && ((b >> 30) & 1u) && ((b >> 31) & 1u);  // F, DQ, BW, VL
+    const bool has_avx512 =
+        ((b >> 16) & 1u) && ((b >> 17) & 1u) && ((b >> 30) & 1u) && ((b >> 31) & 1u);  // F, DQ, BW, VL
     avx512 = avx2 && has_avx512 && (state_low & 0xe6u) == 0xe6u;
   }
 };

@@ -17,7 +17,8 @@ struct PhotometricScratch {
 
 extern "C" {
 
-// Value of the loss, and its gradient with respect to x (f32[planes][height][width], like y). NaN and status 1: no memory.
+// Value of the loss, and its gradient with respect to x (f32[planes][height][width], like y). NaN and status 1: no
+// memory.
 MUDG_API double mudg_photometric(const float* x, const float* y, int planes, int height, int width, float ssim_weight,
                                  float* gradient, int* status) {
   static thread_local PhotometricScratch scratch;
@@ -31,7 +32,8 @@ MUDG_API double mudg_photometric(const float* x, const float* y, int planes, int
   job.gradient = gradient;
   job.padded_width = (width + 15) / 16 * 16;
   job.row_stride = job.padded_width + 2 * mudg::kPhotometricApron;
-  job.worker_stride = static_cast<std::size_t>(5) * job.row_stride + static_cast<std::size_t>(55) * job.padded_width + 64;
+  job.worker_stride =
+      static_cast<std::size_t>(5) * job.row_stride + static_cast<std::size_t>(55) * job.padded_width + 64;
   job.workers = mudg::thread_count();
   const std::size_t strips = static_cast<std::size_t>((height + mudg::kPhotometricStrip - 1) / mudg::kPhotometricStrip);
   const bool ok = scratch.maps.reserve(static_cast<std::size_t>(3) * planes * height * job.row_stride) &&

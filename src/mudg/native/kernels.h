@@ -15,14 +15,14 @@ struct PhotometricJob {
   const float *x, *y;
   int planes, height, width;
   float ssim_weight;
-  float* gradient;         // like x
-  int padded_width;        // multiple of 16
-  int row_stride;          // padded_width + two aprons
-  float* maps;             // [3][planes][height][row_stride]
-  float* worker_scratch;   // [workers][worker_stride]
+  float* gradient;        // like x
+  int padded_width;       // multiple of 16
+  int row_stride;         // padded_width + two aprons
+  float* maps;            // [3][planes][height][row_stride]
+  float* worker_scratch;  // [workers][worker_stride]
   std::size_t worker_stride;
   int workers;
-  double* partial;         // [planes * strips]
+  double* partial;  // [planes * strips]
 };
 
 // One Adam step (adam.h) on a table [rows][columns].
@@ -34,8 +34,8 @@ struct AdamJob {
   std::size_t columns;
   const std::uint8_t* visible;  // [rows], null: all
   float beta1, beta2, epsilon;
-  float step_size;        // rate / (1 - beta1^step)
-  float inv_root_bias2;   // 1 / sqrt(1 - beta2^step)
+  float step_size;       // rate / (1 - beta1^step)
+  float inv_root_bias2;  // 1 / sqrt(1 - beta2^step)
 };
 
 struct Kernels {

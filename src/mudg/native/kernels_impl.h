@@ -16,7 +16,8 @@ namespace {
 template <int kChannels>
 void blend_forward_channels(RasterState& state, float* const* planes, float* alpha) {
   parallel_for(state.tiles_x * state.tiles_y, 1, [&](std::int64_t begin, std::int64_t end, int) {
-    for (std::int64_t tile = begin; tile < end; ++tile) blend_tile<kChannels>(state, static_cast<int>(tile), planes, alpha);
+    for (std::int64_t tile = begin; tile < end; ++tile)
+      blend_tile<kChannels>(state, static_cast<int>(tile), planes, alpha);
   });
 }
 
@@ -38,7 +39,8 @@ void blend_forward(RasterState& state, RasterImage& image) {
 template <int kChannels, bool kAbsolute>
 void undo_all_tiles(RasterState& state, const float* const* planes, const float* alpha) {
   parallel_for(state.tiles_x * state.tiles_y, 1, [&](std::int64_t begin, std::int64_t end, int) {
-    for (std::int64_t tile = begin; tile < end; ++tile) undo_tile<kChannels, kAbsolute>(state, static_cast<int>(tile), planes, alpha);
+    for (std::int64_t tile = begin; tile < end; ++tile)
+      undo_tile<kChannels, kAbsolute>(state, static_cast<int>(tile), planes, alpha);
   });
 }
 

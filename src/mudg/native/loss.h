@@ -1,8 +1,9 @@
 // (1 - w) mean |x - y| + w (1 - mean SSIM) of planar images, and its gradient with respect to x, in two sweeps.
 //
-// SSIM as usual: 11x11 Gaussian window of sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2. The window is separable: rows are
-// blurred into a ring of eleven, which is then blurred across. The first sweep leaves the derivatives of SSIM with respect to the
-// three blurred quantities that depend on x (mean, E[x^2], E[x y]); the second blurs those once more and assembles the gradient.
+// SSIM as usual: 11x11 Gaussian window of sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2. The window is
+// separable: rows are blurred into a ring of eleven, which is then blurred across. The first sweep leaves the
+// derivatives of SSIM with respect to the three blurred quantities that depend on x (mean, E[x^2], E[x y]); the second
+// blurs those once more and assembles the gradient.
 #pragma once
 
 #include "kernels.h"
@@ -18,7 +19,8 @@ constexpr float kWindow[kReach + 1] = {0.26601172486179436f, 0.21300553771125370
 // A symmetric filter along a row; `p` points at the centre tap of lane 0.
 MUDG_INLINE Floats blur_row(const float* p) {
   Floats total = splat(kWindow[0]) * load_unaligned(p);
-  for (int k = 1; k <= kReach; ++k) total = mul_add(splat(kWindow[k]), load_unaligned(p - k) + load_unaligned(p + k), total);
+  for (int k = 1; k <= kReach; ++k)
+    total = mul_add(splat(kWindow[k]), load_unaligned(p - k) + load_unaligned(p + k), total);
   return total;
 }
 
@@ -26,7 +28,8 @@ MUDG_INLINE Floats blur_row(const float* p) {
 MUDG_INLINE Floats blur_column(const float* const* rows, int at) {
   Floats total = splat(kWindow[0]) * load_unaligned(rows[kReach] + at);
   for (int k = 1; k <= kReach; ++k) {
-    total = mul_add(splat(kWindow[k]), load_unaligned(rows[kReach - k] + at) + load_unaligned(rows[kReach + k] + at), total);
+    total = mul_add(splat(kWindow[k]), load_unaligned(rows[kReach - k] + at) + load_unaligned(rows[kReach + k] + at),
+                    total);
   }
   return total;
 }
@@ -47,7 +50,8 @@ struct RowRing {
 };
 
 // Blurs x, y, x^2, y^2, x y of one image row into the ring. `raw` holds five padded rows whose aprons are zero.
-MUDG_INLINE void blur_inputs(const PhotometricJob& job, const float* x, const float* y, float* raw, const RowRing<5>& ring, int at) {
+MUDG_INLINE void blur_inputs(const PhotometricJob& job, const float* x, const float* y, float* raw,
+                             const RowRing<5>& ring, int at) {
   const int padded = job.row_stride;
   float* inside = raw + kPhotometricApron;
   for (int i = 0; i < job.width; ++i) {
@@ -123,13 +127,17 @@ double gradient_strip(const PhotometricJob& job, int plane, int y0, int y1, floa
   const auto fetch = [&](int y) {
     if (y < 0 || y >= job.height) return ring.clear(y);
     for (int m = 0; m < 3; ++m) {
-      const float* map = job.maps + (static_cast<std::size_t>(m) * job.planes * job.height + offset + y) * job.row_stride + kPhotometricApron;
+      const float* map = job.maps +
+                         (static_cast<std::size_t>(m) * job.planes * job.height + offset + y) * job.row_stride +
+                         kPhotometricApron;
       float* out = ring.row(y, m);
       for (int i = 0; i < job.padded_width; i += kLanes) store_unaligned(out + i, blur_row(map + i));
     }
   };
-  const float share = 1.0f / (static_cast<float>(job.planes) * static_cast<float>(job.height) * static_cast<float>(job.width));
-  const Floats of_l1 = splat((1.0f - job.ssim_weight) * share), of_ssim = splat(job.ssim_weight * share), zero = splat(0.0f);
+  const float share =
+      1.0f / (static_cast<float>(job.planes) * static_cast<float>(job.height) * static_cast<float>(job.width));
+  const Floats of_l1 = splat((1.0f - job.ssim_weight) * share), of_ssim = splat(job.ssim_weight * share),
+               zero = splat(0.0f);
   for (int y = y0 - kReach; y < y0 + kReach; ++y) fetch(y);
   double total = 0.0;
   for (int y = y0; y < y1; ++y) {
@@ -144,7 +152,8 @@ double gradient_strip(const PhotometricJob& job, int plane, int y0, int y1, floa
       std::memcpy(x, job.x + at + i, sizeof(float) * count);
       std::memcpy(target, job.y + at + i, sizeof(float) * count);
       const Floats value = load(x), wanted = load(target), difference = value - wanted;
-      const Floats ssim = mul_add(wanted, blur_column(rows[2], i), mul_add(value + value, blur_column(rows[1], i), blur_column(rows[0], i)));
+      const Floats ssim = mul_add(wanted, blur_column(rows[2], i),
+                                  mul_add(value + value, blur_column(rows[1], i), blur_column(rows[0], i)));
       const Floats sign = select(difference > zero, of_l1, select(difference < zero, zero - of_l1, zero));
       sums = sums + abs_of(difference);
       store(out, neg_mul_add(of_ssim, ssim, sign));
@@ -164,11 +173,13 @@ double photometric(const PhotometricJob& job) {
         [&](std::int64_t begin, std::int64_t end, int worker) {
           float* scratch = job.worker_scratch + static_cast<std::size_t>(worker) * job.worker_stride;
           for (int piece = static_cast<int>(begin); piece < static_cast<int>(end); ++piece) {
-            const int plane = piece / strips, y0 = piece % strips * kPhotometricStrip, y1 = smaller(job.height, y0 + kPhotometricStrip);
+            const int plane = piece / strips, y0 = piece % strips * kPhotometricStrip,
+                      y1 = smaller(job.height, y0 + kPhotometricStrip);
             if (sweep == 0) {
               job.partial[piece] = -static_cast<double>(job.ssim_weight) * ssim_strip(job, plane, y0, y1, scratch);
             } else {
-              job.partial[piece] += (1.0 - static_cast<double>(job.ssim_weight)) * gradient_strip(job, plane, y0, y1, scratch);
+              job.partial[piece] +=
+                  (1.0 - static_cast<double>(job.ssim_weight)) * gradient_strip(job, plane, y0, y1, scratch);
             }
           }
         },

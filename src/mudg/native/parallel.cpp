@@ -123,8 +123,8 @@ class Pool {
   int helpers_ = 0;
 };
 
-// The pool lives as long as the process: its threads may be waiting in it at exit. A forked child inherits the object but not
-// the threads, so it leaves the old one alone and makes its own.
+// The pool lives as long as the process: its threads may be waiting in it at exit. A forked child inherits the object
+// but not the threads, so it leaves the old one alone and makes its own.
 Pool& pool() {
   static std::atomic<Pool*> shared{nullptr};
   const int process = current_process();
@@ -138,8 +138,7 @@ Pool& pool() {
 }
 
 std::atomic<int>& thread_setting() {
-  static std::atomic<int> count{
-      std::clamp(static_cast<int>(std::thread::hardware_concurrency()), 1, kMaxThreads)};
+  static std::atomic<int> count{std::clamp(static_cast<int>(std::thread::hardware_concurrency()), 1, kMaxThreads)};
   return count;
 }
 

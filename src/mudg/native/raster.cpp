@@ -70,13 +70,15 @@ RasterStatus backward(RasterContext& context, const RasterImageGradient& image, 
 
 extern "C" {
 
-// A context keeps what the backward pass needs; it may be reused for another forward pass once that is over. Null: no memory.
+// A context keeps what the backward pass needs; it may be reused for another forward pass once that is over. Null: no
+// memory.
 MUDG_API mudg::RasterContext* mudg_raster_new() { return new (std::nothrow) mudg::RasterContext; }
 
 MUDG_API void mudg_raster_free(mudg::RasterContext* context) { delete context; }
 
 // Both return a RasterStatus. The inputs of the scene must stay unchanged until the backward pass is over.
-MUDG_API int mudg_raster_forward(mudg::RasterContext* context, const mudg::RasterScene* scene, mudg::RasterImage* image) {
+MUDG_API int mudg_raster_forward(mudg::RasterContext* context, const mudg::RasterScene* scene,
+                                 mudg::RasterImage* image) {
   return static_cast<int>(mudg::forward(*context, *scene, *image));
 }
 
@@ -85,8 +87,8 @@ MUDG_API int mudg_raster_backward(mudg::RasterContext* context, const mudg::Rast
   return static_cast<int>(mudg::backward(*context, *image, *gradient));
 }
 
-// After a forward pass: visible Gaussians, tile entries, Gaussians with non-finite input, index of the first of those, and the
-// bytes that the context holds; then seconds per phase of the last forward and backward pass.
+// After a forward pass: visible Gaussians, tile entries, Gaussians with non-finite input, index of the first of those,
+// and the bytes that the context holds; then seconds per phase of the last forward and backward pass.
 MUDG_API void mudg_raster_statistics(const mudg::RasterContext* context, std::int64_t counts[5], double phase_s[6]) {
   counts[0] = context->state.visible_count;
   counts[1] = context->state.entry_count;

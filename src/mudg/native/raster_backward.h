@@ -1,6 +1,7 @@
-// Back-to-front gradient of one tile. For every block and chunk: first the per-pixel quantities (blending weight and gradient of
-// sigma) of all entries, then two small matrix products that turn them into colour gradients and moments. Each entry of
-// the tile ends as one record; records are summed per Gaussian afterwards, without atomics and in a fixed order.
+// Back-to-front gradient of one tile. For every block and chunk: first the per-pixel quantities (blending weight and
+// gradient of sigma) of all entries, then two small matrix products that turn them into colour gradients and moments.
+// Each entry of the tile ends as one record; records are summed per Gaussian afterwards, without atomics and in a fixed
+// order.
 #pragma once
 
 #include "raster_blend.h"
@@ -17,7 +18,8 @@ struct MomentBasis {
   constexpr MomentBasis() : rows() {
     for (int b = 0; b < kBlocksPerTile; ++b) {
       for (int l = 0; l < kPixelsPerBlock; ++l) {
-        const float x = static_cast<float>((b & 3) * 4 + (l & 3)) - 7.5f, y = static_cast<float>((b >> 2) * 4 + (l >> 2)) - 7.5f;
+        const float x = static_cast<float>((b & 3) * 4 + (l & 3)) - 7.5f,
+                    y = static_cast<float>((b >> 2) * 4 + (l >> 2)) - 7.5f;
         const float row[kMomentColumns] = {1.0f, x, y, x * x, x * y, y * y, 0.0f, 0.0f};
         for (int k = 0; k < kMomentColumns; ++k) rows[b][l][k] = row[k];
       }
@@ -104,8 +106,8 @@ struct BackwardTile {
 
   // Returns the position of the last entry of the tile that contributed anywhere, -1 if none did.
   MUDG_INLINE int start(const RasterState& state, const TilePlace& place, const float* const* planes,
-                        const float* alpha_plane, const float* final, const std::int32_t* last, float* background_gradient,
-                        unsigned& blocks) {
+                        const float* alpha_plane, const float* final, const std::int32_t* last,
+                        float* background_gradient, unsigned& blocks) {
     int tile_last = -1;
     blocks = 0;
     for (int b = 0; b < kBlocksPerTile; ++b) {
@@ -131,7 +133,7 @@ struct BackwardTile {
     const Floats pixel_x = place.pixel_x(b), pixel_y = place.pixel_y(b), one = splat(1.0f);
     const Floats of_alpha = load(upstream_alpha[b]);
     const Ints last_position = load_int(last + b * kPixelsPerBlock);
-    const float(*image)[kPixelsPerBlock] = upstream[b];
+    const float (*image)[kPixelsPerBlock] = upstream[b];
     Floats before = load(transmittance[b]), light = load(behind[b]);
     for (int j = count - 1; j >= 0; --j) {
       const int entry = entries[j];
@@ -166,12 +168,14 @@ struct BackwardTile {
     store(transmittance[b], before);
     store(behind[b], light);
     accumulate_rows<WideRow, kColumns>(upstream_rows[b], weights, entries, count, records + kRecordChannels, kRecord);
-    accumulate_rows<NarrowRow, kMomentColumns>(kMomentBasis.rows[b], sigma_gradient, entries, count, records + kMoments, kRecord);
+    accumulate_rows<NarrowRow, kMomentColumns>(kMomentBasis.rows[b], sigma_gradient, entries, count, records + kMoments,
+                                               kRecord);
   }
 };
 
 // Brings the next tile's image gradients closer while this one is worked on.
-MUDG_INLINE void prefetch_tile(const RasterState& state, int tile, const float* const* planes, const float* alpha_plane) {
+MUDG_INLINE void prefetch_tile(const RasterState& state, int tile, const float* const* planes,
+                               const float* alpha_plane) {
   if (tile >= state.tiles_x * state.tiles_y) return;
   const TilePlace place(state, tile);
   const int rows = smaller(kTileSize, place.height - place.y);
@@ -211,7 +215,8 @@ void undo_tile(RasterState& state, int tile, const float* const* planes, const f
       __builtin_prefetch(target, 1, 2);
       __builtin_prefetch(target + stride - 1, 1, 2);
     }
-    for (unsigned left = blocks; left != 0; left &= left - 1) work.undo_block(__builtin_ctz(left), base, place, last, cap);
+    for (unsigned left = blocks; left != 0; left &= left - 1)
+      work.undo_block(__builtin_ctz(left), base, place, last, cap);
     for (int i = 0; i < size; ++i) {
       float* target = state.records + items[base + i].record * stride;
       const float* from = work.records + i * Work::kRecord;

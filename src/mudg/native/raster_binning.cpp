@@ -14,7 +14,8 @@ constexpr std::uint32_t kDigitMask = (1u << kDigitBits) - 1;
 
 }  // namespace
 
-// A stable radix sort on the bits of the depth (positive floats order like integers): Gaussians at equal depth keep their order.
+// A stable radix sort on the bits of the depth (positive floats order like integers): Gaussians at equal depth keep
+// their order.
 RasterStatus RasterContext::sort_by_depth() {
   const int count = state.scene.count;
   std::int64_t entries = 0;
@@ -66,8 +67,8 @@ RasterStatus RasterContext::sort_by_depth() {
   return RasterStatus::kOk;
 }
 
-// Every worker walks all Gaussians in depth order and keeps what falls into its own contiguous range of tiles; the ranges
-// are balanced by the number of entries. No atomics, and the same lists for any number of workers.
+// Every worker walks all Gaussians in depth order and keeps what falls into its own contiguous range of tiles; the
+// ranges are balanced by the number of entries. No atomics, and the same lists for any number of workers.
 RasterStatus RasterContext::bin_into_tiles() {
   const int tiles = state.tiles_x * state.tiles_y;
   if (!items.reserve(static_cast<std::size_t>(state.entry_count) + 16)) return RasterStatus::kOutOfMemory;

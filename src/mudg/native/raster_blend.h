@@ -1,4 +1,5 @@
-// What the two blending passes share: the alpha of a Gaussian on one 4x4 block, and the gathering of a stretch of a tile's list.
+// What the two blending passes share: the alpha of a Gaussian on one 4x4 block, and the gathering of a stretch of a
+// tile's list.
 #pragma once
 
 #include "raster_types.h"
@@ -16,7 +17,7 @@ struct Alpha {
   Floats dx, dy;  // mean - pixel
   Floats raw;     // before the cap
   Floats value;
-  Mask counts;    // at least 1/255, and a proper ellipse
+  Mask counts;  // at least 1/255, and a proper ellipse
 };
 MUDG_INLINE Alpha alpha_of(const float* splat_row, Floats pixel_x, Floats pixel_y, Floats cap) {
   Alpha a;
@@ -63,15 +64,22 @@ struct Chunk {
 
 // Position of a tile and of its blocks in the image.
 struct TilePlace {
-  int x, y;  // first pixel
+  int x, y;           // first pixel
   int width, height;  // of the image
   MUDG_INLINE TilePlace(const RasterState& state, int tile)
-      : x(tile % state.tiles_x * kTileSize), y(tile / state.tiles_x * kTileSize), width(state.scene.width), height(state.scene.height) {}
+      : x(tile % state.tiles_x * kTileSize),
+        y(tile / state.tiles_x * kTileSize),
+        width(state.scene.width),
+        height(state.scene.height) {}
   MUDG_INLINE int block_x(int block) const { return x + (block & 3) * kBlockSize; }
   MUDG_INLINE int block_y(int block) const { return y + (block >> 2) * kBlockSize; }
   MUDG_INLINE bool whole() const { return x + kTileSize <= width && y + kTileSize <= height; }
-  MUDG_INLINE Floats pixel_x(int block) const { return load(kPixelX) + splat(static_cast<float>(block_x(block)) + 0.5f); }
-  MUDG_INLINE Floats pixel_y(int block) const { return load(kPixelY) + splat(static_cast<float>(block_y(block)) + 0.5f); }
+  MUDG_INLINE Floats pixel_x(int block) const {
+    return load(kPixelX) + splat(static_cast<float>(block_x(block)) + 0.5f);
+  }
+  MUDG_INLINE Floats pixel_y(int block) const {
+    return load(kPixelY) + splat(static_cast<float>(block_y(block)) + 0.5f);
+  }
 };
 
 // One address per channel: R, G, B, depth, features.
@@ -80,7 +88,8 @@ MUDG_INLINE void channel_planes(const RasterState& state, const Image& image, Po
   const std::size_t pixels = static_cast<std::size_t>(state.scene.width) * state.scene.height;
   for (int c = 0; c < 3; ++c) planes[c] = image.rgb == nullptr ? nullptr : image.rgb + c * pixels;
   planes[3] = image.depth;
-  for (int c = 4; c < state.channels; ++c) planes[c] = image.extra == nullptr ? nullptr : image.extra + (c - 4) * pixels;
+  for (int c = 4; c < state.channels; ++c)
+    planes[c] = image.extra == nullptr ? nullptr : image.extra + (c - 4) * pixels;
 }
 
 }  // namespace

@@ -41,9 +41,8 @@ bool RasterContext::prepare(const RasterScene& scene) {
   const bool ok = splats.reserve(count * state.splat_stride + 64) && clamped.reserve(count + 16) &&
                   entry_worker.reserve(count + 16) && depth_key.reserve(count + 16) &&
                   entry_offset.reserve(count + 16) && entry_counts.reserve(count + 16) &&
-                  first_record.reserve(count + 17) && tile_start.reserve(tiles + 1) &&
-                  tile_cursor.reserve(tiles + 1) && final_transmittance.reserve(tiles * kPixelsPerTile) &&
-                  last_item.reserve(tiles * kPixelsPerTile);
+                  first_record.reserve(count + 17) && tile_start.reserve(tiles + 1) && tile_cursor.reserve(tiles + 1) &&
+                  final_transmittance.reserve(tiles * kPixelsPerTile) && last_item.reserve(tiles * kPixelsPerTile);
   if (!ok) return false;
   state.splats = splats.data();
   state.clamped = clamped.data();
@@ -80,9 +79,9 @@ bool RasterContext::prepare_backward() {
 std::size_t RasterContext::bytes() const {
   std::size_t total = splats.bytes() + final_transmittance.bytes() + records.bytes() + tile_background.bytes() +
                       clamped.bytes() + entry_worker.bytes() + depth_key.bytes() + entry_offset.bytes() +
-                      order.bytes() + sort_key.bytes() + sort_key2.bytes() + sort_order.bytes() +
-                      entry_counts.bytes() + first_record.bytes() + tile_start.bytes() + tile_cursor.bytes() +
-                      last_item.bytes() + items.bytes() + camera_parts.bytes();
+                      order.bytes() + sort_key.bytes() + sort_key2.bytes() + sort_order.bytes() + entry_counts.bytes() +
+                      first_record.bytes() + tile_start.bytes() + tile_cursor.bytes() + last_item.bytes() +
+                      items.bytes() + camera_parts.bytes();
   for (int worker = 0; worker < kMaxThreads; ++worker) {
     total += tile_counts[worker].bytes() + state.workers[worker].capacity * sizeof(TileEntry);
   }

@@ -6,7 +6,15 @@
 
 namespace mudg {
 
-enum RasterPhase { kPhaseProject, kPhaseSort, kPhaseBin, kPhaseBlend, kPhaseBlendBackward, kPhaseProjectBackward, kPhases };
+enum RasterPhase {
+  kPhaseProject,
+  kPhaseSort,
+  kPhaseBin,
+  kPhaseBlend,
+  kPhaseBlendBackward,
+  kPhaseProjectBackward,
+  kPhases
+};
 
 struct RasterContext {
   RasterState state{};

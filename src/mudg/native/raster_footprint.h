@@ -1,5 +1,5 @@
-// Which tiles, and which 4x4 blocks in them, an ellipse touches. Conservative: the mask may hold a block too many, never one too
-// few, because a pixel's own alpha test decides in the end.
+// Which tiles, and which 4x4 blocks in them, an ellipse touches. Conservative: the mask may hold a block too many,
+// never one too few, because a pixel's own alpha test decides in the end.
 #pragma once
 
 #include "raster_types.h"
@@ -8,14 +8,14 @@
 namespace mudg::MUDG_ISA_NAMESPACE {
 namespace {
 
-// The ellipse stretch * ((x + shear * y)^2 + ratio * y^2) <= level around (mean_x, mean_y), cut off at alpha = 1/255, and
-// the rectangle of pixels (inclusive) that holds it.
+// The ellipse stretch * ((x + shear * y)^2 + ratio * y^2) <= level around (mean_x, mean_y), cut off at alpha = 1/255,
+// and the rectangle of pixels (inclusive) that holds it.
 struct Footprint {
   float mean_x, mean_y;
-  float shear;       // B / A of the conic
-  float ratio;       // (C - B^2 / A) / A
-  float half_width2; // level / A: square of the half width on the row through the centre
-  float extreme_y;   // y of the rightmost point, relative to the mean
+  float shear;        // B / A of the conic
+  float ratio;        // (C - B^2 / A) / A
+  float half_width2;  // level / A: square of the half width on the row through the centre
+  float extreme_y;    // y of the rightmost point, relative to the mean
   int left, right, top, bottom;
 };
 
@@ -41,7 +41,8 @@ MUDG_INLINE int emit_rectangle(const Footprint& f, int tiles_x, TileEntry* out, 
   return written;
 }
 
-// First and last block column that the ellipse reaches in each of 16 consecutive block rows, starting at pixel row `y0`.
+// First and last block column that the ellipse reaches in each of 16 consecutive block rows, starting at pixel row
+// `y0`.
 MUDG_INLINE void strip_extents(const Footprint& f, int y0, int* first_column, int* last_column) {
   constexpr float kMargin = 0.01f;  // pixels
   const Floats row = mul_add(load(kLaneIndex), splat(4.0f), splat(static_cast<float>(y0)));

@@ -31,7 +31,8 @@ struct ForwardTile {
     return blocks;
   }
 
-  // Blends the gathered chunk, whose first entry is at list position `base`, into one block. Returns false when the block is finished.
+  // Blends the gathered chunk, whose first entry is at list position `base`, into one block. Returns false when the
+  // block is finished.
   MUDG_INLINE bool blend_block(int b, int base, const TilePlace& place, Floats cap) {
     const Floats pixel_x = place.pixel_x(b), pixel_y = place.pixel_y(b), stop = splat(kStopTransmittance);
     Floats transmittance = load(running[b]), after = load(final[b]);
@@ -43,7 +44,8 @@ struct ForwardTile {
       const int entry = chunk.entries[b][j];
       const float* row = chunk.row(entry);
       const Alpha alpha = alpha_of(row, pixel_x, pixel_y, cap);
-      // The transmittance of finished pixels is 0, so they fail the test by themselves: no separate mask on the critical path.
+      // The transmittance of finished pixels is 0, so they fail the test by themselves: no separate mask on the
+      // critical path.
       const Floats effective = keep(alpha.counts, alpha.value);
       const Floats next = neg_mul_add(effective, transmittance, transmittance);
       const Mask goes_on = next > stop;
@@ -117,7 +119,8 @@ void blend_tile(RasterState& state, int tile, float* const* planes, float* alpha
     }
   }
   work.add_background(state.scene.background);
-  std::memcpy(state.final_transmittance + static_cast<std::size_t>(tile) * kPixelsPerTile, work.final, sizeof work.final);
+  std::memcpy(state.final_transmittance + static_cast<std::size_t>(tile) * kPixelsPerTile, work.final,
+              sizeof work.final);
   std::memcpy(state.last_item + static_cast<std::size_t>(tile) * kPixelsPerTile, work.last, sizeof work.last);
   work.write(place, state.channels, planes, alpha);
 }

@@ -1,4 +1,5 @@
-// Forward projection: every Gaussian becomes a splat (ellipse, opacity, channel values) and a list of touched tiles, or is culled.
+// Forward projection: every Gaussian becomes a splat (ellipse, opacity, channel values) and a list of touched tiles, or
+// is culled.
 #pragma once
 
 #include "raster_footprint.h"
@@ -46,7 +47,10 @@ MUDG_INLINE unsigned project_lanes(const RasterScene& s, int first, SplatLanes& 
   store(out.extent_x, sqrt_of(level * p.cov_xx));
   store(out.extent_y, sqrt_of(level * p.cov_yy));
 
-  const Floats inv_length = splat(1.0f) / sqrt_of(mul_add(p.offset[0], p.offset[0], mul_add(p.offset[1], p.offset[1], mul_add(p.offset[2], p.offset[2], splat(1e-24f)))));
+  const Floats inv_length =
+      splat(1.0f) /
+      sqrt_of(mul_add(p.offset[0], p.offset[0],
+                      mul_add(p.offset[1], p.offset[1], mul_add(p.offset[2], p.offset[2], splat(1e-24f)))));
   Floats basis[kMaxSh];
   sh_basis<Floats>(s.sh_degree, p.offset[0] * inv_length, p.offset[1] * inv_length, p.offset[2] * inv_length, basis);
   for (int k = 0; k < (s.sh_degree + 1) * (s.sh_degree + 1); ++k) store(out.basis[k], basis[k]);
@@ -118,7 +122,8 @@ MUDG_INLINE bool write_splat(RasterState& state, const SplatLanes& lanes, int l,
 void note_not_finite(RasterState& state, std::int64_t g) {
   __atomic_fetch_add(&state.not_finite_count, 1, __ATOMIC_RELAXED);
   std::int64_t seen = __atomic_load_n(&state.first_not_finite, __ATOMIC_RELAXED);
-  while (g < seen && !__atomic_compare_exchange_n(&state.first_not_finite, &seen, g, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+  while (g < seen &&
+         !__atomic_compare_exchange_n(&state.first_not_finite, &seen, g, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
   }
 }
 
@@ -135,7 +140,8 @@ void project_group(RasterState& state, RasterImage& image, int first, int worker
     int touched = 0;
     const std::size_t offset = worker.used;
     if (is_finite && footprint_of(s, lanes, l, f)) {
-      const std::size_t tiles = static_cast<std::size_t>((f.right >> 4) - (f.left >> 4) + 1) * ((f.bottom >> 4) - (f.top >> 4) + 1);
+      const std::size_t tiles =
+          static_cast<std::size_t>((f.right >> 4) - (f.left >> 4) + 1) * ((f.bottom >> 4) - (f.top >> 4) + 1);
       TileEntry* out = worker.room(tiles + 1);
       if (out == nullptr || offset + tiles >= kHidden) {
         __atomic_store_n(&state.out_of_memory, 1, __ATOMIC_RELAXED);
@@ -166,7 +172,8 @@ void project_forward(RasterState& state, RasterImage& image) {
   parallel_for(
       groups, 32,
       [&](std::int64_t begin, std::int64_t end, int worker) {
-        for (std::int64_t group = begin; group < end; ++group) project_group(state, image, static_cast<int>(group) * kLanes, worker);
+        for (std::int64_t group = begin; group < end; ++group)
+          project_group(state, image, static_cast<int>(group) * kLanes, worker);
       },
       state.worker_count);
 }

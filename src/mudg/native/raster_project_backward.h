@@ -10,9 +10,10 @@ namespace {
 // Gradients of one group of sixteen splats, by lane.
 struct GroupGradient {
   alignas(64) float mean2d[2][kLanes];
-  alignas(64) float inverse[3][kLanes];  // half the second moments: gradient of the inverse covariance (xx, xy summed over both, yy)
+  alignas(64) float inverse[3][kLanes];  // half the second moments: gradient of the inverse covariance (xx, xy summed
+                                         // over both, yy)
   alignas(64) float depth[kLanes];
-  alignas(64) float opacity[kLanes];     // of the opacity after anti-aliasing
+  alignas(64) float opacity[kLanes];       // of the opacity after anti-aliasing
   alignas(64) float direction[3][kLanes];  // of the mean, by way of the viewing direction of the harmonics
 };
 
@@ -52,15 +53,17 @@ MUDG_INLINE bool sum_records(const RasterState& state, int g, float mean_x, floa
 
 MUDG_INLINE void zero_rows(const RasterScene& s, const RasterGradient& gradient, int g) {
   const std::size_t row = static_cast<std::size_t>(g);
-  if (gradient.sh != nullptr) std::memset(gradient.sh + row * s.sh_coefficients * 3, 0, sizeof(float) * 3 * s.sh_coefficients);
-  if (gradient.extra != nullptr) std::memset(gradient.extra + row * s.extra_channels, 0, sizeof(float) * s.extra_channels);
+  if (gradient.sh != nullptr)
+    std::memset(gradient.sh + row * s.sh_coefficients * 3, 0, sizeof(float) * 3 * s.sh_coefficients);
+  if (gradient.extra != nullptr)
+    std::memset(gradient.extra + row * s.extra_channels, 0, sizeof(float) * s.extra_channels);
   if (gradient.means2d != nullptr) gradient.means2d[2 * row] = gradient.means2d[2 * row + 1] = 0.0f;
   if (gradient.abs_means2d != nullptr) gradient.abs_means2d[2 * row] = gradient.abs_means2d[2 * row + 1] = 0.0f;
 }
 
 // Gradient of the harmonics' coefficients, and of the mean through the viewing direction.
-MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& gradient, int g, const float* of_channels, int l,
-                                GroupGradient& group) {
+MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& gradient, int g,
+                                const float* of_channels, int l, GroupGradient& group) {
   const RasterScene& s = state.scene;
   float of_rgb[3];
   for (int c = 0; c < 3; ++c) of_rgb[c] = (state.clamped[g] >> c) & 1 ? 0.0f : of_channels[c];
@@ -75,7 +78,8 @@ MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& 
   sh_basis<float>(s.sh_degree, d[0], d[1], d[2], basis);
   const int active = (s.sh_degree + 1) * (s.sh_degree + 1);
   const float* sh = s.sh + static_cast<std::size_t>(g) * s.sh_coefficients * 3;
-  for (int k = 0; k < active; ++k) of_basis[k] = sh[3 * k] * of_rgb[0] + sh[3 * k + 1] * of_rgb[1] + sh[3 * k + 2] * of_rgb[2];
+  for (int k = 0; k < active; ++k)
+    of_basis[k] = sh[3 * k] * of_rgb[0] + sh[3 * k + 1] * of_rgb[1] + sh[3 * k + 2] * of_rgb[2];
   if (gradient.sh != nullptr) {
     float* of_sh = gradient.sh + static_cast<std::size_t>(g) * s.sh_coefficients * 3;
     for (int k = 0; k < active; ++k) {
@@ -92,7 +96,8 @@ MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& 
 }
 
 // Reads the records of sixteen Gaussians. Returns whether any of them contributed to the image.
-MUDG_INLINE bool gather_group(const RasterState& state, const RasterGradient& gradient, int first, GroupGradient& group) {
+MUDG_INLINE bool gather_group(const RasterState& state, const RasterGradient& gradient, int first,
+                              GroupGradient& group) {
   const RasterScene& s = state.scene;
   std::memset(&group, 0, sizeof group);
   bool any = false;
@@ -155,7 +160,8 @@ MUDG_INLINE CovarianceGradient covariance_backward(const Projection& p, const Gr
 }
 
 // Splits the gradient of the compensated opacity into that of the opacity and a part of the covariance's.
-MUDG_INLINE Floats compensation_backward(const Projection& p, Floats opacity, Floats of_opacity, CovarianceGradient& of_cov) {
+MUDG_INLINE Floats compensation_backward(const Projection& p, Floats opacity, Floats of_opacity,
+                                         CovarianceGradient& of_cov) {
   const Floats factor = compensation_of(p);
   const Mask live = factor > splat(1.5e-3f);
   const Floats half = splat(0.5f) * of_opacity * opacity * factor;  // gradient of ln(sharp_det / det)
@@ -169,11 +175,13 @@ MUDG_INLINE Floats compensation_backward(const Projection& p, Floats opacity, Fl
 
 MUDG_INLINE void quaternion_backward(const Projection& p, const Floats v[3][3], Floats out[4]) {
   const Floats w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3], two = splat(2.0f);
-  const Floats of_unit[4] = {
-      two * (x * (v[2][1] - v[1][2]) + y * (v[0][2] - v[2][0]) + z * (v[1][0] - v[0][1])),
-      two * (y * (v[1][0] + v[0][1]) + z * (v[2][0] + v[0][2]) + w * (v[2][1] - v[1][2]) - two * x * (v[1][1] + v[2][2])),
-      two * (x * (v[1][0] + v[0][1]) + z * (v[2][1] + v[1][2]) + w * (v[0][2] - v[2][0]) - two * y * (v[0][0] + v[2][2])),
-      two * (x * (v[2][0] + v[0][2]) + y * (v[2][1] + v[1][2]) + w * (v[1][0] - v[0][1]) - two * z * (v[0][0] + v[1][1]))};
+  const Floats of_unit[4] = {two * (x * (v[2][1] - v[1][2]) + y * (v[0][2] - v[2][0]) + z * (v[1][0] - v[0][1])),
+                             two * (y * (v[1][0] + v[0][1]) + z * (v[2][0] + v[0][2]) + w * (v[2][1] - v[1][2]) -
+                                    two * x * (v[1][1] + v[2][2])),
+                             two * (x * (v[1][0] + v[0][1]) + z * (v[2][1] + v[1][2]) + w * (v[0][2] - v[2][0]) -
+                                    two * y * (v[0][0] + v[2][2])),
+                             two * (x * (v[2][0] + v[0][2]) + y * (v[2][1] + v[1][2]) + w * (v[1][0] - v[0][1]) -
+                                    two * z * (v[0][0] + v[1][1]))};
   Floats along = splat(0.0f);
   for (int k = 0; k < 4; ++k) along = mul_add(of_unit[k], p.quat[k], along);
   for (int k = 0; k < 4; ++k) out[k] = neg_mul_add(along, p.quat[k], of_unit[k]) * p.inv_norm;
@@ -186,8 +194,8 @@ struct ParameterGradient {
 // Parts of the camera's gradient: rotation (cam_from_world, 9) and centre (3).
 constexpr int kCameraParts = 12;
 
-MUDG_INLINE void group_backward(const RasterScene& s, int first, const GroupGradient& group, Mask drawn, ParameterGradient& out,
-                                double* camera) {
+MUDG_INLINE void group_backward(const RasterScene& s, int first, const GroupGradient& group, Mask drawn,
+                                ParameterGradient& out, double* camera) {
   Projection p;
   Floats means[3], quats[4];
   project_sixteen(s, first, p, means, quats);
@@ -230,8 +238,8 @@ MUDG_INLINE void group_backward(const RasterScene& s, int first, const GroupGrad
   Floats of_cam[3];
   of_cam[0] = fx * inv_z * of_u;
   of_cam[1] = fy * inv_z * of_v;
-  of_cam[2] = load(group.depth) - (fx * p.slope_x * of_u + fy * p.slope_y * of_v) * inv_z - (fx * of_jxx + fy * of_jyy) * inv_z2 +
-              (fx * p.held_x * of_jxz + fy * p.held_y * of_jyz) * inv_z2;
+  of_cam[2] = load(group.depth) - (fx * p.slope_x * of_u + fy * p.slope_y * of_v) * inv_z -
+              (fx * of_jxx + fy * of_jyy) * inv_z2 + (fx * p.held_x * of_jxz + fy * p.held_y * of_jyz) * inv_z2;
   const Floats of_held_x = keep(p.free_x, splat(0.0f) - fx * inv_z * of_jxz);
   const Floats of_held_y = keep(p.free_y, splat(0.0f) - fy * inv_z * of_jyz);
   of_cam[0] = mul_add(of_held_x, inv_z, of_cam[0]);
@@ -247,7 +255,8 @@ MUDG_INLINE void group_backward(const RasterScene& s, int first, const GroupGrad
   }
   for (int k = 0; k < 4; ++k) out.quat[k] = keep(drawn, out.quat[k]);
   out.opacity = keep(drawn, out.opacity);
-  const Floats jxx = fx * inv_z, jxz = splat(0.0f) - fx * p.held_x * inv_z, jyy = fy * inv_z, jyz = splat(0.0f) - fy * p.held_y * inv_z;
+  const Floats jxx = fx * inv_z, jxz = splat(0.0f) - fx * p.held_x * inv_z, jyy = fy * inv_z,
+               jyz = splat(0.0f) - fy * p.held_y * inv_z;
   for (int k = 0; k < 3; ++k) {
     camera[k] += sum(keep(drawn, mul_add(of_cam[0], p.offset[k], jxx * of_world[0][k])));
     camera[3 + k] += sum(keep(drawn, mul_add(of_cam[1], p.offset[k], jyy * of_world[1][k])));
@@ -270,7 +279,8 @@ void project_backward(RasterState& state, RasterGradient& gradient) {
         std::memset(&out, 0, sizeof out);
         if (gather_group(state, gradient, first, of_splats)) {
           alignas(64) float drawn[kLanes];
-          for (int l = 0; l < kLanes; ++l) drawn[l] = first + l < s.count && state.entry_counts[first + l] > 0 ? 1.0f : 0.0f;
+          for (int l = 0; l < kLanes; ++l)
+            drawn[l] = first + l < s.count && state.entry_counts[first + l] > 0 ? 1.0f : 0.0f;
           group_backward(s, first, of_splats, load(drawn) > splat(0.5f), out, camera);
         }
         store_columns<3>(gradient.means, first, s.count, out.mean);

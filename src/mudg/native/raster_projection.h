@@ -1,4 +1,5 @@
-// The perspective projection of sixteen Gaussians at a time (EWA splatting), shared by the forward and the backward pass.
+// The perspective projection of sixteen Gaussians at a time (EWA splatting), shared by the forward and the backward
+// pass.
 #pragma once
 
 #include "raster_types.h"
@@ -25,22 +26,23 @@ MUDG_INLINE void store_columns(float* rows, int first, int count, const Floats* 
   alignas(64) float lanes[kLanes];
   for (int c = 0; c < kColumns; ++c) {
     store(lanes, columns[c]);
-    for (int l = 0; l < kLanes && first + l < count; ++l) rows[static_cast<std::size_t>(first + l) * kColumns + c] = lanes[l];
+    for (int l = 0; l < kLanes && first + l < count; ++l)
+      rows[static_cast<std::size_t>(first + l) * kColumns + c] = lanes[l];
   }
 }
 
 struct Projection {
-  Floats offset[3];              // mean - camera centre, world axes
-  Floats cam[3];                 // mean in camera axes
-  Floats inv_z;                  // 1 / z, or 1 for what lies in front of the near plane
-  Floats slope_x, slope_y;       // x / z, y / z
-  Floats held_x, held_y;         // the slopes at which the projection is linearised: held within 1.3 times the view
-  Mask free_x, free_y;           // whether they are the slopes themselves
-  Floats quat[4], inv_norm;      // unit quaternion and 1 / length of the given one
-  Floats rotation[3][3];         // of the quaternion
+  Floats offset[3];          // mean - camera centre, world axes
+  Floats cam[3];             // mean in camera axes
+  Floats inv_z;              // 1 / z, or 1 for what lies in front of the near plane
+  Floats slope_x, slope_y;   // x / z, y / z
+  Floats held_x, held_y;     // the slopes at which the projection is linearised: held within 1.3 times the view
+  Mask free_x, free_y;       // whether they are the slopes themselves
+  Floats quat[4], inv_norm;  // unit quaternion and 1 / length of the given one
+  Floats rotation[3][3];     // of the quaternion
   Floats scale[3];
-  Floats image_from_world[2][3]; // J R: pixels per metre
-  Floats image_from_unit[2][3];  // J R Q S: maps the unit sphere to the ellipse
+  Floats image_from_world[2][3];        // J R: pixels per metre
+  Floats image_from_unit[2][3];         // J R Q S: maps the unit sphere to the ellipse
   Floats sharp_xx, sharp_xy, sharp_yy;  // covariance in pixels^2
   Floats cov_xx, cov_xy, cov_yy;        // plus the blur
   Floats sharp_det, det;                // determinants of both
@@ -61,7 +63,9 @@ MUDG_INLINE void rotation_of(const Floats q[4], Floats r[3][3]) {
   r[2][2] = one - two * (x * x + y * y);
 }
 
-MUDG_INLINE Floats dot3(const Floats* a, const Floats* b) { return mul_add(a[0], b[0], mul_add(a[1], b[1], a[2] * b[2])); }
+MUDG_INLINE Floats dot3(const Floats* a, const Floats* b) {
+  return mul_add(a[0], b[0], mul_add(a[1], b[1], a[2] * b[2]));
+}
 
 // `means`, `quats` receive the raw inputs, for checks.
 MUDG_INLINE void project_sixteen(const RasterScene& s, int first, Projection& p, Floats means[3], Floats quats[4]) {
@@ -77,7 +81,8 @@ MUDG_INLINE void project_sixteen(const RasterScene& s, int first, Projection& p,
   const Floats z = select(p.cam[2] > splat(s.near_m), p.cam[2], splat(1.0f));
   p.inv_z = splat(1.0f) / z;
 
-  const Floats squares = mul_add(quats[0], quats[0], mul_add(quats[1], quats[1], mul_add(quats[2], quats[2], quats[3] * quats[3])));
+  const Floats squares =
+      mul_add(quats[0], quats[0], mul_add(quats[1], quats[1], mul_add(quats[2], quats[2], quats[3] * quats[3])));
   p.inv_norm = splat(1.0f) / sqrt_of(max_of(squares, splat(1e-24f)));
   for (int k = 0; k < 4; ++k) p.quat[k] = quats[k] * p.inv_norm;
   rotation_of(p.quat, p.rotation);
@@ -120,8 +125,8 @@ MUDG_INLINE void project_sixteen(const RasterScene& s, int first, Projection& p,
   p.det = mul_add(splat(s.blur_px2), p.sharp_xx + p.cov_yy, p.sharp_det);
 }
 
-// Anti-aliasing: the blur must not add light, so opacity shrinks by sqrt(det(sharp) / det(blurred)). Below 1e-3 nothing is
-// visible anyway.
+// Anti-aliasing: the blur must not add light, so opacity shrinks by sqrt(det(sharp) / det(blurred)). Below 1e-3 nothing
+// is visible anyway.
 MUDG_INLINE Floats compensation_of(const Projection& p) {
   return sqrt_of(max_of(p.sharp_det / max_of(p.det, splat(1e-10f)), splat(1e-6f)));
 }

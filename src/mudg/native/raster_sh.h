@@ -1,4 +1,5 @@
-// Real spherical harmonics up to degree 3 in the order and with the signs that Gaussian splatting uses, and their derivative.
+// Real spherical harmonics up to degree 3 in the order and with the signs that Gaussian splatting uses, and their
+// derivative.
 #pragma once
 
 #include "simd.h"

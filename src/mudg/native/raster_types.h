@@ -1,8 +1,9 @@
-// What the stages of the rasteriser hand to each other. Plain structs: the kernels are compiled once per instruction set and
-// see no container from the standard library.
+// What the stages of the rasteriser hand to each other. Plain structs: the kernels are compiled once per instruction
+// set and see no container from the standard library.
 //
-// Stages of a forward pass: project (Gaussian -> ellipse, colour, touched tiles) -> sort by depth -> bin into tiles -> blend.
-// Backward: blend backward (per tile, back to front, one gradient record per Gaussian and tile) -> project backward.
+// Stages of a forward pass: project (Gaussian -> ellipse, colour, touched tiles) -> sort by depth -> bin into tiles ->
+// blend. Backward: blend backward (per tile, back to front, one gradient record per Gaussian and tile) -> project
+// backward.
 #pragma once
 
 #include <cstddef>
@@ -12,13 +13,13 @@
 
 namespace mudg {
 
-constexpr int kTileSize = 16;               // pixels; a tile is 4 x 4 blocks
-constexpr int kBlockSize = 4;               // pixels; the 16 pixels of a block are one SIMD vector
+constexpr int kTileSize = 16;  // pixels; a tile is 4 x 4 blocks
+constexpr int kBlockSize = 4;  // pixels; the 16 pixels of a block are one SIMD vector
 constexpr int kBlocksPerTile = 16;
 constexpr int kPixelsPerBlock = 16;
 constexpr int kPixelsPerTile = kTileSize * kTileSize;
-constexpr int kMaxChannels = 32;            // RGB + depth + features
-constexpr float kStopTransmittance = 1e-4f; // a pixel is finished when its transmittance would fall to this or below
+constexpr int kMaxChannels = 32;             // RGB + depth + features
+constexpr float kStopTransmittance = 1e-4f;  // a pixel is finished when its transmittance would fall to this or below
 constexpr float kLog2Of255 = 7.994353436858858f;  // contributions below alpha = 1/255 are dropped
 constexpr float kLog2E = 1.4426950408889634f;
 constexpr float kLn2 = 0.6931471805599453f;
@@ -50,8 +51,8 @@ struct RasterScene {
   std::int32_t count, width, height, extra_channels, sh_coefficients, sh_degree, antialias, want_abs_gradient;
   float near_m, far_m, blur_px2, alpha_max;
   float fx, fy, cx, cy;
-  float rotation[9];                      // cam_from_world, row by row
-  float center_high[3], center_low[3];    // camera centre in the world as a sum of two floats
+  float rotation[9];                    // cam_from_world, row by row
+  float center_high[3], center_low[3];  // camera centre in the world as a sum of two floats
   float background[3];
   const float *means, *quats, *scales, *opacities, *sh, *extra;  // [N,3] [N,4] [N,3] [N] [N,K,3] [N,C]
 };
@@ -67,8 +68,8 @@ struct RasterImageGradient {
 };
 
 struct RasterGradient {
-  float *means, *quats, *scales, *opacities;      // never null
-  float *sh, *extra, *means2d, *abs_means2d;      // null: not wanted
+  float *means, *quats, *scales, *opacities;  // never null
+  float *sh, *extra, *means2d, *abs_means2d;  // null: not wanted
   float rotation[9], center[3], background[3];
 };
 
@@ -90,29 +91,29 @@ struct WorkerEntries {
 // Views into the buffers of a RasterContext; valid from a forward pass to the next one on the same context.
 struct RasterState {
   RasterScene scene;
-  int channels;          // 4 + extra
-  int padded_channels;   // rounded up to a multiple of 4
-  int splat_stride;      // floats per splat
-  int record_stride;     // floats per gradient record
+  int channels;         // 4 + extra
+  int padded_channels;  // rounded up to a multiple of 4
+  int splat_stride;     // floats per splat
+  int record_stride;    // floats per gradient record
   int tiles_x, tiles_y;
   std::int64_t visible_count, entry_count;
 
-  float* splats;                  // [N][splat_stride], written for visible Gaussians only
-  std::uint8_t* clamped;          // [N] bit c: colour channel c was cut off at zero
-  std::uint32_t* depth_key;       // [N] depth bits, kHidden when no tile is touched
-  std::uint32_t* entry_offset;    // [N] into the entries of worker entry_worker
-  std::int32_t* entry_counts;     // [N] tiles touched
-  std::uint8_t* entry_worker;     // [N]
-  std::int32_t* first_record;     // [N + 1]
-  std::uint32_t* order;           // [visible_count] Gaussians front to back
-  std::int32_t* tile_start;       // [tiles + 1]
-  TileItem* items;                // [entry_count]
-  float* final_transmittance;     // [tiles][16 blocks][16 pixels]
-  std::int32_t* last_item;        // the same layout: last list position that contributed, -1 if none
-  float* records;                 // [entry_count][record_stride]
-  float* tile_background;         // [tiles][4] per-tile part of the background's gradient
-  double* camera_parts;           // [chunks][16] per-chunk parts of the camera's gradient
-  int worker_count;               // workers that may take part in projecting
+  float* splats;                // [N][splat_stride], written for visible Gaussians only
+  std::uint8_t* clamped;        // [N] bit c: colour channel c was cut off at zero
+  std::uint32_t* depth_key;     // [N] depth bits, kHidden when no tile is touched
+  std::uint32_t* entry_offset;  // [N] into the entries of worker entry_worker
+  std::int32_t* entry_counts;   // [N] tiles touched
+  std::uint8_t* entry_worker;   // [N]
+  std::int32_t* first_record;   // [N + 1]
+  std::uint32_t* order;         // [visible_count] Gaussians front to back
+  std::int32_t* tile_start;     // [tiles + 1]
+  TileItem* items;              // [entry_count]
+  float* final_transmittance;   // [tiles][16 blocks][16 pixels]
+  std::int32_t* last_item;      // the same layout: last list position that contributed, -1 if none
+  float* records;               // [entry_count][record_stride]
+  float* tile_background;       // [tiles][4] per-tile part of the background's gradient
+  double* camera_parts;         // [chunks][16] per-chunk parts of the camera's gradient
+  int worker_count;             // workers that may take part in projecting
   WorkerEntries workers[kMaxThreads];
 
   std::int64_t not_finite_count;

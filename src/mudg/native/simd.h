@@ -1,8 +1,10 @@
-// Sixteen float lanes under one name, in three implementations. The file that is compiled with AVX-512 flags gets one register,
-// the one with AVX2 flags two, and every other processor four 128-bit vectors through compiler vector extensions.
+// Sixteen float lanes under one name, in three implementations. The file that is compiled with AVX-512 flags gets one
+// register, the one with AVX2 flags two, and every other processor four 128-bit vectors through compiler vector
+// extensions.
 //
-// Everything here lives in a namespace named after the instruction set and inside an anonymous namespace: an inline function
-// with external linkage would be merged by the linker across instruction sets, and then run on a processor without it.
+// Everything here lives in a namespace named after the instruction set and inside an anonymous namespace: an inline
+// function with external linkage would be merged by the linker across instruction sets, and then run on a processor
+// without it.
 #pragma once
 
 #include <cmath>
@@ -28,8 +30,8 @@ namespace {
 constexpr int kLanes = 16;
 alignas(64) constexpr float kLaneIndex[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-// log2(x) to about one unit in the last place, for normal positive x. The logarithm of the mantissa m in [sqrt(1/2), sqrt(2)) is
-// the odd series in (m - 1) / (m + 1).
+// log2(x) to about one unit in the last place, for normal positive x. The logarithm of the mantissa m in [sqrt(1/2),
+// sqrt(2)) is the odd series in (m - 1) / (m + 1).
 MUDG_INLINE Floats log2_of(Floats x) {
   Floats exponent, mantissa;
   split_exponent(x, exponent, mantissa);

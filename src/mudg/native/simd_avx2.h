@@ -146,7 +146,9 @@ struct WideRow {
   __m256 v;
   static MUDG_INLINE WideRow load_row(const float* p) { return {_mm256_loadu_ps(p)}; }
   MUDG_INLINE void store_row(float* p) const { _mm256_storeu_ps(p, v); }
-  static MUDG_INLINE WideRow product(float weight, WideRow row) { return {_mm256_mul_ps(_mm256_set1_ps(weight), row.v)}; }
+  static MUDG_INLINE WideRow product(float weight, WideRow row) {
+    return {_mm256_mul_ps(_mm256_set1_ps(weight), row.v)};
+  }
   MUDG_INLINE void add_product(float weight, WideRow row) { v = _mm256_fmadd_ps(_mm256_set1_ps(weight), row.v, v); }
   MUDG_INLINE WideRow plus(WideRow other) const { return {_mm256_add_ps(v, other.v)}; }
 };

@@ -35,12 +35,8 @@ MUDG_INLINE Floats min_of(Floats a, Floats b) { return {_mm512_min_ps(a.v, b.v)}
 MUDG_INLINE Floats max_of(Floats a, Floats b) { return {_mm512_max_ps(a.v, b.v)}; }
 MUDG_INLINE Floats sqrt_of(Floats a) { return {_mm512_sqrt_ps(a.v)}; }
 MUDG_INLINE Floats abs_of(Floats a) { return {_mm512_abs_ps(a.v)}; }
-MUDG_INLINE Floats floor_of(Floats a) {
-  return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
-}
-MUDG_INLINE Floats ceil_of(Floats a) {
-  return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)};
-}
+MUDG_INLINE Floats floor_of(Floats a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+MUDG_INLINE Floats ceil_of(Floats a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
 MUDG_INLINE Ints truncate(Floats a) { return {_mm512_cvttps_epi32(a.v)}; }
 
 MUDG_INLINE Mask operator>=(Floats a, Floats b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
@@ -96,7 +92,9 @@ struct WideRow {
   __m512 v;
   static MUDG_INLINE WideRow load_row(const float* p) { return {_mm512_loadu_ps(p)}; }
   MUDG_INLINE void store_row(float* p) const { _mm512_storeu_ps(p, v); }
-  static MUDG_INLINE WideRow product(float weight, WideRow row) { return {_mm512_mul_ps(_mm512_set1_ps(weight), row.v)}; }
+  static MUDG_INLINE WideRow product(float weight, WideRow row) {
+    return {_mm512_mul_ps(_mm512_set1_ps(weight), row.v)};
+  }
   MUDG_INLINE void add_product(float weight, WideRow row) { v = _mm512_fmadd_ps(_mm512_set1_ps(weight), row.v, v); }
   MUDG_INLINE WideRow plus(WideRow other) const { return {_mm512_add_ps(v, other.v)}; }
 };
@@ -106,7 +104,9 @@ struct NarrowRow {
   __m256 v;
   static MUDG_INLINE NarrowRow load_row(const float* p) { return {_mm256_loadu_ps(p)}; }
   MUDG_INLINE void store_row(float* p) const { _mm256_storeu_ps(p, v); }
-  static MUDG_INLINE NarrowRow product(float weight, NarrowRow row) { return {_mm256_mul_ps(_mm256_set1_ps(weight), row.v)}; }
+  static MUDG_INLINE NarrowRow product(float weight, NarrowRow row) {
+    return {_mm256_mul_ps(_mm256_set1_ps(weight), row.v)};
+  }
   MUDG_INLINE void add_product(float weight, NarrowRow row) { v = _mm256_fmadd_ps(_mm256_set1_ps(weight), row.v, v); }
   MUDG_INLINE NarrowRow plus(NarrowRow other) const { return {_mm256_add_ps(v, other.v)}; }
 };

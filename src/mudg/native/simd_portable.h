@@ -56,11 +56,20 @@ MUDG_INLINE Ints load_int(const int* p) {
 }
 MUDG_INLINE void store_int(int* p, Ints a) { std::memcpy(p, a.q, 64); }
 
-#define MUDG_LANEWISE(expression) {{expression(0), expression(1), expression(2), expression(3)}}
-#define MUDG_BINARY(Type, name, op) \
-  MUDG_INLINE Type name(Type a, Type b) { return {{a.q[0] op b.q[0], a.q[1] op b.q[1], a.q[2] op b.q[2], a.q[3] op b.q[3]}}; }
-#define MUDG_COMPARE(name, op) \
-  MUDG_INLINE Mask name(Floats a, Floats b) { return {{a.q[0] op b.q[0], a.q[1] op b.q[1], a.q[2] op b.q[2], a.q[3] op b.q[3]}}; }
+#define MUDG_LANEWISE(expression)                                \
+  {                                                              \
+    {                                                            \
+      expression(0), expression(1), expression(2), expression(3) \
+    }                                                            \
+  }
+#define MUDG_BINARY(Type, name, op)                                                    \
+  MUDG_INLINE Type name(Type a, Type b) {                                              \
+    return {{a.q[0] op b.q[0], a.q[1] op b.q[1], a.q[2] op b.q[2], a.q[3] op b.q[3]}}; \
+  }
+#define MUDG_COMPARE(name, op)                                                         \
+  MUDG_INLINE Mask name(Floats a, Floats b) {                                          \
+    return {{a.q[0] op b.q[0], a.q[1] op b.q[1], a.q[2] op b.q[2], a.q[3] op b.q[3]}}; \
+  }
 MUDG_BINARY(Floats, operator+, +)
 MUDG_BINARY(Floats, operator-, -)
 MUDG_BINARY(Floats, operator*, *)
