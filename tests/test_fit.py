@@ -324,3 +324,11 @@ def test_the_table_of_methods_and_the_recipes_agree():
         assert recipe.sky == ("sky" in row.nodes) == ("sky" in row.supervision)
         assert recipe.lidar == ("LiDAR depth" in row.supervision)
         assert recipe.virtual == ("virtual views of mudg_r" in row.supervision)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 8, 374, 375])
+def test_blocks_cover_images_of_any_size(size: int) -> None:
+    centres = fit_trust.block_centres(size)
+    spread = np.repeat(centres, fit_trust.STRIDE_PX)[:size]
+    assert len(spread) == size
+    assert np.abs(spread - np.arange(size)).max() <= fit_trust.STRIDE_PX // 2

@@ -34,6 +34,7 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
             seen[label] = (arguments, named)
             out.mkdir(parents=True, exist_ok=True)
             (out / "scene.json").write_text("{}") if name in ("ingest", "annotate") else None
+            (out / "manifest.json").write_text("{}")
             return out
 
         return act
@@ -46,17 +47,22 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setattr(run, "_has_semantics", lambda _scene: seen["labelled"])
     monkeypatch.setattr(score, "summary_table", lambda _out: "table")
 
-    def write_report(out: Path) -> Path:
+    def film(_out: Path) -> list[Any]:
+        seen["calls"].append("report")
+        return []
+
+    def write_page(out: Path, _reels: list[Any]) -> Path:
         store.write_text(out / "report.html", "page")
         return out / "report.html"
 
-    monkeypatch.setattr(report, "write_report", write_report)
+    monkeypatch.setattr(report, "film", film)
+    monkeypatch.setattr(report, "write_page", write_page)
     return seen
 
 
 CHAIN = [
     "ingest", "fuse", "synthesize", "fit:street_gaussians", "fit:mudg_s", "render:street_gaussians", "render:mudg_s",
-    "score",
+    "score", "report",
 ]  # fmt: skip
 
 
@@ -75,6 +81,17 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "complete"
     assert all(step["state"] == "complete" for step in ledger["steps"].values())
+
+
+def test_a_repeat_makes_no_second_report_unless_it_was_touched(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+    before = run.run_chain(RunConfig(), "city", tmp_path / "out")["seconds"]
+    assert verbs["calls"] == [*CHAIN, *CHAIN[:-1]]
+    assert "report" in before
+    store.write_text(tmp_path / "out" / "report.html", "scribble")
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+    assert verbs["calls"][-1] == "report"
+    assert (tmp_path / "out" / "report.html").read_text() == "page"
 
 
 def test_run_yaml_repeats_the_run(tmp_path: Path, verbs: dict[str, Any]) -> None:
@@ -145,7 +162,7 @@ def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dic
     assert verbs["calls"] == []
     run.run_chain(with_seed(RunConfig(), 3), "city", tmp_path / "out", overwrite=True)
     assert verbs["calls"] == CHAIN
-    assert all(verbs[label][1]["overwrite"] for label in CHAIN)
+    assert all(verbs[label][1]["overwrite"] for label in CHAIN[:-1])
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, verbs: dict[str, Any]) -> None:

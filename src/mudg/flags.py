@@ -134,7 +134,7 @@ class Run(Output):
     fast: FlagCreatePairsOff[bool] = False
     """Smaller pictures, fewer frames and iterations: a first look in a minute or two."""
     seed: Annotated[int | None, arg(metavar="INT")] = None
-    """Seed of every random draw in the chain (not given: 0, or what --config says)."""
+    """Seed of every random draw in the chain (not given: city 3, draws 0, or what --config says)."""
     cameras: tuple[str, ...] = ()
     """Cameras to move sideways (not given: the first one)."""
     shifts_m: tuple[float, ...] = ()
@@ -151,7 +151,7 @@ class Demo(Output):
     fast: FlagCreatePairsOff[bool] = False
     """Smaller pictures, fewer frames and iterations: about 90 seconds instead of 5 minutes on 2 cores."""
     seed: Annotated[int | None, arg(metavar="INT")] = None
-    """Seed of the city and of every random draw in the chain (not given: 0, or what --config says)."""
+    """Seed of the city and of every random draw in the chain (not given: city 3, draws 0, or what --config says)."""
     shifts_m: tuple[float, ...] = ()
     """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
     settings: Annotated[stage_config.RunConfig, arg(name="")] = stage_config.RunConfig()

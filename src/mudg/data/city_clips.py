@@ -20,7 +20,7 @@ import torch
 
 from mudg import native
 from mudg.base import geometry, seeds
-from mudg.base.types import Clip, FusedCloud, View
+from mudg.base.types import Clip, Condition, FusedCloud, View
 from mudg.core.fusion import FusionRules, Shot, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
@@ -167,7 +167,7 @@ def _thinned(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Re
     return tuple(r for r in recorded if r.view.time_s in kept)
 
 
-def clip_from_truth(condition, truths: Sequence[CityTruth]) -> Clip:
+def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
     """A clip from a condition and the generator's truth at its views; the sky has no valid depth."""
     rgb = torch.stack([torch.from_numpy(np.ascontiguousarray(t.rgb)).permute(2, 0, 1) for t in truths])
     depth = torch.stack([torch.from_numpy(np.ascontiguousarray(t.depth))[None] for t in truths])

@@ -67,9 +67,14 @@ def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
     return _Witness(small, depth[0].numpy())
 
 
+def block_centres(size_px: int) -> NDArray[np.intp]:
+    """Pixel asked about for each block of ``STRIDE_PX``; the last block may be cut, so that any size is covered."""
+    return np.minimum(np.arange(0, size_px, STRIDE_PX) + STRIDE_PX // 2, size_px - 1)
+
+
 def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence[RigidNode]) -> NDArray[np.bool_]:
     height, width = stored.rgb.shape[:2]
-    row, column = np.mgrid[STRIDE_PX // 2 : height : STRIDE_PX, STRIDE_PX // 2 : width : STRIDE_PX]
+    row, column = np.meshgrid(block_centres(height), block_centres(width), indexing="ij")
     shape = row.shape
     row, column = row.ravel(), column.ravel()
     depth = np.full(len(row), SKY_AT_M) if stored.depth is None else stored.depth[row, column].astype(np.float64)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,12 +28,12 @@ from mudg.stages.doctor import video_encoders
 from mudg.stages.report_page import FAR_M, NEAR_M, Reel, page
 from mudg.stages.score import error_image, resize_nearest, resize_rgb, to_bytes
 
-PANEL_WIDTH: Final = 480
+PANEL_WIDTH: Final = 416
 BUDGET_BYTES: Final = 16 * 2**20
 """For all videos together, before base64; the page stays under 25 MB."""
 FPS: Final = 10
 ROWS: Final = ("rgb", "depth", "semantics", "error")
-_QUALITY: Final = (24, 27, 30, 34, 38, 42)
+FIRST_CRF, LAST_CRF = 27, 45
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,13 @@ def write_report(out: Path) -> Path:
     Raises:
         InputError: the run is not scored yet, or a folder of views is damaged.
     """
+    return write_page(out, film(out))
+
+
+def film(out: Path) -> list[Reel]:
+    """The costly half of a report: one video per trajectory. Raises as ``write_report``."""
     out = Path(out)
     scores = store.read_json(out / "score" / "metrics.json")
-    ledger = store.read_json(out / "run.json")
     folders = _folders(out, scores)
     playable = bool(video_encoders())
     if not playable:
@@ -66,8 +71,16 @@ def write_report(out: Path) -> Path:
             bar.advance()
             return reel
 
-        reels = list(pool.map(make, courses))
-    store.write_text(out / "report.html", page(scores, ledger, _settings(out), reels, list(folders)))
+        return list(pool.map(make, courses))
+
+
+def write_page(out: Path, reels: Sequence[Reel]) -> Path:
+    """The cheap half: scores, times and settings around the videos."""
+    out = Path(out)
+    scores = store.read_json(out / "score" / "metrics.json")
+    ledger = store.read_json(out / "run.json")
+    columns = list(_folders(out, scores))
+    store.write_text(out / "report.html", page(scores, ledger, _settings(out), reels, columns))
     return out / "report.html"
 
 
@@ -97,11 +110,13 @@ def _reel(course: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]], 
     height = max(2, round(int(course["height"]) * width / int(course["width"])) // 2 * 2)
     panels = {column: tuple(_modalities(columns, column)) for column in columns.sets}
     order = list(folders)
-    video = b""
-    for quality in _QUALITY if playable else ():
-        video = mp4_bytes(_atlases(columns, order, panels, width, height), FPS, quality)
-        if len(video) <= budget:
+    video, crf = b"", FIRST_CRF
+    while playable:
+        video = mp4_bytes(_atlases(columns, order, panels, width, height), FPS, crf, "veryfast")
+        if len(video) <= budget or crf >= LAST_CRF:
             break
+        # Six steps of the quality halve the size, about.
+        crf = min(LAST_CRF, crf + max(1, math.ceil(6 * math.log2(len(video) / budget))))
     middle = columns.frames // 2
     poster = _jpeg(next(_atlases(columns, order, panels, width, height, first=middle)))
     return Reel(

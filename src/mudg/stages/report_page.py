@@ -302,6 +302,7 @@ def _tables(scores: Mapping[str, Any]) -> str:
     ]
     absent_words = ""
     if absent:
+        blocks += "\n" + _absent_table(scores, absent)
         listed = ", ".join(f"{m['title']} ({m['needs'][-1]})" for m in absent)
         absent_words = (
             f'<p class="small soft">Not computed, because this build has no weights for them: {escape(listed)}.</p>'
@@ -494,9 +495,13 @@ def _made_of(scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str
     packages = ", ".join(f"{n} {v}" for n, v in environment.get("packages", {}).items())
     scene = scores["scene"]
     sizes = ", ".join(f"{name} {w} x {h}" for name, (w, h) in scene["cameras"].items())
+    asked = ledger.get("asked", {})
+    seeds = {str(asked[verb]["seed"]) for verb in ("synthesize", "fit") if "seed" in asked.get(verb, {})}
     rows = [
         ("Input", str(ledger.get("asked", {}).get("source", ""))),
         ("Scene", f"{scene['id']}: {scene['frames']} frames, {scene['held_out']} held out; cameras {sizes}"),
+        ("Seed", ", ".join(sorted(seeds))),
+        ("Diffusion model", str(asked.get("synthesize", {}).get("model", "")).replace("embedded", "shipped with mudg")),
         ("Licence of the data", scene["licence"]),
         ("Truth", "exact at any view" if scores["truth"] == "exact" else "recorded held-out frames only"),
         ("Program", f"mudg {environment.get('mudg', '')}, Python {environment.get('python', '')}"),
@@ -506,7 +511,8 @@ def _made_of(scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str
         ),
         ("Packages", packages),
     ]
-    rows += [(f"Hash of {name}", digest) for name, digest in ledger.get("digests", {}).items()]
+    hashes = ", ".join(f"{name} {digest[:16]}" for name, digest in ledger.get("digests", {}).items())
+    rows.append(("Hashes (SHA-256)", hashes))
     items = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in rows if v)
     return (
         f'<section aria-labelledby="made-title"><h2 id="made-title">What was run</h2><dl>{items}</dl>'

@@ -15,7 +15,7 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
-from mudg.base.versions import environment
+from mudg.base.versions import environment, version
 from mudg.stages.config import RunConfig
 
 CITY = "city"
@@ -30,7 +30,7 @@ class Step:
 
     name: str
     folder: str
-    make: Callable[[], Path]
+    make: Callable[[], Any]
 
 
 def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
@@ -52,6 +52,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         InputError: no such log. UsageError: ``out`` holds a run of other settings. Whatever a verb raises.
     """
     from mudg import native
+    from mudg.stages import report
 
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
@@ -62,18 +63,23 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         scene = _prepare_scene(config, source, out, ledger, overwrite)
         for step in _steps(config, scene, out, overwrite):
             ledger.timed(step)
-        report = ledger.timed(Step("report", "report.html", lambda: _report(out)))
+        key = _report_key(out)
+        reels = None if ledger.has_report(key) else ledger.timed(Step("report", "report.html", lambda: report.film(out)))
     except KeyboardInterrupt:
         ledger.save("interrupted")
         raise
     except MudgError:
         ledger.save("failed")
         raise
+    ledger.digests = _digests(out)
     ledger.save("complete")
-    _report(out)  # once more, now that the seconds of all steps are known
+    if reels is not None:  # written last, when the seconds of all steps are known
+        report.write_page(out, reels)
+        ledger.remember_report(key)
+    page = out / "report.html"
     return {
-        "report": report, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
-        "text": _closing_words(out, report, ledger),
+        "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
+        "text": _closing_words(out, page, ledger),
     }  # fmt: skip
 
 
@@ -137,10 +143,15 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
     )  # fmt: skip
 
 
-def _report(out: Path) -> Path:
-    from mudg.stages import report
+def _report_key(out: Path) -> str:
+    """What the page is made of: the scores (which name the views), the settings and the program."""
+    return f"{store.sha256_file(out / 'score' / store.MANIFEST)} {store.sha256_file(out / 'run.yaml')} {version()}"
 
-    return report.write_report(out)
+
+def _digests(out: Path) -> dict[str, str]:
+    """Hash of each artefact's manifest."""
+    folders = sorted(path.parent for path in out.rglob(store.MANIFEST))
+    return {folder.relative_to(out).as_posix(): store.sha256_file(folder / store.MANIFEST) for folder in folders}
 
 
 def _use_all_threads(count: int) -> None:
@@ -163,22 +174,26 @@ def _closing_words(out: Path, report: Path, ledger: _Ledger) -> str:
 class _Ledger:
     """OUT/run.json: what was asked, and how long each step took over all continuations."""
 
-    def __init__(self, out: Path, asked: Mapping[str, Any], steps: dict[str, dict[str, Any]]) -> None:
+    def __init__(self, out: Path, asked: Mapping[str, Any], before: Mapping[str, Any]) -> None:
         self._out = out
         self._asked = dict(asked)
-        self._steps = steps
+        self._steps: dict[str, dict[str, Any]] = dict(before.get("steps", {}))
+        self._report = dict(before.get("report", {}))
+        self.digests: dict[str, str] = {}
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
         """Open or begin the ledger of ``out``; UsageError if it belongs to other settings."""
         asked = {"verb": "run", "source": source, **configuration.to_dict(config)}
-        steps: dict[str, dict[str, Any]] = {}
+        before: dict[str, Any] = {}
         known = out / "run.json"
         if known.is_file():
             before = store.read_json(known)
             if before.get("asked") == asked:
-                steps = dict(before.get("steps", {}))
-            elif not overwrite:
+                pass
+            elif overwrite:
+                before = {}
+            else:
                 raise UsageError(
                     "the output folder holds a run of other settings", where=str(out),
                     got="; ".join(_differences(before.get("asked", {}), asked)[:8]) or "another program version",
@@ -187,12 +202,22 @@ class _Ledger:
         elif out.is_dir() and any(out.iterdir()) and not overwrite:
             raise UsageError("the output folder holds files of something else", where=str(out),
                              remedy="choose an empty --out")  # fmt: skip
-        ledger = cls(out, asked, steps)
+        ledger = cls(out, asked, before)
         ledger.save("running")
         store.write_text(out / "run.yaml", configuration.dump_yaml(config))
         return ledger
 
-    def timed(self, step: Step) -> Path:
+    def has_report(self, key: str) -> bool:
+        """Whether report.html was made of just this and is unchanged."""
+        page = self._out / "report.html"
+        return self._report.get("key") == key and page.is_file() and self._report["sha256"] == store.sha256_file(page)
+
+    def remember_report(self, key: str) -> None:
+        """Note what the page was made of."""
+        self._report = {"key": key, "sha256": store.sha256_file(self._out / "report.html")}
+        self.save("complete")
+
+    def timed(self, step: Step) -> Any:
         """Do one step and add its seconds, also when it is interrupted; a reused result adds none."""
         finished = self._steps.get(step.name, {}).get("state") == "complete" and (self._out / step.folder).exists()
         began = time.monotonic()
@@ -219,7 +244,10 @@ class _Ledger:
         """Write OUT/run.json."""
         store.write_json(
             self._out / "run.json",
-            {"schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "environment": environment()},
+            {
+                "schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests,
+                "report": self._report, "environment": environment(),
+            },  # fmt: skip
         )
 
 

@@ -36,10 +36,12 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 10.0
     return Path(path)
 
 
-def mp4_bytes(frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 26) -> bytes:
-    """The same as bytes, for embedding in a page."""
+def mp4_bytes(
+    frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 26, preset: str = "medium"
+) -> bytes:
+    """The same as bytes, for embedding in a page. ``preset``: x264's name for speed against size."""
     buffer = io.BytesIO()
-    _encode(buffer, frames, fps, crf)
+    _encode(buffer, frames, fps, crf, preset)
     return buffer.getvalue()
 
 
@@ -52,7 +54,9 @@ def read_mp4(path: Path) -> NDArray[np.uint8]:
         raise InputError("not a readable video", where=str(path), got=str(error)) from error
 
 
-def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int) -> None:
+def _encode(
+    target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int, preset: str = "medium"
+) -> None:
     container = stream = None
     size: tuple[int, ...] = ()
     try:
@@ -64,7 +68,7 @@ def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: i
                 # The index first, so that players start at once; only a file can be rewritten that way.
                 options = {"movflags": "+faststart"} if isinstance(target, str) else {}
                 container = av.open(target, "w", format="mp4", options=options)
-                stream = _stream(container, frame.shape, fps, crf)
+                stream = _stream(container, frame.shape, fps, crf, preset)
             if frame.shape != size:
                 raise InputError("video frames differ in size", where=f"frame {index}", expected=str(size), got=str(frame.shape))
             for packet in stream.encode(av.VideoFrame.from_ndarray(_even(frame), format="rgb24")):  # type: ignore[union-attr]
@@ -80,7 +84,7 @@ def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: i
             container.close()
 
 
-def _stream(container: Any, shape: tuple[int, ...], fps: float, crf: int) -> Any:
+def _stream(container: Any, shape: tuple[int, ...], fps: float, crf: int, preset: str) -> Any:
     codec = next((name for name in _CODECS if name in av.codecs_available), None)
     if codec is None:
         raise ResourceError("PyAV was built without an MP4 video encoder", expected=" or ".join(_CODECS))
@@ -88,7 +92,7 @@ def _stream(container: Any, shape: tuple[int, ...], fps: float, crf: int) -> Any
     stream.width, stream.height = shape[1] + shape[1] % 2, shape[0] + shape[0] % 2
     stream.pix_fmt = "yuv420p"
     stream.thread_count = 1  # the same bytes on every machine with this encoder
-    stream.options = {"crf": str(crf), "preset": "medium"} if codec == "libx264" else {}
+    stream.options = {"crf": str(crf), "preset": preset} if codec == "libx264" else {}
     return stream
 
 
