@@ -60,6 +60,10 @@ def test_modalities_not_produced_stay_none(tmp_path: Path) -> None:
     got = read_observations(tmp_path / "t")[0]
     assert got.depth is None
     assert got.semantics is None
+    (tmp_path / "t" / "observations.json").unlink()
+    with ObservationWriter(tmp_path / "t", "t", "x") as writer:
+        writer.skip(bare.view)
+    assert read_observations(tmp_path / "t")[0].depth is None
 
 
 def test_an_interrupted_folder_is_not_readable_but_its_files_are_kept(tmp_path: Path) -> None:

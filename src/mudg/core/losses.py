@@ -188,7 +188,7 @@ def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Ten
     total = prediction[0].new_zeros(())
     for mine, theirs in zip(prediction, target):
         _same_shape(mine, theirs, "feature_distance")
-        scale_weight = F.adaptive_avg_pool2d(weight.to(mine.dtype), mine.shape[-2:])
+        scale_weight = F.adaptive_avg_pool2d(weight.to(mine.dtype), (mine.shape[-2], mine.shape[-1]))
         total = total + confident_mean((mine - theirs).abs(), scale_weight)
     return total / len(prediction)
 

@@ -66,8 +66,9 @@ class _Context:
             raise ResourceError("not enough memory for the rasteriser")
 
     def __del__(self) -> None:
-        if getattr(self, "handle", None):
-            type(self)._free.append(self.handle)
+        free = getattr(type(self), "_free", None)  # gone when the interpreter is shutting down
+        if free is not None and getattr(self, "handle", None):
+            free.append(self.handle)
 
 
 def _statistics(library: ctypes.CDLL, handle: int) -> dict[str, float]:

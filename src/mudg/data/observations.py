@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from mudg.base import palette, store
+from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, ObservationKind, View
 
@@ -81,7 +81,8 @@ class ObservationWriter:
 
     def skip(self, view: View) -> None:
         """Record a view whose files an earlier run has written."""
-        self._record(view)
+        arrays = store.read_safetensors(self._out / "data" / f"{len(self._records):06d}.safetensors")
+        self._record(view, "depth" in arrays, "semantics" in arrays)
 
     def add(self, observation: Observation) -> None:
         """Write one observation and record its view."""
@@ -89,33 +90,15 @@ class ObservationWriter:
         rgb = (observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
         with store.atomic_path(self._out / "rgb" / f"{name}.png") as temporary:
             Image.fromarray(rgb).save(temporary, compress_level=1)
-        h, w = rgb.shape[:2]
-        depth = (
-            np.full((h, w), np.nan, np.float32)
-            if observation.depth is None
-            else _numpy(observation.depth[0], np.float32)
-        )
-        semantics = (
-            np.full((h, w), palette.UNLABELLED, np.uint8)
-            if observation.semantics is None
-            else _numpy(observation.semantics, np.uint8)
-        )
-        store.write_safetensors(
-            self._out / "data" / f"{name}.safetensors",
-            {
-                "depth": depth,
-                "semantics": semantics,
-                "confidence": _numpy(observation.confidence[0], np.float16),
-                "mask": _numpy(observation.mask[0], np.uint8),
-            },
-            metadata={
-                "depth": "no" if observation.depth is None else "yes",
-                "semantics": "no" if observation.semantics is None else "yes",
-            },
-        )
+        arrays = {"confidence": _numpy(observation.confidence[0], np.float16), "mask": _numpy(observation.mask[0], np.uint8)}
+        if observation.depth is not None:
+            arrays["depth"] = _numpy(observation.depth[0], np.float32)
+        if observation.semantics is not None:
+            arrays["semantics"] = _numpy(observation.semantics, np.uint8)
+        store.write_safetensors(self._out / "data" / f"{name}.safetensors", arrays)
         self._record(observation.view, observation.depth is not None, observation.semantics is not None)
 
-    def _record(self, view: View, has_depth: bool = True, has_semantics: bool = True) -> None:
+    def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
         self._records.append(
             {
                 "camera": camera_record(view.camera),
@@ -172,7 +155,8 @@ class ObservationSet:
         path = self.path / "data" / f"{index:06d}.safetensors"
         arrays = store.read_safetensors(path)
         shape = (view.camera.height, view.camera.width)
-        for name in ("depth", "semantics", "confidence", "mask"):
+        wanted = ["confidence", "mask"] + ["depth"] * self.has_depth[index] + ["semantics"] * self.has_semantics[index]
+        for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
                 raise InputError(
