@@ -139,9 +139,8 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
     folders = report._folders(out, scores)
     assert list(folders) == ["truth", "street_gaussians", "mudg_r", "mudg_s"]
     course = next(c for c in scores["trajectories"] if c["shift_m"] == 0)
-    columns = report._columns(
-        course, {c: report.read_observations(of[course["name"]]) for c, of in folders.items() if course["name"] in of}
-    )
+    columns = report._columns(course, folders)
+    assert columns.has_truth
     panels = {c: tuple(report._modalities(columns, c)) for c in columns.sets}
     assert panels["truth"] == ("rgb", "depth", "semantics")
     assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
@@ -153,6 +152,21 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
     assert (atlas[h : 2 * h, :w][np.isnan(toy_views.depths())] == 0).all()
     assert tuple(atlas[2 * h, 0]) == (70, 130, 180)  # sky in the usual colour
     assert (atlas[:h, 2 * w : 3 * w] == 24).all()  # not produced
+
+
+def test_a_shifted_view_of_a_log_shows_the_driven_line_beside_it(tmp_path: Path) -> None:
+    out = finished_run(tmp_path)
+    scores = store.read_json(out / "score" / "metrics.json")
+    folders = report._folders(out, scores)
+    course = next(c for c in scores["trajectories"] if c["shift_m"] == 2)
+    columns = report._columns(course, folders)
+    assert not columns.has_truth
+    assert columns.sets["truth"].trajectory == "front_recorded"
+    assert list(columns.indices["truth"]) == [0, 1, 2, 3]
+    panels = {c: tuple(report._modalities(columns, c)) for c in columns.sets}
+    assert all("error" not in rows for rows in panels.values())
+    atlas = next(report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
+    assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colours(0))
 
 
 def run_of(psnr: dict[tuple[str, float], float | str], truth: str = "exact") -> dict[str, Any]:

@@ -32,17 +32,22 @@ PANEL_WIDTH: Final = 416
 BUDGET_BYTES: Final = 16 * 2**20
 """For all videos together, before base64; the page stays under 25 MB."""
 FPS: Final = 10
+SAME_TIME_S: Final = 1e-4
 ROWS: Final = ("rgb", "depth", "semantics", "error")
 FIRST_CRF, LAST_CRF = 27, 45
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The observation sets of one trajectory, by column name, and which view of each stands at each frame."""
+    """The observation sets of one trajectory, by column name, and which view of each stands at each frame.
+
+    ``has_truth``: the column "truth" shows this very trajectory, not the recorded path at the same moments.
+    """
 
     sets: Mapping[str, ObservationSet]
     indices: Mapping[str, Sequence[int]]
     frames: int
+    has_truth: bool
 
 
 def write_report(out: Path) -> Path:
@@ -105,7 +110,7 @@ def _folders(out: Path, scores: Mapping[str, Any]) -> dict[str, dict[str, Path]]
 
 def _reel(course: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]], playable: bool, budget: int) -> Reel:
     name = course["name"]
-    columns = _columns(course, {c: read_observations(of[name]) for c, of in folders.items() if name in of})
+    columns = _columns(course, folders)
     width = min(PANEL_WIDTH, int(course["width"])) // 2 * 2
     height = max(2, round(int(course["height"]) * width / int(course["width"])) // 2 * 2)
     panels = {column: tuple(_modalities(columns, column)) for column in columns.sets}
@@ -126,12 +131,25 @@ def _reel(course: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]], 
     )  # fmt: skip
 
 
-def _columns(course: Mapping[str, Any], sets: dict[str, ObservationSet]) -> Columns:
-    """Truth and baseline have just the scored views; of the methods' views the scorer's indices pick the same."""
-    frames = int(course["views"])
-    picked = course["indices"]
-    indices = {column: picked[column] if column in picked else range(frames) for column in sets}
-    return Columns(sets, indices, frames)
+def _columns(course: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]]) -> Columns:
+    """Truth and baseline have just the scored views; of the methods' views the scorer's indices pick the same.
+
+    Where a trajectory has no truth (a shifted view of a recorded log), its column shows the recorded path at the same moments.
+    """
+    name, frames, picked = course["name"], int(course["views"]), course["indices"]
+    sets = {column: read_observations(of[name]) for column, of in folders.items() if name in of}
+    indices: dict[str, Sequence[int]] = {c: picked[c] if c in picked else range(frames) for c in sets}
+    has_truth = "truth" in sets
+    driven = folders.get("truth", {}).get(f"{course['camera']}_recorded")
+    if not has_truth and driven is not None:
+        recorded = read_observations(driven)
+        column = next(iter(sets))
+        wanted = np.array([sets[column].views[i].time_s for i in indices[column]])
+        apart = np.abs(np.array([view.time_s for view in recorded.views])[None] - wanted[:, None])
+        if apart.min(1).max() < SAME_TIME_S:
+            sets = {"truth": recorded, **sets}
+            indices["truth"] = apart.argmin(1).tolist()
+    return Columns(sets, indices, frames, has_truth)
 
 
 def _modalities(columns: Columns, column: str) -> Iterator[str]:
@@ -141,7 +159,7 @@ def _modalities(columns: Columns, column: str) -> Iterator[str]:
         yield "depth"
     if first.semantics is not None:
         yield "semantics"
-    if "truth" in columns.sets and column != "truth":
+    if columns.has_truth and column != "truth":
         yield "error"
 
 

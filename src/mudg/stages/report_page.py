@@ -179,7 +179,7 @@ def _player(scores: Mapping[str, Any], reels: Sequence[Reel], columns: Sequence[
     rows = [{"name": "rgb", "title": "Colour"}, {"name": "depth", "title": "Depth"},
             {"name": "semantics", "title": "Classes"}, {"name": "error", "title": "Colour error"}]  # fmt: skip
     recorded = scores["truth"] != "exact"
-    titles = {c: ("Recorded" if recorded and c == "truth" else title_of(c)) for c in columns}
+    titles = {c: ("Recorded, driven line" if recorded and c == "truth" else title_of(c)) for c in columns}
     data = {
         "fps": 10, "columns": list(columns), "titles": titles, "rows": rows,
         "trajectories": [
@@ -192,7 +192,7 @@ def _player(scores: Mapping[str, Any], reels: Sequence[Reel], columns: Sequence[
     intro = (
         "Every panel shows the same instant. Left of the road is left on the selector."
         if not recorded
-        else "Every panel shows the same instant. The recorded column exists only on the path that was driven."
+        else "Every panel shows the same instant. The first column is the picture taken from the driven line."
     )
     return f"""<section aria-labelledby="views-title">
 <h2 id="views-title">The same moments, from another line</h2>

@@ -131,6 +131,11 @@ def plain(document: Mapping[str, Any]) -> str:
     columns = [m for m in document["metrics"] if m["name"] in SHOWN]
     lines = []
     for distance in distances:
+        if not any(
+            isinstance(v, float) for m in document["methods"] for v in of.get((m["name"], distance), {}).values()
+        ):
+            lines += [f"{distance_title(document, distance)}: nothing to score against (no truth)", ""]
+            continue
         lines.append(distance_title(document, distance))
         heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
         lines.append("  " + " " * 28 + "".join(f"{head:>14}" for head in heads))

@@ -37,11 +37,13 @@
     wall.appendChild(element("div", "corner"));
     data.columns.forEach(function (column) { wall.appendChild(heading(column)); });
     data.rows.forEach(function (row, y) {
+      var somebody = data.columns.some(function (c) { return (current.panels[c] || []).indexOf(row.name) >= 0; });
+      if (!somebody) { return; }
       wall.appendChild(element("div", "row", row.title));
       data.columns.forEach(function (column, x) {
         var here = current.panels[column];
         if (!here || here.indexOf(row.name) < 0) {
-          var why = column === "truth" && row.name === "error" ? "the reference" : "not produced";
+          var why = column !== "truth" ? "not produced" : row.name === "error" ? "the reference" : "not recorded";
           wall.appendChild(element("div", "none", why));
           return;
         }
