@@ -436,19 +436,19 @@ class RunDir:
     ) -> None:
         import yaml
 
-        differences = []
+        found = []
         if state.get("verb") != verb:
-            differences.append(f"verb {state.get('verb')!r} instead of {verb!r}")
+            found.append(f"verb {state.get('verb')!r} instead of {verb!r}")
         old_inputs = state.get("inputs", {})
-        differences += [f"input {name!r} changed" for name in inputs if old_inputs.get(name) != inputs[name]]
+        found += [f"input {name!r} changed" for name in inputs if old_inputs.get(name) != inputs[name]]
         with contextlib.suppress(OSError, yaml.YAMLError):
             old = yaml.safe_load((path / "run.yaml").read_text()) or {}
             new = json.loads(json_text(dict(config)))
-            differences += _differences(old, {"verb": verb, **new})
+            found += differences(old, {"verb": verb, **new})
         raise UsageError(
             "the output folder holds the result of another configuration",
             where=str(path),
-            got="; ".join(differences[:8]) or "another program version",
+            got="; ".join(found[:8]) or "another program version",
             remedy="choose another --out, or add --overwrite to replace it",
         )
 
@@ -537,10 +537,11 @@ def process_alive(pid: int) -> bool:
     return pid > 0
 
 
-def _differences(old: Any, new: Any, path: str = "") -> list[str]:
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value."""
     if isinstance(old, dict) and isinstance(new, dict):
         found = []
         for name in sorted(set(old) | set(new), key=str):
-            found += _differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
+            found += differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
         return found
     return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]

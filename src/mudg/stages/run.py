@@ -196,7 +196,7 @@ class _Ledger:
             else:
                 raise UsageError(
                     "the output folder holds a run of other settings", where=str(out),
-                    got="; ".join(_differences(before.get("asked", {}), asked)[:8]) or "another program version",
+                    got="; ".join(store.differences(before.get("asked", {}), asked)[:8]) or "another program version",
                     remedy="choose another --out, or add --overwrite to replace it",
                 )  # fmt: skip
         elif out.is_dir() and any(out.iterdir()) and not overwrite:
@@ -249,12 +249,3 @@ class _Ledger:
                 "report": self._report, "environment": environment(),
             },  # fmt: skip
         )
-
-
-def _differences(old: Any, new: Any, path: str = "") -> list[str]:
-    if isinstance(old, dict) and isinstance(new, dict):
-        found = []
-        for name in sorted(set(old) | set(new), key=str):
-            found += _differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
-        return found
-    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]
