@@ -46,8 +46,9 @@ def image_of_wall(view, x_m):
 def test_warp_of_a_plane_is_exact():
     """A striped wall 10 m ahead, seen from 1.5 m beside: the warped recorded image equals the true one."""
     recorded, target = view_at(), view_at(y=1.5)
-    source = Source(recorded, clips._tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0)
-    rgb, found = clips.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
+    source = Source(recorded, clips._tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0,
+                    torch.zeros(32, 48, dtype=torch.uint8))  # fmt: skip
+    rgb, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
     truth = clips._tensor(image_of_wall(target, 10.0))
     assert float(found.float().mean()) > 0.85
     assert float((rgb - truth).abs()[:, found].max()) < 0.01
@@ -65,7 +66,8 @@ def test_hidden_pixels_are_not_taken():
     rgb = torch.zeros(3, 32, 48)
     surface = torch.full((32, 48), 10.0)
     surface[:, 20:28] = 4.0  # something near stands there in the recorded image
-    _, found = clips.warp(target, torch.full((32, 48), 10.0), Source(recorded, rgb, surface, surface < 0), surface, 0.08)
+    source = Source(recorded, rgb, surface, surface < 0, torch.zeros(32, 48, dtype=torch.uint8))
+    _, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, surface, 0.08)
     x, _, _ = clips.carry(target, torch.full((1, 32, 48), 10.0), recorded)
     behind = (x[0] > 20.5) & (x[0] < 27.5)
     assert bool(behind.any())
@@ -191,7 +193,9 @@ def some_clip(frames=3, height=16, width=24):
         draw(frames, 1, height, width) > 0.5, draw(frames, 3, height, width),
     )  # fmt: skip
     depth = 80 * draw(frames, 1, height, width)
-    return Clip(condition, draw(frames, 3, height, width), depth, depth > 5, torch.randint(0, 19, (frames, height, width)))
+    return Clip(
+        condition, draw(frames, 3, height, width), depth, depth > 5, torch.randint(0, 19, (frames, height, width))
+    )
 
 
 def test_shards_give_back_what_was_packed(tmp_path):

@@ -14,10 +14,11 @@ from mudg.models.vae import CodecConfig
 
 TINY = MDMConfig(
     widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
-    embed_width=16, patch=1, codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+    embed_width=16, patch=1, codec=CodecConfig(decoder_width=8, decoder_blocks=1), refine_widths=(8, 16), refine_blocks=(1, 1),
 )  # fmt: skip
+PLAIN = replace(TINY, given_classes=False, refine_widths=(), refine_blocks=())
 SEPARATE = replace(
-    TINY, joint=False, head="v", copy_condition=False, backdrop=False, mask_planes="none", reference="first_frame",
+    PLAIN, joint=False, head="v", copy_condition=False, backdrop=False, mask_planes="none", reference="first_frame",
     codec=CodecConfig(semantics_code="palette", depth_code="linear", decoder_width=8, decoder_blocks=1),
 )  # fmt: skip
 
@@ -30,7 +31,19 @@ def some_condition(frames=3, height=16, width=24, seed=0):
     return Condition(
         views, draw(frames, 3, height, width), 3 + 60 * draw(frames, 1, height, width), draw(frames, 1, height, width) > 0.5,
         draw(3, height, width), draw(frames, 1, height, width) > 0.3, draw(frames, 3, height, width),
+        some_ids(generator, frames, height, width), some_ids(generator, frames, height, width),
     )  # fmt: skip
+
+
+def some_ids(generator, frames, height, width):
+    """Classes 0 to 18, and one in five unknown."""
+    ids = torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
+    return torch.where(torch.rand(ids.shape, generator=generator) < 0.2, torch.full_like(ids, 255), ids)
+
+
+def learn_part(model):
+    """Parameters that training changes after the codec."""
+    return [p for n, p in model.named_parameters() if not n.startswith("codec.")]
 
 
 def randomised(config, seed=0):
@@ -38,7 +51,7 @@ def randomised(config, seed=0):
     model = MDM(config).eval()
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        for value in model.net.parameters():
+        for value in learn_part(model):
             fan = value[0].numel() if value.ndim > 1 else 1
             value.copy_(torch.randn(value.shape, generator=generator) * (0.5 / fan**0.5 if value.ndim > 1 else 0.1))
     return model
@@ -87,14 +100,46 @@ def test_published_reference_replaces_frame_zero_of_the_colour_only():
     assert encoded.planes.shape[2] == 8
 
 
+def test_a_grown_model_starts_as_the_same_denoiser():
+    """Further inputs and outputs begin at zero: without given classes, nothing changes."""
+    small, condition = randomised(PLAIN), some_condition()
+    big = mdm.grown(small, TINY)
+    condition = replace(condition, semantics=None, backdrop_semantics=None)
+    x = {
+        m: torch.randn(1, 3, c, 8, 12, generator=torch.Generator().manual_seed(1))
+        for m, c in small.codec.channels.items()
+    }
+    with torch.no_grad():
+        before, _ = small.predict(x, small.encode_condition(condition), torch.tensor([600]))
+        after, _ = big.predict(x, big.encode_condition(condition), torch.tensor([600]))
+    for name in before:
+        assert torch.allclose(before[name], after[name], atol=1e-5), name
+    with pytest.raises(UsageError, match="another kind"):
+        mdm.grown(small, replace(TINY, widths=(16, 32)))
+
+
+def test_given_classes_are_copied_where_they_are_known():
+    """An untrained denoiser and refiner already say what the condition says, and nothing where it says nothing."""
+    model, condition = MDM(TINY).eval(), some_condition()
+    blocks = condition.semantics[..., ::4, ::4].repeat_interleave(4, -2).repeat_interleave(4, -1)
+    sample = model.sample(replace(condition, semantics=blocks), steps=1)
+    known = (blocks != 255)[:, 0]
+    assert float((sample.semantics == blocks[:, 0])[known].float().mean()) > 0.95
+    without = model.sample(replace(condition, semantics=None, backdrop_semantics=None), steps=1)
+    assert float((without.semantics == blocks[:, 0])[known].float().mean()) < 0.2
+
+
 def test_untrained_model_copies_the_condition_where_it_is_seen():
     """At the start the x0 head gives sigmoid(4) of the condition's latent where everything was seen."""
     model = MDM(TINY)
-    condition = some_condition()
+    condition = replace(some_condition(), semantics=None)
     everything = torch.ones_like(condition.valid)
     condition = replace(condition, valid=everything, warped=everything)
     encoded = model.encode_condition(condition)
-    x = {m: torch.randn(1, 3, c, 8, 12, generator=torch.Generator().manual_seed(1)) for m, c in model.codec.channels.items()}
+    x = {
+        m: torch.randn(1, 3, c, 8, 12, generator=torch.Generator().manual_seed(1))
+        for m, c in model.codec.channels.items()
+    }
     stated, _ = model.predict(x, encoded, torch.tensor([999]))
     gate = torch.sigmoid(torch.tensor(mdm.COPY_BIAS))
     assert torch.allclose(stated["depth"], gate * encoded.copy["depth"], atol=1e-5)
@@ -123,7 +168,10 @@ def test_frames_and_clips_do_not_leak_across_the_batch():
     model = randomised(TINY)
     encoded = [model.encode_condition(some_condition(seed=s)) for s in (0, 1)]
     both = model.encode_condition([some_condition(seed=0), some_condition(seed=1)])
-    x = {m: torch.randn(2, 3, c, 8, 12, generator=torch.Generator().manual_seed(2)) for m, c in model.codec.channels.items()}
+    x = {
+        m: torch.randn(2, 3, c, 8, 12, generator=torch.Generator().manual_seed(2))
+        for m, c in model.codec.channels.items()
+    }
     together, _ = model.predict(x, both, torch.tensor([100, 700]))
     with torch.no_grad():
         for i, t in enumerate((100, 700)):
@@ -152,14 +200,19 @@ def test_temporal_shift_moves_one_eighth_each_way():
 def test_loss_falls_when_a_clip_is_learnt(config):
     torch.manual_seed(0)
     model, condition = MDM(config), some_condition()
-    rgb, depth, ids = condition.color[None].flip(-1), condition.depth[None] * 0.5 + 2, torch.randint(0, 19, (1, 3, 16, 24))
+    rgb, depth, ids = (
+        condition.color[None].flip(-1),
+        condition.depth[None] * 0.5 + 2,
+        torch.randint(0, 19, (1, 3, 16, 24)),
+    )
     truth, encoded = model.encode_truth(rgb, depth, ids), model.encode_condition(condition)
     shares = mdm.truth_shares(ids)
-    optimizer = torch.optim.Adam(model.net.parameters(), lr=3e-3)
+    optimizer = torch.optim.Adam(learn_part(model), lr=3e-3)
+    pixels = model.pixel_truth(rgb, depth, ids)
     totals = []
     for step in range(40):
         # the same draws at every fourth step: a falling loss cannot come from an easier draw
-        losses = model.loss(truth, encoded, torch.Generator().manual_seed(step % 4), shares=shares)
+        losses = model.loss(truth, encoded, torch.Generator().manual_seed(step % 4), shares=shares, pixels=pixels)
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
@@ -174,11 +227,18 @@ def test_loss_has_gradients_everywhere():
     losses = model.loss(
         model.encode_truth(condition.color[None], condition.depth[None], ids), model.encode_condition(condition),
         torch.Generator().manual_seed(0), shares=mdm.truth_shares(ids),
+        pixels=model.pixel_truth(condition.color[None], condition.depth[None], ids),
     )  # fmt: skip
     losses.total.backward()
-    dead = [n for n, p in model.net.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]
+    trained = [(n, p) for n, p in model.named_parameters() if not n.startswith("codec.")]
+    dead = [n for n, p in trained if p.grad is None or not bool(p.grad.abs().sum() > 0)]
     assert dead == []
-    assert set(losses.terms) == {"rgb", "depth", "semantics"}
+    assert set(losses.terms) == {
+        "rgb",
+        "depth",
+        "semantics",
+        *(f"pixel_{m}" for m in ("rgb", "depth", "semantics", "error")),
+    }
 
 
 def test_measured_depth_is_taken_and_sky_is_far():
@@ -197,18 +257,6 @@ def test_measured_depth_is_taken_and_sky_is_far():
     settled = mdm.settle_depth(depth, condition, sky, 100.0)
     assert torch.equal(settled[seen], nearest[seen])
     assert bool((settled[~seen] == 100.0).all())
-
-
-def test_lost_colour_is_given_back_only_where_generated_and_condition_agree():
-    condition = some_condition(frames=1)
-    everywhere = torch.ones_like(condition.valid)
-    condition = replace(condition, valid=everywhere, color=torch.full_like(condition.color, 0.6))
-    carried = torch.full_like(condition.color, 0.5)
-    assert torch.allclose(mdm.restore_colour(carried, carried, condition), condition.color)
-    other = carried + 0.2
-    assert torch.equal(mdm.restore_colour(other, carried, condition), other)
-    unseen = replace(condition, valid=~everywhere, warped=~everywhere)
-    assert torch.equal(mdm.restore_colour(carried, carried, unseen), carried)
 
 
 def test_the_shipped_model_loads():

@@ -377,6 +377,8 @@ class Condition:
         reference: f32[3, H, W], the dense recorded image near views[0].
         warped: bool[T, 1, H, W] or None: the colour here was warped from a recorded image near in time.
         backdrop: f32[T, 3, H, W] in [0, 1] or None: a recorded image carried over as if all of it were far away.
+        semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 = unknown.
+        backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
     """
 
     views: tuple[View, ...]
@@ -386,6 +388,8 @@ class Condition:
     reference: Tensor
     warped: Tensor | None = None
     backdrop: Tensor | None = None
+    semantics: Tensor | None = None
+    backdrop_semantics: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
@@ -397,6 +401,10 @@ class Condition:
             _check_tensor(self.warped, "condition.warped", (t, 1, h, w))
         if self.backdrop is not None:
             _check_tensor(self.backdrop, "condition.backdrop", (t, 3, h, w))
+        if self.semantics is not None:
+            _check_tensor(self.semantics, "condition.semantics", (t, 1, h, w))
+        if self.backdrop_semantics is not None:
+            _check_tensor(self.backdrop_semantics, "condition.backdrop_semantics", (t, 1, h, w))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

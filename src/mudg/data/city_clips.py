@@ -28,7 +28,7 @@ from mudg.data.clip_shards import pack_clips, write_shard
 from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
 
 HELD_OUT = 1_000_000
-"""City numbers from here on are for scoring: standard rig, all cameras, shifts of exactly 2, 3 and 4 m."""
+"""City numbers from here on are for scoring: standard rig, all cameras, shifts of exactly 2, 3 and 4 m, whatever the seed."""
 
 FRAMES = 12
 FIRST = 2
@@ -59,7 +59,7 @@ class CityLog:
 
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
     """The city's configuration."""
-    seed = seeds.key(rules.seed, city, "city") & 0x7FFFFFFF
+    seed = seeds.key(0 if city >= HELD_OUT else rules.seed, city, "city") & 0x7FFFFFFF
     if city >= HELD_OUT:
         return CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
@@ -113,18 +113,23 @@ def make_log(rules: CityClipRules, city: int) -> CityLog:
     for index in used:
         sweep = world.lidar_sweep(index)
         error = geometry.yaw_matrix(float(rng.normal(0, jitter_rad)), rng.normal(0, jitter_m, 3))
-        shots = [Shot(world.frame_views(n)[index], truths[n][index].rgb_u8) for n in config.cameras]
+        shots = [
+            Shot(world.frame_views(n)[index], truths[n][index].rgb_u8, truths[n][index].semantics)
+            for n in config.cameras
+        ]
         sweeps.append(SweepShots(sweep.time_s, sweep.world_from_lidar @ error, sweep.points, shots))
     cloud, _ = fuse_sweeps(sweeps, world.tracks(), FusionRules(min_object_points=40))
     recorded = tuple(
-        Recorded(view, truth.rgb_u8) for name in config.cameras for view, truth in zip(world.frame_views(name), truths[name])
+        Recorded(view, truth.rgb_u8, truth.semantics)
+        for name in config.cameras
+        for view, truth in zip(world.frame_views(name), truths[name])
     )
     return CityLog(world, cloud, recorded)
 
 
-def make_clips(rules: CityClipRules, city: int) -> tuple[list[Clip], tuple[float, ...]]:
-    """All clips of one city and their shifts in metres."""
-    log = make_log(rules, city)
+def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> tuple[list[Clip], tuple[float, ...]]:
+    """All clips of one city and their shifts in metres; `log` is the city's own from `make_log`, made here if not given."""
+    log = log or make_log(rules, city)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
     size = (rules.width, rules.height)
     recorded_views = log.world.frame_views("front")[FIRST : FIRST + rules.window]
@@ -179,6 +184,12 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     """Make one city's clips and write its shard; returns the number of clips. Runs in a process of its own."""
     torch.set_num_threads(1)
     native.set_threads(1)
-    clips, shifts = make_clips(rules, city)
-    write_shard(folder, city, pack_clips(clips, shifts))
+    log = make_log(rules, city)
+    clips, shifts = make_clips(rules, city, log)
+    points = None
+    if city >= HELD_OUT:
+        plain = ConditionRules(rules.width, rules.height, warp=False)
+        tracks = log.world.tracks()
+        points = [build_condition(log.cloud, tracks, c.condition.views, (), plain).color for c in clips]
+    write_shard(folder, city, pack_clips(clips, shifts, points))
     return len(clips)

@@ -5,13 +5,18 @@ A shard is a safetensors file with, for K clips of T frames,
     rgb u8[K,T,3,H,W]  depth f16[K,T,H,W] metres (codes beyond 1000 m and sky as 1000)  semantics u8[K,T,H,W]
     color u8[K,T,3,H,W]  sparse_depth f16[K,T,H,W]  flags u8[K,T,H,W] (1 = a point was seen, 2 = colour warped)
     backdrop u8[K,T,3,H,W]  reference u8[K,3,H,W]  shift_m f32[K]
+    ids, backdrop_ids u8[K,T,H,W]: classes that came with color and backdrop, 255 = unknown
+    world_from_cam f64[K,T,4,4]  intrinsics f64[K,T,4] (fx, fy, cx, cy)
+    point_color u8[K,T,3,H,W], cities for scoring only: colour of the nearest point, no image warped in
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +37,8 @@ class Batch:
     """Clips stacked for training.
 
     rgb, color, backdrop f32[B,T,3,H,W] in [0,1]; depth, sparse_depth f32[B,T,1,H,W] metres; valid, warped bool[B,T,1,H,W];
-    semantics i64[B,T,H,W]; reference f32[B,3,H,W]; shift_m: lateral shift of each clip.
+    semantics i64[B,T,H,W]; reference f32[B,3,H,W]; ids, backdrop_ids u8[B,T,1,H,W] (255 = unknown); world_from_cam
+    f64[B,T,4,4]; intrinsics f64[B,T,4]; shift_m: lateral shift of each clip; point_color f32[B,T,3,H,W] or None.
     """
 
     rgb: Tensor
@@ -44,7 +50,12 @@ class Batch:
     warped: Tensor
     backdrop: Tensor
     reference: Tensor
+    ids: Tensor
+    backdrop_ids: Tensor
+    world_from_cam: Tensor
+    intrinsics: Tensor
     shift_m: tuple[float, ...]
+    point_color: Tensor | None = None
 
 
 def shard_path(folder: Path, city: int) -> Path:
@@ -52,8 +63,10 @@ def shard_path(folder: Path, city: int) -> Path:
     return folder / f"city_{city:07d}.safetensors"
 
 
-def pack_clips(clips: Sequence[Clip], shifts_m: Sequence[float]) -> dict[str, NDArray[np.generic]]:
-    """Arrays of a shard from clips of one size."""
+def pack_clips(
+    clips: Sequence[Clip], shifts_m: Sequence[float], point_color: Sequence[Tensor] | None = None
+) -> dict[str, NDArray[np.generic]]:
+    """Arrays of a shard from clips of one size; `point_color` f32[T,3,H,W] per clip is kept if given."""
 
     def u8(image: Tensor) -> NDArray[np.uint8]:
         return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -68,7 +81,17 @@ def pack_clips(clips: Sequence[Clip], shifts_m: Sequence[float]) -> dict[str, ND
         warped = torch.zeros_like(c.valid) if c.warped is None else c.warped
         return (c.valid * FLAG_VALID + warped * FLAG_WARPED)[:, 0].to(torch.uint8).numpy()
 
-    return {
+    def ids(clip: Clip, far: bool) -> NDArray[np.uint8]:
+        c = clip.condition
+        known = c.backdrop_semantics if far else c.semantics
+        return (torch.full_like(c.valid, 255, dtype=torch.uint8) if known is None else known)[:, 0].numpy()
+
+    def lens(clip: Clip) -> NDArray[np.float64]:
+        cameras = [view.camera for view in clip.condition.views]
+        return np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], np.float64)
+
+    extra = {} if point_color is None else {"point_color": np.stack([u8(c) for c in point_color])}
+    return extra | {
         "rgb": np.stack([u8(c.rgb) for c in clips]),
         "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
         "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
@@ -77,6 +100,10 @@ def pack_clips(clips: Sequence[Clip], shifts_m: Sequence[float]) -> dict[str, ND
         "flags": np.stack([flags(c) for c in clips]),
         "backdrop": np.stack([u8(_backdrop(c)) for c in clips]),
         "reference": np.stack([u8(c.condition.reference) for c in clips]),
+        "ids": np.stack([ids(c, False) for c in clips]),
+        "backdrop_ids": np.stack([ids(c, True) for c in clips]),
+        "world_from_cam": np.stack([np.stack([v.world_from_cam for v in c.condition.views]) for c in clips]),
+        "intrinsics": np.stack([lens(c) for c in clips]),
         "shift_m": np.asarray(shifts_m, np.float32),
     }
 
@@ -105,14 +132,20 @@ def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
                          remedy="delete it; it is made again") from error  # fmt: skip
 
 
+_PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "backdrop", "ids", "backdrop_ids", "world_from_cam",
+              "intrinsics")  # fmt: skip
+
+
 def read_batch(folder: Path, picks: Sequence[tuple[int, int, Sequence[int]]]) -> Batch:
     """Read clips as a batch; `picks` holds (city, clip, frame indices), all with the same number of frames."""
     columns: dict[str, list[NDArray[np.generic]]] = {}
     shifts = []
     for city, clip, frames in picks:
         with _open(shard_path(folder, city)) as shard:
-            for name in ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "backdrop"):
+            for name in _PER_FRAME:
                 columns.setdefault(name, []).append(shard.get_slice(name)[clip][np.asarray(frames)])
+            if "point_color" in shard.keys():
+                columns.setdefault("point_color", []).append(shard.get_slice("point_color")[clip][np.asarray(frames)])
             columns.setdefault("reference", []).append(shard.get_slice("reference")[clip])
             shifts.append(float(shard.get_tensor("shift_m")[clip]))
     stacked = {name: torch.from_numpy(np.stack(parts)) for name, parts in columns.items()}
@@ -127,22 +160,29 @@ def read_batch(folder: Path, picks: Sequence[tuple[int, int, Sequence[int]]]) ->
         warped=(flags & FLAG_WARPED) > 0,
         backdrop=stacked["backdrop"].float() / 255,
         reference=stacked["reference"].float() / 255,
+        ids=stacked["ids"].unsqueeze(2),
+        backdrop_ids=stacked["backdrop_ids"].unsqueeze(2),
+        world_from_cam=stacked["world_from_cam"],
+        intrinsics=stacked["intrinsics"],
         shift_m=tuple(shifts),
+        point_color=stacked["point_color"].float() / 255 if len(columns.get("point_color", ())) == len(picks) else None,
     )
 
 
 def vary(batch: Batch, rng: np.random.Generator) -> Batch:
-    """Random mirror image, and one random colour curve per clip for truth and condition alike.
+    """Random mirror image, one random colour curve per clip for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
-    +-8 %; the condition gets a further exposure error of +-3 %.
+    +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `_worse_ids`. A mirrored clip keeps its
+    poses and intrinsics: they then describe the mirror image of the place.
     """
-    rgb, color, reference = batch.rgb, batch.color, batch.reference
-    new_rgb, new_color, new_backdrop, new_reference = [], [], [], []
-    for index in range(len(rgb)):
+    columns: dict[str, list[Tensor]] = {
+        name: [] for name in ("rgb", "color", "backdrop", "reference", "ids", "backdrop_ids")
+    }
+    for index in range(len(batch.rgb)):
         gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
         gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
-        middle = float(rgb[index].mean())
+        middle = float(batch.rgb[index].mean())
         error = rng.uniform(0.97, 1.03)
 
         def curve(x: Tensor, extra: float, gain=gain, gamma=gamma, contrast=contrast, saturation=saturation,
@@ -153,21 +193,42 @@ def vary(batch: Batch, rng: np.random.Generator) -> Batch:
             x = grey + saturation * (x - grey)
             return (middle + contrast * (x - middle)).clamp(0, 1)
 
-        new_rgb.append(curve(rgb[index], 1.0))
-        new_color.append(curve(color[index], error))
-        new_backdrop.append(curve(batch.backdrop[index], error))
-        new_reference.append(curve(reference[index], error))
-    flip = rng.random() < 0.5
-    turn = (lambda x: x.flip(-1)) if flip else (lambda x: x)
-    return Batch(
-        turn(torch.stack(new_rgb)),
-        turn(batch.depth),
-        turn(batch.semantics),
-        turn(torch.stack(new_color)),
-        turn(batch.sparse_depth),
-        turn(batch.valid),
-        turn(batch.warped),
-        turn(torch.stack(new_backdrop)),
-        turn(torch.stack(new_reference)),
-        tuple(-s if flip else s for s in batch.shift_m),
-    )
+        columns["rgb"].append(curve(batch.rgb[index], 1.0))
+        for name in ("color", "backdrop", "reference"):
+            columns[name].append(curve(getattr(batch, name)[index], error))
+        ids, far_ids = _worse_ids(batch.ids[index], batch.backdrop_ids[index], rng)
+        columns["ids"].append(ids)
+        columns["backdrop_ids"].append(far_ids)
+    turned = {name: torch.stack(parts) for name, parts in columns.items()}
+    for name in ("depth", "semantics", "sparse_depth", "valid", "warped"):
+        turned[name] = getattr(batch, name)
+    if rng.random() >= 0.5:
+        return dataclasses.replace(batch, **turned)  # type: ignore[arg-type]
+    mirrored: dict[str, Any] = {name: x.flip(-1) for name, x in turned.items()}
+    return dataclasses.replace(batch, **mirrored, shift_m=tuple(-s for s in batch.shift_m))
+
+
+NO_IDS, WORSE_IDS = 0.35, 0.25
+"""Shares of the training clips that get no classes, and classes with mistakes."""
+
+
+def _worse_ids(ids: Tensor, far_ids: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Given classes u8[T,1,H,W] as a labeller might have made them: exact, none at all, or with mistakes.
+
+    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout, and blocks of 8x8 pixels are unknown.
+    """
+    draw = rng.random()
+    if draw < NO_IDS:
+        return torch.full_like(ids, 255), torch.full_like(far_ids, 255)
+    if draw >= NO_IDS + WORSE_IDS:
+        return ids, far_ids
+    table = np.arange(256)
+    for number in range(19):
+        chance = rng.random()
+        table[number] = 255 if chance < 0.15 else int(rng.integers(19)) if chance < 0.23 else number
+    height, width = ids.shape[-2:]
+    holes = torch.from_numpy(rng.random((1, 1, -(-height // 8), -(-width // 8))) < rng.uniform(0, 0.25))
+    holes = holes.repeat_interleave(8, -2).repeat_interleave(8, -1)[..., :height, :width]
+    lookup = torch.from_numpy(table.astype(np.uint8))
+    worse = lambda x: torch.where(holes, torch.full_like(x, 255), lookup[x.long()])  # noqa: E731
+    return worse(ids), worse(far_ids)

@@ -7,9 +7,10 @@
 3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
    falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
-5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR.
+5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
+6. the classes of labelled points and images travel with their colours.
 
-Steps 2 to 5 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
+Steps 2 to 6 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
 only, zero where nothing is known, the reference image in frame 0 being put in by the model.
 
 The generated cities as training data are in `city_clips`.
@@ -28,9 +29,10 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
+from mudg.base import palette
 from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Track, View
-from mudg.core.project import ProjectConfig, project_cloud
+from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,20 +66,23 @@ class ConditionRules:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """A recorded image: `rgb` u8[H,W,3] of `view`, any size."""
+    """A recorded image: `rgb` u8[H,W,3] of `view`, any size; `semantics` u8[H,W] train ids (255 = unknown) or None."""
 
     view: View
     rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sparse:
-    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects)."""
+    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects),
+    semantics u8[H,W] (255 = unknown)."""
 
     rgb: Tensor
     depth: Tensor
     valid: Tensor
     moving: Tensor
+    semantics: Tensor
 
 
 def remove_shine_through(depth: NDArray[np.float32], valid: NDArray[np.bool_], reach_px: int = 3) -> NDArray[np.bool_]:
@@ -144,31 +149,41 @@ def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> Tens
     return found[0].unflatten(1, grid.shape[:2]).movedim(0, 1)
 
 
+def look_up_ids(ids: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Ids of `ids` u8[h,w] in the pixels at coordinates f32[K,H,W] -> u8[K,H,W]; the border is repeated outside."""
+    column = x.floor().clamp(0, ids.shape[1] - 1).long()
+    return ids[y.floor().clamp(0, ids.shape[0] - 1).long(), column]
+
+
 def inside(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     """Which of the carried pixels lie in front of and inside the other view, bool of their shape."""
     return (z > 0.1) & (x >= 0.5) & (x <= view.camera.width - 0.5) & (y >= 0.5) & (y <= view.camera.height - 0.5)
 
 
-def warp(view: View, depth: Tensor, source: Source, surface: Tensor, hidden_share: float) -> tuple[Tensor, Tensor]:
-    """Colours that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
+def warp(
+    view: View, depth: Tensor, source: Source, surface: Tensor, hidden_share: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours and classes that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
 
     `surface` f32[h,w]: depth of the nearest surface at the pixels of the recorded image.
-    Returns rgb f32[3,H,W] (bilinear) and found bool[H,W]: inside the image and not hidden in it.
+    Returns rgb f32[3,H,W] (bilinear), semantics u8[H,W] (nearest) and found bool[H,W]: inside the image and not hidden in it.
     """
     x, y, z = carry(view, depth[None], source.view)
     in_front = look_up(surface[None], x, y, "nearest")[0, 0]
     found = inside(source.view, x, y, z)[0] & (in_front >= z[0] * (1 - hidden_share) - 0.3)
-    return look_up(source.rgb, x, y)[0], found
+    return look_up(source.rgb, x, y)[0], look_up_ids(source.semantics, x, y)[0], found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """A recorded image made ready for warping: rgb f32[3,h,w] in [0,1], depth f32[h,w] m (filled), moving bool[h,w]."""
+    """A recorded image made ready for warping: rgb f32[3,h,w] in [0,1], depth f32[h,w] m (filled), moving bool[h,w],
+    semantics u8[h,w] (255 = unknown)."""
 
     view: View
     rgb: Tensor
     depth: Tensor
     moving: Tensor
+    semantics: Tensor
 
 
 def build_condition(
@@ -212,9 +227,9 @@ def build_conditions(
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
     looks = [_look(cloud, tracks, view, recorded, rules, sources) for view in fine_views]
-    color, depth, valid, warped, backdrop = (torch.stack(column) for column in zip(*looks))
+    color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*looks))
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
-                     warped, backdrop)  # fmt: skip
+                     warped, backdrop, ids, far_ids)  # fmt: skip
     if size == (rules.width, rules.height):
         return fine, fine
 
@@ -224,9 +239,10 @@ def build_conditions(
     own = [project_sparse(cloud, tracks, view, rules) for view in small]
     own_depth = torch.stack([_filled(sparse, rules)[1] for sparse in own])[:, None]
     own_valid = torch.stack([sparse.valid for sparse in own])[:, None]
-    condition = Condition(
-        tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5, reduced(backdrop)
-    )
+    small_size = (rules.height, rules.width)
+    own_ids, own_far_ids = (functional.interpolate(x, size=small_size, mode="nearest-exact") for x in (ids, far_ids))
+    condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
+                          reduced(backdrop), own_ids, own_far_ids)  # fmt: skip
     return condition, fine
 
 
@@ -237,8 +253,9 @@ def _look(
     recorded: Sequence[Recorded],
     rules: ConditionRules,
     sources: dict[int, Source],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W] and backdrop f32[3,H,W] of one view, at its size."""
+) -> tuple[Tensor, ...]:
+    """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
+    the backdrop u8[1,H,W] of one view, at its size."""
 
     def source(number: int) -> Source:
         if number not in sources:
@@ -246,31 +263,34 @@ def _look(
         return sources[number]
 
     sparse = project_sparse(cloud, tracks, view, rules)
-    colour, depth, moving = _filled(sparse, rules)
+    colour, depth, moving, ids = _filled(sparse, rules)
     found = torch.zeros_like(sparse.valid)
     if not (rules.warp and recorded):
-        return colour, depth[None], sparse.valid[None], found[None], colour
+        return colour, depth[None], sparse.valid[None], found[None], colour, ids[None], ids[None]
     order = _order_of_images(view, recorded, rules)
     nearest = source(order[0])
     x, y, _ = carry(view, torch.full((1, *depth.shape), rules.backdrop_m), nearest.view)
-    backdrop = look_up(nearest.rgb, x, y)[0]
+    backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
     for number in order:
         image = source(number)
         fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
-        rgb, new = warp(view, depth, image, surface, rules.hidden_share)
+        rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
         new = new & ~found if fresh else new & ~found & ~moving
         colour = torch.where(new, rgb, colour)
+        ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
         found = found | new
-    return colour, depth[None], sparse.valid[None], found[None], backdrop
+    return colour, depth[None], sparse.valid[None], found[None], backdrop, ids[None], far_ids
 
 
-def _filled(sparse: Sparse, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour f32[3,H,W], depth f32[H,W] and moving bool[H,W] of the nearest valid pixel, for every pixel."""
+def _filled(sparse: Sparse, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest valid pixel, for every pixel."""
     if not bool(sparse.valid.any()):
-        return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving
+        return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
     rows, columns = (torch.from_numpy(i.astype(np.int64)) for i in nearest_valid(sparse.valid.numpy()))
-    return sparse.rgb[:, rows, columns], sparse.depth[rows, columns], sparse.moving[rows, columns]
+    found = (x[..., rows, columns] for x in (sparse.rgb, sparse.depth, sparse.moving, sparse.semantics))
+    rgb, depth, moving, ids = found
+    return rgb, depth, moving, ids
 
 
 def _published_condition(
@@ -300,7 +320,11 @@ def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionR
     def rank(number: int) -> tuple[float, bool, float]:
         other = recorded[number].view
         gap = round(abs(other.time_s - view.time_s) / 0.02)
-        return (gap, other.camera.name != view.camera.name, float(np.linalg.norm(other.center_world - view.center_world)))
+        return (
+            gap,
+            other.camera.name != view.camera.name,
+            float(np.linalg.norm(other.center_world - view.center_world)),
+        )
 
     return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
 
@@ -313,8 +337,18 @@ def _prepare_source(
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
-    _, depth, moving = _filled(project_sparse(cloud, tracks, view, rules), rules)
-    return Source(view, _tensor(resize_image(recorded.rgb, width, height)), depth, moving)
+    _, depth, moving, _ = _filled(project_sparse(cloud, tracks, view, rules), rules)
+    return Source(
+        view, _tensor(resize_image(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
+    )
+
+
+def _ids_at(recorded: Recorded, width: int, height: int) -> Tensor:
+    """The image's classes u8[height,width], each from the pixel in its middle; 255 without labels."""
+    if recorded.semantics is None:
+        return torch.full((height, width), palette.UNLABELLED, dtype=torch.uint8)
+    own = torch.from_numpy(recorded.semantics.astype(np.uint8))
+    return functional.interpolate(own[None, None], size=(height, width), mode="nearest-exact")[0, 0]
 
 
 def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules: ConditionRules) -> Sparse:
@@ -327,8 +361,13 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
         far_m=rules.far_m,
         occluder_m=0.0 if rules.published else rules.occluder_m,
     )
-    seen = project_cloud(cloud, {name: pose for name, pose in poses.items() if pose is not None}, view, config)
+    placed = {name: pose for name, pose in poses.items() if pose is not None}
+    seen = project_cloud(cloud, placed, view, config)
     valid = seen.valid[0]
     if not rules.published:
         valid = torch.from_numpy(remove_shine_through(seen.depth[0].numpy(), valid.numpy()))
-    return Sparse(seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid)
+    clouds = [cloud.static, *(points for _, points in drawn_objects(cloud, placed))]
+    unknown = np.uint8(palette.UNLABELLED)
+    ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
+    table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
+    return Sparse(seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()])

@@ -30,7 +30,18 @@ from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Condition
 from mudg.core import noise
 from mudg.core.noise import Schedule, ScheduleConfig
-from mudg.models.vae import CLASSES, MODALITIES, ChannelNorm, CodecConfig, Modality, build_codec, semantic_shares
+from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares, temporal_shift
+from mudg.models.vae import (
+    CLASSES,
+    MODALITIES,
+    ChannelNorm,
+    CodecConfig,
+    Decoded,
+    Modality,
+    build_codec,
+    code_to_depth,
+    semantic_shares,
+)  # fmt: skip
 
 SKY = palette.ID["sky"]
 LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
@@ -66,6 +77,11 @@ class MDMConfig:
     temporal_attention: tuple[bool, ...] = (False, False, True)
     head_width: int = 32
     embed_width: int = 192
+    given_classes: bool = True
+    """The condition's classes (255 = unknown) are read, and can be copied. Without: 20 input planes fewer."""
+    refine_widths: tuple[int, ...] = (64, 128)
+    """Channels of the refiner (see `models.refine`) at the latent resolution and at half of it; empty = no refiner."""
+    refine_blocks: tuple[int, ...] = (2, 3)
     window: int = 8
     """Frames per clip the model was made for; other numbers work, only this one is tested."""
     shared_noise: float = 0.3
@@ -88,6 +104,14 @@ class MDMConfig:
             )
         if self.backdrop and not self.copy_condition:
             raise UsageError("a backdrop is only used together with copy_condition")
+        if self.given_classes and not (self.joint and self.copy_condition and self.codec.semantics_code == "shares"):
+            raise UsageError("given classes are only read by a joint model with class shares that copies its condition")
+        if (len(self.refine_widths), len(self.refine_blocks)) not in ((0, 0), (2, 2)):
+            raise UsageError(
+                "refine_widths and refine_blocks have two entries each, or none", got=str(self.refine_widths)
+            )
+        if self.refine_widths and not (self.joint and self.head == "x0" and self.codec.semantics_code == "shares"):
+            raise UsageError("a refiner needs a joint model with an x0 head and class shares")
         if self.head == "v" and (self.copy_condition or self.codec.semantics_code != "palette"):
             raise UsageError("a v head can neither copy the condition nor give class scores", expected="head = x0")
 
@@ -135,21 +159,6 @@ def sinusoid(t: Tensor, width: int) -> Tensor:
     frequencies = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device) / half)
     angles = t.float()[:, None] * frequencies
     return torch.cat([angles.cos(), angles.sin()], 1)
-
-
-def temporal_shift(x: Tensor, frames: int, share: int = 8) -> Tensor:
-    """Move 1/share of the channels one frame later and as many one frame earlier; ends keep their own.
-
-    `x` [B*T,C,h,w]. The following convolution then mixes neighbouring frames at no cost (Lin et al., "TSM").
-    """
-    n, c, h, w = x.shape
-    if frames == 1:
-        return x
-    k = c // share
-    y = x.permute(0, 2, 3, 1).unflatten(0, (n // frames, frames))
-    late = torch.cat([y[:, :1, ..., :k], y[:, :-1, ..., :k]], 1)
-    early = torch.cat([y[:, 1:, ..., k : 2 * k], y[:, -1:, ..., k : 2 * k]], 1)
-    return torch.cat([late, early, y[..., 2 * k :]], -1).flatten(0, 1).permute(0, 3, 1, 2)
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
@@ -331,14 +340,16 @@ class UNet(nn.Module):
 class Encoded:
     """A batch of conditions as the network wants them.
 
-    planes f32[B,T,8+backdrop+masks,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth; backdrop: the
-    same of the backdrop or None; seen: share of the cell that is trustworthy, [B,T,1,h,w] in [0,1], per modality.
+    planes f32[B,T,8+backdrop+masks+classes,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class
+    shares [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour, or None; seen: share of the cell that is
+    trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..].
     """
 
     planes: Tensor
     copy: dict[Modality, Tensor]
     backdrop: Tensor | None
     seen: dict[Modality, Tensor]
+    pixels: ConditionPixels
 
 
 @dataclass(frozen=True)
@@ -364,6 +375,9 @@ class Losses:
     terms: dict[str, float]
 
 
+TRUSTED_ERROR = 0.08
+"""Expected error of the colour (of 1) at which the confidence is 1/e; models with a refiner."""
+
 COPY_BIAS = 4.0
 """Start value of the copy gates' logits where the cell is seen (minus this for the backdrop); 0 where it is not."""
 
@@ -379,12 +393,20 @@ class MDM(nn.Module):
         self.config = config
         self.codec = build_codec(config.codec)
         self.schedule = Schedule(config.schedule)
-        self.passes: tuple[tuple[Modality, ...], ...] = (MODALITIES,) if config.joint else tuple((m,) for m in MODALITIES)
+        self.passes: tuple[tuple[Modality, ...], ...] = (
+            (MODALITIES,) if config.joint else tuple((m,) for m in MODALITIES)
+        )
         masks = {"none": 0, "valid": 1, "valid_image": 2}[config.mask_planes] * self.codec.factor**2
         noisy = sum(self.codec.channels[m] for m in self.passes[0])
-        self.gates = (2 if config.copy_condition else 0) + (1 if config.backdrop else 0)
-        planes = noisy + 8 + (4 if config.backdrop else 0) + masks
+        self.gates = (
+            (2 if config.copy_condition else 0) + (1 if config.backdrop else 0) + (1 if config.given_classes else 0)
+        )
+        planes = noisy + 8 + (4 if config.backdrop else 0) + masks + (CLASSES + 1 if config.given_classes else 0)
         self.net = UNet(config, planes, noisy + self.gates).to(memory_format=torch.channels_last)
+        self.refiner: Refiner | None = None
+        if config.refine_widths:
+            (fine, coarse), (outer, inner) = config.refine_widths, config.refine_blocks
+            self.refiner = Refiner(noisy, (fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
 
     # inputs -----------------------------------------------------------------------------------------------------------
 
@@ -404,15 +426,20 @@ class MDM(nn.Module):
         stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
         warped = torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch])
         backdrop = torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch])
-        return self.encode_planes(stack("color"), stack("depth"), stack("valid"), warped, backdrop, stack("reference"))
+        unknown = torch.full(batch[0].valid.shape, 255, dtype=torch.uint8)
+        ids = torch.stack([unknown if c.semantics is None else c.semantics for c in batch])
+        far_ids = torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch])
+        color, depth, valid, reference = (stack(name) for name in ("color", "depth", "valid", "reference"))
+        return self.encode_planes(color, depth, valid, warped, backdrop, reference, ids, far_ids)
 
     def encode_planes(
-        self, color: Tensor, depth: Tensor, valid: Tensor, warped: Tensor, backdrop: Tensor, reference: Tensor
-    ) -> Encoded:
+        self, color: Tensor, depth: Tensor, valid: Tensor, warped: Tensor, backdrop: Tensor, reference: Tensor, ids: Tensor,
+        backdrop_ids: Tensor,
+    ) -> Encoded:  # fmt: skip
         """As `encode_condition`, from stacked tensors.
 
         color, backdrop f32[B,T,3,H,W]; depth f32[B,T,1,H,W] metres; valid, warped bool[B,T,1,H,W]; reference f32[B,3,H,W], used
-        only with `reference = "first_frame"`.
+        only with `reference = "first_frame"`; ids, backdrop_ids u8[B,T,1,H,W], 255 = unknown.
         """
         self.check_size(*color.shape[-2:])
         valid, warped = valid.float(), warped.float()
@@ -423,10 +450,21 @@ class MDM(nn.Module):
         factor = self.codec.factor
         masks = {"none": [], "valid": [valid], "valid_image": [valid, warped]}[self.config.mask_planes]
         far = self.codec.encode_rgb(backdrop) if self.config.backdrop else None
-        planes = [copy["rgb"], copy["depth"], *([] if far is None else [far]), *(functional.pixel_unshuffle(m, factor) for m in masks)]
+        planes = [
+            copy["rgb"],
+            copy["depth"],
+            *([] if far is None else [far]),
+            *(functional.pixel_unshuffle(m, factor) for m in masks),
+        ]
         pool = lambda m: functional.avg_pool2d(m.flatten(0, 1), factor).unflatten(0, m.shape[:2])  # noqa: E731
         seen: dict[Modality, Tensor] = {"rgb": pool(torch.maximum(valid, warped)), "depth": pool(valid)}
-        return Encoded(torch.cat(planes, 2), copy, far, seen)
+        if self.config.given_classes:
+            copy["semantics"] = shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2])
+            seen["semantics"] = copy["semantics"].sum(2, keepdim=True)
+            planes += [copy["semantics"], seen["semantics"]]
+        depth_code = self.codec.linear_depth_code(depth)
+        pixels = (color * 2 - 1, backdrop * 2 - 1, depth_code, valid, warped, ids, backdrop_ids)
+        return Encoded(torch.cat(planes, 2), copy, far, seen, ConditionPixels(*(x.flatten(0, 1) for x in pixels)))
 
     # network ----------------------------------------------------------------------------------------------------------
 
@@ -452,8 +490,10 @@ class MDM(nn.Module):
                     gate = (gates[:, :, channel : channel + 1] + COPY_BIAS * encoded.seen[m]).sigmoid()
                     stated[m] = stated[m] + gate * encoded.copy[m]
             if encoded.backdrop is not None and "rgb" in stated:
-                gate = (gates[:, :, 2:] - COPY_BIAS * encoded.seen["rgb"]).sigmoid()
+                gate = (gates[:, :, 2:3] - COPY_BIAS * encoded.seen["rgb"]).sigmoid()
                 stated["rgb"] = stated["rgb"] + gate * encoded.backdrop
+            if "semantics" in encoded.copy and "semantics" in stated:
+                stated["semantics"] = stated["semantics"] + 4.0 * gates[:, :, -1:].sigmoid() * encoded.copy["semantics"]
         log_shares = None
         if "semantics" in stated and self.config.codec.semantics_code == "shares":
             log_shares = stated["semantics"].log_softmax(2)
@@ -479,6 +519,8 @@ class MDM(nn.Module):
         shares: Tensor | None = None,
         class_weights: Tensor | None = None,
         depth_known: Tensor | None = None,
+        pixels: PixelTruth | None = None,
+        window: tuple[slice, slice] | None = None,
     ) -> Losses:
         """Denoising loss of a batch, steps and noise drawn from `generator`.
 
@@ -486,6 +528,8 @@ class MDM(nn.Module):
         shares       class shares [B,T,19,h,w]; needed when semantics are coded as shares
         class_weights  f32[19], weights of the classes in the cross-entropy; None = all 1
         depth_known  f32[B,T,1,h,w] share of the cell with true depth; None = everywhere
+        pixels, window  truth at pixel resolution, and the rectangle of latent cells to train the refiner on (None = all);
+                     its terms are added, and their gradient reaches the denoiser
 
         x0 head: squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a
         clip; cross-entropy for class shares. v head: squared error of v. Steps are stratified over the batch.
@@ -515,9 +559,36 @@ class MDM(nn.Module):
                     part = (weight * (stated[m] - truth[m]).square()).mean()
                 terms[m] = float(part.detach())
                 total = total + LOSS_SHARES[m] * part
+            if self.refiner is not None and pixels is not None:
+                parts = self._refiner_terms(stated, encoded, pixels, window, class_weights)
+                terms |= {name: float(part.detach()) for name, part in parts.items()}
+                total = total + sum(parts.values())
         if not isinstance(total, Tensor):
             raise UsageError("nothing to train on", where="MDM.loss")
         return Losses(total, terms)
+
+    def _refiner_terms(
+        self, stated: dict[Modality, Tensor], encoded: Encoded, truth: PixelTruth, window: tuple[slice, slice] | None,
+        class_weights: Tensor | None,
+    ) -> dict[str, Tensor]:  # fmt: skip
+        frames = encoded.planes.shape[1]
+        rows, columns = window or (slice(0, encoded.planes.shape[-2]), slice(0, encoded.planes.shape[-1]))
+        latents: dict[Modality, Tensor] = {m: z[..., rows, columns].flatten(0, 1) for m, z in stated.items()}
+        factor = self.codec.factor
+        tall, wide = (slice(s.start * factor, s.stop * factor) for s in (rows, columns))
+        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
+        return refine_loss(made, truth.crop(tall, wide), class_weights)
+
+    def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.refine`)."""
+        if self.refiner is None:
+            raise UsageError("this model has no refiner", where="MDM.refine")
+        return self.refiner(self.codec, latents, given, frames)
+
+    def pixel_truth(self, rgb: Tensor, depth: Tensor, semantics: Tensor) -> PixelTruth:
+        """Truth for `loss`: rgb f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres, semantics i64[B,T,H,W]."""
+        code = self.codec.linear_depth_code(depth)
+        return PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), semantics.flatten(0, 1))
 
     def _drawn_passes(self, generator: torch.Generator) -> Sequence[tuple[Modality, ...]]:
         """Joint: the one pass. Separate: one modality per batch, colour half of the time, as published."""
@@ -573,22 +644,31 @@ class MDM(nn.Module):
                 latents |= part
                 change = torch.maximum(change, moved)
             drawn.append(latents)
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            decoded = self.codec.decode({m: z[0] for m, z in drawn[0].items() if m in modalities})
         if n_samples > 1:
             stacked = torch.stack([d.get("rgb", next(iter(d.values()))) for d in drawn])
             change = stacked.std(0).mean(2, keepdim=True) * 2
-        rgb = decoded.rgb
-        if rgb is not None and self.config.copy_condition:
-            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-                carried = self.codec.decode({"rgb": encoded.copy["rgb"][0]}).rgb
-            if carried is not None:
-                rgb = restore_colour(rgb, carried, condition)
+        latents = {m: z[0] for m, z in drawn[0].items()}
         confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
-        depth = decoded.depth
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            if self.refiner is None:
+                decoded = self.codec.decode({m: z for m, z in latents.items() if m in modalities})
+            else:
+                decoded, error = self._decode_refined(latents, encoded.pixels)
+                confidence = torch.exp(-error / TRUSTED_ERROR)
+        depth, ids = decoded.depth, decoded.semantics
         if depth is not None:
-            depth = settle_depth(depth, condition, decoded.semantics, self.config.codec.far_m)
-        return Sample(rgb, depth, decoded.semantics, confidence, {m: z[0] for m, z in drawn[0].items()})
+            depth = settle_depth(depth, condition, ids, self.config.codec.far_m)
+        wanted = lambda m, x: x if m in modalities else None  # noqa: E731
+        return Sample(wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents)
+
+    def _decode_refined(self, latents: dict[Modality, Tensor], given: ConditionPixels) -> tuple[Decoded, Tensor]:
+        """Pixels of one clip through the refiner, and the expected error of the colour f32[T,1,H,W] in [0,1]."""
+        made = self.refine(latents, given, next(iter(latents.values())).shape[0])
+        best = made.scores.softmax(1).topk(2, dim=1)
+        margin = best.values[:, :1] - best.values[:, 1:]
+        depth = code_to_depth(made.depth_code, self.config.codec)
+        rgb = ((made.rgb + 1) / 2).clamp(0, 1)
+        return Decoded(rgb, depth, best.indices[:, 0], margin), made.log_error.clamp(-6, 1).exp() / 2
 
     def _denoise(
         self,
@@ -644,20 +724,6 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     coverage = 0.35 + 0.65 * torch.maximum(seen, near)
     value = coverage * torch.exp(-2.0 * change)
     return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
-
-
-def restore_colour(rgb: Tensor, carried: Tensor, condition: Condition) -> Tensor:
-    """Give back the colour that the latent code cannot carry, f32[T,3,H,W] in [0,1].
-
-    rgb      generated; carried: the condition's colour after coding and decoding, both f32[T,3,H,W]
-    Where the condition is seen and the generated colour agrees with `carried`, the difference between the condition and
-    `carried` (one axis of hue, fine texture) is added; the weight falls to nothing at a disagreement of 0.15.
-    """
-    seen = condition.valid if condition.warped is None else condition.valid | condition.warped
-    apart = (rgb - carried).abs().amax(1, keepdim=True)
-    apart = functional.avg_pool2d(apart, 3, stride=1, padding=1, count_include_pad=False)
-    weight = (1 - apart / 0.15).clamp(0, 1) * seen
-    return (rgb + weight * (condition.color - carried)).clamp(0, 1)
 
 
 def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, far_m: float) -> Tensor:
@@ -727,7 +793,9 @@ def load(path: Path | str = "embedded") -> MDM:
     for name, digest in content["files"].items():
         file = folder / Path(name).name
         if not file.is_file() or store.sha256_file(file) != digest:
-            raise IntegrityError("a weight file is missing or altered", where=str(file), expected=f"sha256 {digest[:16]}...")
+            raise IntegrityError(
+                "a weight file is missing or altered", where=str(file), expected=f"sha256 {digest[:16]}..."
+            )
         state |= {k: torch.from_numpy(v.copy()) for k, v in store.read_safetensors(file).items()}
     wanted = model.state_dict()
     wrong = sorted(set(wanted) ^ set(state)) or [k for k in wanted if wanted[k].shape != state[k].shape]
@@ -735,6 +803,33 @@ def load(path: Path | str = "embedded") -> MDM:
         raise InputError("weights do not fit the configuration", where=str(folder), got=", ".join(wrong[:6]))
     model.load_state_dict({k: v.to(wanted[k].dtype) for k, v in state.items()})
     return model.eval()
+
+
+def grown(before: MDM, config: MDMConfig) -> MDM:
+    """A model of `config` with the weights of `before`, whose inputs and outputs are the first of its own.
+
+    Weights of further inputs and outputs are 0, so that the denoiser starts as the same function; a refiner is taken over
+    if `before` has one of the same shape. For continuing the training of an earlier, plainer model.
+
+    Raises:
+        UsageError: the two differ in more than `given_classes` and the refiner.
+    """
+    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
+    if dataclasses.replace(before.config, **plain) != dataclasses.replace(config, **plain):
+        raise UsageError(
+            "the model to continue from is of another kind", expected=str(config), got=str(before.config),
+            remedy="give its widths, blocks, attention, patch and window",
+        )  # fmt: skip
+    model = MDM(config)
+    state = model.state_dict()
+    for name, old in before.state_dict().items():
+        if name not in state or (name.startswith("refiner.") and state[name].shape != old.shape):
+            continue
+        new = torch.zeros_like(state[name]) if name.startswith("net.") else state[name]
+        new[tuple(slice(0, size) for size in old.shape)] = old
+        state[name] = new
+    model.load_state_dict(state)
+    return model
 
 
 def facts(path: Path | str) -> dict[str, Any]:

@@ -235,9 +235,12 @@ class PatchCodec(nn.Module):
         for block in self.blocks:
             x = block(x)
         d_rgb, d_depth, d_scores = self.leave(functional.silu(x)).float().split([12, 4, 4 * CLASSES], 1)
-        rgb = torch.einsum("nkhw,ck->nchw", full["rgb"].float() * self.rgb_scale.view(4, 1, 1), self.rgb_basis)
+        with torch.autocast(some.device.type, enabled=False):  # half precision would cost a percent of depth
+            rgb = torch.einsum("nkhw,ck->nchw", full["rgb"].float() * self.rgb_scale.view(4, 1, 1), self.rgb_basis)
+            depth = torch.einsum(
+                "nkhw,ck->nchw", full["depth"].float() * self.depth_scale.view(4, 1, 1), self.depth_basis
+            )
         rgb = functional.pixel_shuffle(rgb + self.rgb_mean.view(12, 1, 1) + 0.2 * d_rgb, 2)
-        depth = torch.einsum("nkhw,ck->nchw", full["depth"].float() * self.depth_scale.view(4, 1, 1), self.depth_basis)
         depth = functional.pixel_shuffle(depth + 0.05 * d_depth, 2)
         scores = functional.pixel_shuffle(d_scores, 2)
         if self.config.semantics_code == "shares":
@@ -257,7 +260,9 @@ class PatchCodec(nn.Module):
             z = flat["semantics"].float() * self.rgb_scale.view(4, 1, 1)
             image = torch.einsum("nkhw,ck->nchw", z, self.rgb_basis) + self.rgb_mean.view(12, 1, 1)
             colours = functional.pixel_shuffle(image, 2).permute(0, 2, 3, 1)
-            scores = -torch.cdist(colours.flatten(0, 2), self.palette).unflatten(0, colours.shape[:3]).permute(0, 3, 1, 2)  # type: ignore[arg-type]
+            scores = (
+                -torch.cdist(colours.flatten(0, 2), self.palette).unflatten(0, colours.shape[:3]).permute(0, 3, 1, 2)
+            )  # type: ignore[arg-type]
         best = scores.softmax(1).topk(2, dim=1)
         margin = best.values[:, :1] - best.values[:, 1:]
         size = scores.shape[-2:]

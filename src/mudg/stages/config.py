@@ -109,6 +109,11 @@ class LearnConfig:
     spatial_attention: tuple[bool, ...] = (False, False, True)
     temporal_attention: tuple[bool, ...] = (False, False, True)
     patch: int = Field(default=2, ge=1)
+    refine_widths: tuple[int, ...] = (64, 128)
+    """Channels of the refiner at the latent resolution and at half of it; none = no refiner."""
+    refine_blocks: tuple[int, ...] = (2, 3)
+    refined_share: float = Field(default=0.5, gt=0, le=1)
+    """Share of each side of the image on which the refiner is trained at a step."""
     codec_steps: int = Field(default=400, ge=1)
     codec_batch: int = Field(default=16, ge=1)
     codec_fit_batches: int = Field(default=8, ge=1)

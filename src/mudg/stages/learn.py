@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from mudg.base import checkpoint, log, seeds, store
 from mudg.base.config import to_dict
-from mudg.base.errors import NumericsError, ResourceError, UsageError
+from mudg.base.errors import NumericsError, ResourceError
 from mudg.data import city_clips, clip_shards
 from mudg.data.clip_shards import Batch
 from mudg.models import mdm
@@ -48,11 +48,7 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
         ResourceError, UsageError: see `RunDir.open`.
     """
     before = mdm.load(config.start) if config.start else None
-    if before is not None and before.config != model_config(config):
-        raise UsageError(
-            "the model to continue from is of another kind", where=config.start, expected=str(model_config(config)),
-            got=str(before.config), remedy="give its widths, blocks, attention, patch and window",
-        )  # fmt: skip
+    model = MDM(model_config(config)) if before is None else mdm.grown(before, model_config(config))
     inputs = {"start": mdm.digest(config.start)} if config.start else {}
     directory = store.RunDir.open(out, verb="learn", config=to_dict(config), inputs=inputs, overwrite=overwrite)
     if directory.complete:
@@ -61,10 +57,12 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     torch.set_num_threads(config.threads)
     clips = Path(config.clips) if config.clips else out / "clips"
     with _making_clips(config, clips):
-        model = before or MDM(model_config(config))
         if before is None:
             _train_codec(model, config, directory, clips, bf16)
             _draw_weights(model.net, config.seed, "weights")
+        if model.refiner is not None and (before is None or before.refiner is None):
+            _draw_weights(model.refiner, config.seed, "refiner weights")
+            model.refiner.reset()
         model.codec.requires_grad_(False)
         _train_network(model, config, directory, clips, bf16)
     scores = learn_score.score(model, held_out(config), clips, steps=config.score_steps, seed=config.seed, bf16=bf16)
@@ -87,6 +85,8 @@ def model_config(config: LearnConfig) -> MDMConfig:
         temporal_attention=config.temporal_attention,
         patch=config.patch,
         window=config.window,
+        refine_widths=config.refine_widths,
+        refine_blocks=config.refine_blocks if config.refine_widths else (),
     )
 
 
@@ -226,7 +226,11 @@ def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> t
     """
     rgb, depth, ids = batch.rgb.flatten(0, 1), batch.depth.flatten(0, 1), batch.semantics.flatten(0, 1)
     with torch.no_grad():
-        latents = {"rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth), "semantics": codec.encode_semantics(ids)}
+        latents = {
+            "rgb": codec.encode_rgb(rgb),
+            "depth": codec.encode_depth(depth),
+            "semantics": codec.encode_semantics(ids),
+        }
         amount = 0.15 * torch.rand(len(rgb), 1, 1, 1, generator=generator)
         keep = (torch.rand(3, len(rgb), 1, 1, 1, generator=generator) > 0.15).float()
         noisy = {
@@ -239,7 +243,9 @@ def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> t
     part_rgb = error.abs().mean() + 0.5 * error.square().mean() + 0.25 * gradient
     part_depth = ((out_depth - target) * keep[1]).abs().mean()
     ids = torch.where(keep[2, :, 0] > 0, ids, torch.full_like(ids, 255))
-    part_semantics = functional.cross_entropy(scores, ids, ignore_index=255) if bool((ids < 255).any()) else scores.sum() * 0
+    part_semantics = (
+        functional.cross_entropy(scores, ids, ignore_index=255) if bool((ids < 255).any()) else scores.sum() * 0
+    )
     loss = part_rgb + part_depth + 0.1 * part_semantics
     terms = {"rgb": part_rgb, "depth": part_depth, "semantics": part_semantics}
     return loss, {k: float(v.detach()) for k, v in terms.items()}
@@ -262,8 +268,8 @@ def frames_at(config: LearnConfig, step: int) -> int:
 
 
 def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool) -> None:
-    """Train the denoising network; on return the model holds the moving average of the weights."""
-    net, out = model.net, run_dir.path / "steps"
+    """Train denoiser and refiner; on return the model holds the moving average of the weights."""
+    net, out = trained_part(model), run_dir.path / "steps"
     average = {k: v.detach().clone() for k, v in net.state_dict().items()}
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
     saved = checkpoint.latest(out)
@@ -287,12 +293,12 @@ def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folde
             with torch.no_grad():
                 truth = model.encode_truth(batch.rgb, batch.depth, batch.semantics)
                 shares = mdm.truth_shares(batch.semantics)
-                encoded = model.encode_planes(
-                    batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop, batch.reference
-                )
+                encoded = model.encode_planes(batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop,
+                                              batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
+                pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics)
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
                 losses = model.loss(truth, encoded, seeds.torch_generator(config.seed, step, "noise"), shares=shares,
-                                    class_weights=weights)  # fmt: skip
+                                    class_weights=weights, pixels=pixels, window=refined_window(config, model, step))  # fmt: skip
             _check_finite(losses.terms, step, "network")
             optimizer.zero_grad(set_to_none=True)
             losses.total.backward()
@@ -319,6 +325,23 @@ def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folde
     net.eval()
 
 
+def trained_part(model: MDM) -> torch.nn.ModuleDict:
+    """What the second part of training changes: the denoiser and, if there is one, the refiner."""
+    return torch.nn.ModuleDict({"net": model.net} | ({} if model.refiner is None else {"refiner": model.refiner}))
+
+
+def refined_window(config: LearnConfig, model: MDM, step: int) -> tuple[slice, slice]:
+    """Rectangle of latent cells on which the refiner is trained at `step`: a share of each side, anywhere."""
+    rng = seeds.numpy_rng(config.seed, step, "refined window")
+    spans = []
+    for side in (config.height, config.width):
+        cells = side // model.codec.factor
+        size = min(cells, max(8, round(cells * config.refined_share / 8) * 8))
+        start = 2 * int(rng.integers((cells - size) // 2 + 1))
+        spans.append(slice(start, start + size))
+    return spans[0], spans[1]
+
+
 def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
     """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over the first cities.
 
@@ -336,12 +359,18 @@ def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
 
 
 def _look(
-    model: MDM, average: dict[str, Tensor], config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool
+    model: MDM,
+    average: dict[str, Tensor],
+    config: LearnConfig,
+    run_dir: store.RunDir,
+    folder: Path,
+    step: int,
+    bf16: bool,
 ) -> None:
     """Score the moving average on a few held-out clips and draw a grid of what it makes."""
     shown = MDM(model.config)
     shown.codec.load_state_dict(model.codec.state_dict())
-    shown.net.load_state_dict(average)
+    trained_part(shown).load_state_dict(average)
     shown.eval()
     scores = learn_score.score(
         shown, held_out(config)[: config.watched], folder, steps=config.sample_steps, seed=config.seed, bf16=bf16,

@@ -54,7 +54,9 @@ def score(
         for clip in range(clip_shards.clips_in(folder, city)):
             frames = range(model.config.window)
             batch = clip_shards.read_batch(folder, [(city, clip, frames)])
-            sample = model.sample(condition_of(batch), steps=steps, seed=seed, index=city * 16 + clip, eta=eta, bf16=bf16)
+            sample = model.sample(
+                condition_of(batch), steps=steps, seed=seed, index=city * 16 + clip, eta=eta, bf16=bf16
+            )
             shift = batch.shift_m[0]
             name = "recorded" if shift == 0 else f"{abs(shift):.0f} m"
             row, matrix = score_clip(batch, sample)
@@ -78,8 +80,15 @@ def condition_of(batch: Batch, index: int = 0) -> Condition:
     camera = Camera("clip", width, height, float(width), float(width), width / 2, height / 2)
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
     return Condition(
-        views, batch.color[index], batch.sparse_depth[index], batch.valid[index], batch.reference[index], batch.warped[index],
+        views,
+        batch.color[index],
+        batch.sparse_depth[index],
+        batch.valid[index],
+        batch.reference[index],
+        batch.warped[index],
         batch.backdrop[index],
+        batch.ids[index],
+        batch.backdrop_ids[index],
     )
 
 
@@ -170,7 +179,9 @@ def depth_image(depth: Tensor, far_m: float = 100.0) -> NDArray[np.uint8]:
     """Depth f32[1,H,W] metres as a grey-free picture u8[H,W,3]: near red, far blue, logarithmic."""
     d = depth[0].clamp(2.0, far_m).numpy()
     share = np.log(d / 2.0) / np.log(far_m / 2.0)
-    anchors = np.array([[122, 4, 3], [230, 90, 14], [225, 220, 55], [72, 230, 120], [40, 130, 235], [48, 18, 59]], float)
+    anchors = np.array(
+        [[122, 4, 3], [230, 90, 14], [225, 220, 55], [72, 230, 120], [40, 130, 235], [48, 18, 59]], float
+    )
     x = share * (len(anchors) - 1)
     low = np.clip(x.astype(int), 0, len(anchors) - 2)
     f = (x - low)[..., None]
@@ -194,7 +205,9 @@ def save_grid(path: Path, shown: Sequence[tuple[Batch, Sample]], frame: int = 4)
         t = min(frame, len(sample.confidence) - 1)
         if sample.rgb is None or sample.depth is None or sample.semantics is None:
             continue
-        measured = torch.where(batch.valid[0, t], batch.sparse_depth[0, t], torch.full_like(batch.sparse_depth[0, t], 100.0))
+        measured = torch.where(
+            batch.valid[0, t], batch.sparse_depth[0, t], torch.full_like(batch.sparse_depth[0, t], 100.0)
+        )
         trust = (sample.confidence[t, 0].clamp(0, 1) * 255).byte().numpy()
         cells = [
             rgb_image(batch.color[0, t]), rgb_image(sample.rgb[t]), rgb_image(batch.rgb[0, t]), depth_image(measured),

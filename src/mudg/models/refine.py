@@ -1,0 +1,202 @@
+"""From latents to pixels with the condition in view: the last, pixel-level part of the small diffusion model.
+
+The latent code has a quarter of the image's places and loses texture, one axis of hue and whatever is one pixel wide; the
+condition has all of it wherever something was seen. The refiner reads both and states, for every pixel, how much of the
+condition's colour, depth and class to take over, what to add, and how wrong the colour will probably be. It runs once per
+clip, after the last denoising step, and is trained together with the denoiser, on what the denoiser makes.
+
+All maps are held at the latent resolution, the 2x2 pixels of a cell as channels (`functional.pixel_unshuffle`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mudg.models.vae import CLASSES, MODALITIES, ChannelNorm, Modality, PatchCodec
+
+UNKNOWN = 255
+COPY_SCORE = 6.0
+"""What a class given by the condition adds to its score when the gate is open."""
+
+
+@dataclass(frozen=True)
+class ConditionPixels:
+    """The condition at pixel resolution: color, backdrop f32[N,3,H,W] in [-1,1]; depth_code f32[N,1,H,W]; valid, warped
+    f32[N,1,H,W]; ids, backdrop_ids u8[N,1,H,W], 255 = unknown. N = clips times frames."""
+
+    color: Tensor
+    backdrop: Tensor
+    depth_code: Tensor
+    valid: Tensor
+    warped: Tensor
+    ids: Tensor
+    backdrop_ids: Tensor
+
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
+        """A rectangle of pixels."""
+        return ConditionPixels(*(x[..., rows, columns] for x in self.parts()))
+
+    def parts(self) -> tuple[Tensor, ...]:
+        """All tensors in the order of the fields."""
+        return (self.color, self.backdrop, self.depth_code, self.valid, self.warped, self.ids, self.backdrop_ids)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Pixels: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], class scores f32[N,19,H,W] (none of them clamped), and the
+    expected absolute error of rgb as its logarithm f32[N,1,H,W]."""
+
+    rgb: Tensor
+    depth_code: Tensor
+    scores: Tensor
+    log_error: Tensor
+
+
+def temporal_shift(x: Tensor, frames: int, share: int = 8) -> Tensor:
+    """Move 1/share of the channels one frame later and as many one frame earlier; ends keep their own.
+
+    `x` [B*T,C,h,w]. The following convolution then mixes neighbouring frames at no cost (Lin et al., "TSM").
+    """
+    n, c, h, w = x.shape
+    if frames == 1:
+        return x
+    k = c // share
+    y = x.permute(0, 2, 3, 1).unflatten(0, (n // frames, frames))
+    late = torch.cat([y[:, :1, ..., :k], y[:, :-1, ..., :k]], 1)
+    early = torch.cat([y[:, 1:, ..., k : 2 * k], y[:, -1:, ..., k : 2 * k]], 1)
+    return torch.cat([late, early, y[..., 2 * k :]], -1).flatten(0, 1).permute(0, 3, 1, 2)
+
+
+def one_hot(ids: Tensor) -> Tensor:
+    """u8[N,1,H,W] -> f32[N,19,H,W]; all zero where unknown."""
+    places = torch.arange(CLASSES, dtype=torch.uint8, device=ids.device).view(1, -1, 1, 1)
+    return (ids == places).float()
+
+
+def shares(ids: Tensor) -> Tensor:
+    """Share of each class among all 2x2 pixels of a cell, u8[N,1,H,W] -> f32[N,19,H/2,W/2]; unknown pixels count for none."""
+    return functional.avg_pool2d(one_hot(ids), 2)
+
+
+class RefineBlock(nn.Module):
+    """norm - temporal shift - conv - SiLU - conv around a residual."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = ChannelNorm(width)
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.conv2.weight)
+        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """[B*T,width,h,w] -> the same."""
+        return x + self.conv2(functional.silu(self.conv1(temporal_shift(self.norm(x), frames))))
+
+
+class Refiner(nn.Module):
+    """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks there."""
+
+    SIZES = (12, 4, 4, 4, 4, 4 * CLASSES, 4, 4, 4)
+    """Outputs: colour to add, gates of the condition's colour and backdrop, depth to add, gate of depth, scores to add,
+    gates of the condition's classes and the backdrop's, logarithm of the error."""
+    STARTS = (0.0, -1.0, -4.0, 0.0, -1.0, 0.0, 0.0, -4.0, -2.5)
+    """Their values before training."""
+
+    def __init__(self, channels: int, widths: tuple[int, int], blocks: tuple[int, int]) -> None:
+        super().__init__()
+        fine, coarse = widths
+        inside = channels + 12 + 4 + 12 + 12 + 4 + 4 + 4 + 2 * CLASSES
+        self.enter = nn.Conv2d(inside, fine, 3, padding=1)
+        self.before = nn.ModuleList(RefineBlock(fine) for _ in range(blocks[0]))
+        self.shrink = nn.Conv2d(fine, coarse, 2, stride=2)
+        self.middle = nn.ModuleList(RefineBlock(coarse) for _ in range(blocks[1]))
+        self.grow = nn.Conv2d(coarse, 4 * fine, 1)
+        self.join = nn.Conv2d(2 * fine, fine, 1)
+        self.after = nn.ModuleList(RefineBlock(fine) for _ in range(blocks[0]))
+        self.norm = ChannelNorm(fine)
+        self.leave = nn.Conv2d(fine, sum(self.SIZES), 1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Output that adds nothing and copies little, whatever the other weights are."""
+        with torch.no_grad():
+            self.leave.weight.zero_()
+            parts = [torch.full((size,), start) for size, start in zip(self.SIZES, self.STARTS)]
+            self.leave.bias.copy_(torch.cat(parts))  # type: ignore[union-attr]
+
+    def forward(
+        self, codec: PatchCodec, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int
+    ) -> Refined:
+        """`latents` [N,C,h,w] of all modalities (N = clips times frames, frames innermost) -> pixels."""
+        rgb, depth, scores = codec.decode_raw(latents)
+        fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
+        seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
+        planes = [*(latents[m] for m in MODALITIES), fold(rgb), fold(depth), *(fold(x) for x in seen), shares(given.ids),
+                  shares(given.backdrop_ids)]  # fmt: skip
+        x = self.enter(torch.cat([p.to(rgb.dtype) for p in planes], 1).contiguous(memory_format=torch.channels_last))
+        for block in self.before:
+            x = block(x, frames)
+        y = self.shrink(x)
+        for block in self.middle:
+            y = block(y, frames)
+        y = functional.pixel_shuffle(self.grow(y), 2)
+        x = self.join(torch.cat([x, y], 1).contiguous(memory_format=torch.channels_last))
+        for block in self.after:
+            x = block(x, frames)
+        out = functional.pixel_shuffle(self.leave(functional.silu(self.norm(x))).float(), 2)
+        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = out.split(
+            [size // 4 for size in self.SIZES], 1
+        )
+        rgb = rgb + take.sigmoid() * (given.color - rgb)
+        rgb = rgb + take_far.sigmoid() * (given.backdrop - rgb) + 0.2 * more
+        depth = depth + take_depth.sigmoid() * (given.depth_code - depth) + 0.05 * deeper
+        scores = scores + more_scores + COPY_SCORE * (
+            take_ids.sigmoid() * one_hot(given.ids) + take_far_ids.sigmoid() * one_hot(given.backdrop_ids)
+        )  # fmt: skip
+        return Refined(rgb, depth, scores, log_error)
+
+
+@dataclass(frozen=True)
+class PixelTruth:
+    """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 = unlabelled)."""
+
+    rgb: Tensor
+    depth_code: Tensor
+    ids: Tensor
+
+    def crop(self, rows: slice, columns: slice) -> PixelTruth:
+        """A rectangle of pixels."""
+        return PixelTruth(
+            self.rgb[..., rows, columns], self.depth_code[..., rows, columns], self.ids[..., rows, columns]
+        )
+
+
+def refine_loss(made: Refined, truth: PixelTruth, class_weights: Tensor | None = None) -> dict[str, Tensor]:
+    """Weighted terms of the pixel loss, scalars with gradient.
+
+    pixel_rgb        L1 + 2 x squared error + half of the L1 of gradients
+    pixel_depth      10 x smooth L1 (beta 0.02) of the depth code
+    pixel_semantics  0.2 x cross-entropy, classes weighted
+    pixel_error      0.05 x negative log-likelihood of the colour's absolute error under the stated scale (Laplace); it moves
+                     the statement only, not the colour
+    """
+    error = made.rgb - truth.rgb
+    across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
+    rgb = error.abs().mean() + 2.0 * error.square().mean() + 0.5 * (across.abs().mean() + down.abs().mean())
+    depth = 10.0 * functional.smooth_l1_loss(made.depth_code, truth.depth_code, beta=0.02)
+    labelled = bool((truth.ids != UNKNOWN).any())
+    weight = None if class_weights is None else class_weights.to(made.scores.dtype)
+    semantics = (
+        functional.cross_entropy(made.scores, truth.ids, weight, ignore_index=UNKNOWN)
+        if labelled
+        else made.scores.sum() * 0
+    )
+    size = error.detach().abs().mean(1, keepdim=True)
+    scale = made.log_error.clamp(-6.0, 1.0)
+    likely = (size * torch.exp(-scale) + scale).mean()
+    return {"pixel_rgb": rgb, "pixel_depth": depth, "pixel_semantics": 0.2 * semantics, "pixel_error": 0.05 * likely}

@@ -1,0 +1,95 @@
+"""The pixel-level part of the diffusion model: what is copied, what the loss asks for, shapes."""
+
+import pytest
+import torch
+
+from mudg.models import refine
+from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner
+from mudg.models.vae import CodecConfig, PatchCodec
+
+
+def some(count=4, height=16, width=24, seed=0):
+    """A codec, a refiner whose last layer is untouched, latents and a condition of random pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    codec = PatchCodec(CodecConfig(decoder_width=8, decoder_blocks=1))
+    refiner = Refiner(sum(codec.channels.values()), (16, 24), (1, 1))
+    latents = {m: torch.randn(count, c, height // 2, width // 2, generator=generator) for m, c in codec.channels.items()}
+    image = lambda c: torch.rand(count, c, height, width, generator=generator) * 2 - 1  # noqa: E731
+    ids = lambda: torch.randint(0, 19, (count, 1, height, width), generator=generator, dtype=torch.uint8)  # noqa: E731
+    given = ConditionPixels(image(3), image(3), image(1), image(1) > 0, image(1) > 0, ids(), ids())
+    return codec, refiner, latents, given
+
+
+def test_open_gates_hand_the_condition_through():
+    codec, refiner, latents, given = some()
+    with torch.no_grad():
+        starts = refiner.leave.bias.split(Refiner.SIZES)
+        for number in (1, 4, 6):  # colour, depth and classes of the condition
+            starts[number].fill_(30.0)
+        made = refiner(codec, latents, given, 4)
+        _, _, base = codec.decode_raw(latents)
+    assert torch.allclose(made.depth_code, given.depth_code, atol=1e-5)
+    assert torch.allclose(made.rgb, given.color + torch.sigmoid(torch.tensor(-4.0)) * (given.backdrop - given.color), atol=1e-5)
+    shown = given.ids.squeeze(1).long()
+    gained = (made.scores - base).gather(1, shown.unsqueeze(1))
+    assert float(gained.min()) > refine.COPY_SCORE - 0.01
+
+
+def test_shut_gates_leave_what_the_codec_makes():
+    codec, refiner, latents, given = some()
+    with torch.no_grad():
+        starts = refiner.leave.bias.split(Refiner.SIZES)
+        for number in (1, 2, 4, 6, 7):
+            starts[number].fill_(-30.0)
+        made = refiner(codec, latents, given, 4)
+    for stated, base in zip((made.rgb, made.depth_code, made.scores), codec.decode_raw(latents)):
+        assert torch.allclose(stated, base, atol=1e-5)
+
+
+def test_shares_of_known_classes():
+    ids = torch.tensor([[3, 3, 255, 255], [3, 7, 255, 1]], dtype=torch.uint8).view(1, 1, 2, 4)
+    share = refine.shares(ids)
+    assert share.shape == (1, 19, 1, 2)
+    assert share[0, 3, 0].tolist() == [0.75, 0.0]
+    assert share[0, 7, 0].tolist() == [0.25, 0.0]
+    assert share[0, 1, 0].tolist() == [0.0, 0.25]
+    assert float(share.sum()) == pytest.approx(1.25)
+
+
+def test_a_crop_is_refined_as_in_the_whole_image_away_from_its_border():
+    """Training on a rectangle teaches what inference on the whole image does: the receptive field is local."""
+    codec, refiner, latents, given = some(2, 48, 48)
+    with torch.no_grad():
+        refiner.leave.weight.normal_(0, 0.05, generator=torch.Generator().manual_seed(1))
+        whole = refiner(codec, latents, given, 2)
+        cells, pixels = slice(4, 24), slice(8, 48)
+        part = refiner(codec, {m: z[..., cells, cells] for m, z in latents.items()}, given.crop(pixels, pixels), 2)
+    assert torch.allclose(part.rgb[..., 14:40, 14:40], whole.rgb[..., 22:48, 22:48], atol=1e-4)
+    assert not torch.allclose(part.rgb[..., :4, :4], whole.rgb[..., 8:12, 8:12], atol=1e-4)
+
+
+def test_loss_terms_at_known_values():
+    """Everything right: no error, and the stated scale costs its own logarithm. Colour off by 0.1: L1 and square."""
+    ids = torch.randint(0, 19, (1, 4, 4), generator=torch.Generator().manual_seed(0))
+    scores = 50.0 * torch.nn.functional.one_hot(ids, 19).movedim(-1, 1).float()
+    rgb, code = torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4)
+    truth = PixelTruth(rgb, code, ids)
+    right = refine.refine_loss(Refined(rgb, code, scores, torch.full_like(code, -3.0)), truth)
+    assert float(right["pixel_rgb"]) == 0
+    assert float(right["pixel_depth"]) == 0
+    assert float(right["pixel_semantics"]) == pytest.approx(0, abs=1e-6)
+    assert float(right["pixel_error"]) == pytest.approx(0.05 * -3.0)
+    off = refine.refine_loss(Refined(rgb + 0.1, code, scores, code), truth)
+    assert float(off["pixel_rgb"]) == pytest.approx(0.1 + 2 * 0.01, rel=1e-5)
+    unlabelled = refine.refine_loss(Refined(rgb, code, scores, code), PixelTruth(rgb, code, torch.full_like(ids, 255)))
+    assert float(unlabelled["pixel_semantics"]) == 0
+
+
+def test_the_stated_error_does_not_move_the_colour():
+    rgb = torch.full((1, 3, 4, 4), 0.3, requires_grad=True)
+    log_error = torch.full((1, 1, 4, 4), -1.0, requires_grad=True)
+    ids = torch.zeros(1, 4, 4, dtype=torch.long)
+    made = Refined(rgb, torch.zeros(1, 1, 4, 4), torch.zeros(1, 19, 4, 4), log_error)
+    refine.refine_loss(made, PixelTruth(torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4), ids))["pixel_error"].backward()
+    assert rgb.grad is None or float(rgb.grad.abs().sum()) == 0
+    assert float(log_error.grad.sum()) > 0 or float(log_error.grad.sum()) < 0
