@@ -8,7 +8,8 @@ import torch
 
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Camera, Condition, View
-from mudg.models import mdm
+from mudg.core import noise
+from mudg.models import mdm, refine, unet
 from mudg.models.mdm import MDM, MDMConfig
 from mudg.models.vae import CodecConfig
 
@@ -182,15 +183,15 @@ def test_frames_and_clips_do_not_leak_across_the_batch():
 
 def test_training_and_inference_attention_agree():
     q, k, v = torch.randn(3, 2, 4, 10, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
-    trained = mdm.attend(q, k, v)
+    trained = unet.attend(q, k, v)
     with torch.no_grad():
-        fused = mdm.attend(q, k, v)
+        fused = unet.attend(q, k, v)
     assert torch.allclose(trained, fused, atol=1e-5)
 
 
 def test_temporal_shift_moves_one_eighth_each_way():
     x = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 16, 2, 2)
-    moved = mdm.temporal_shift(x, 3)
+    moved = refine.temporal_shift(x, 3)
     assert moved[:, :2].amax((1, 2, 3)).tolist() == [0, 0, 1]
     assert moved[:, 2:4].amax((1, 2, 3)).tolist() == [1, 2, 2]
     assert torch.equal(moved[:, 4:], x[:, 4:])
@@ -266,6 +267,42 @@ def test_the_shipped_model_loads():
     assert all(f.stat().st_size < 16 * 1024 * 1024 for f in files)
     assert sum(f.stat().st_size for f in files) < 40 * 1024 * 1024
     assert mdm.facts("embedded")["held_out"]["clips"] == 24
+
+
+def test_a_start_from_the_condition_keeps_more_of_it_the_less_is_run():
+    model, condition = randomised(TINY), some_condition()
+    start = model.condition_latents(condition)
+    passes = []
+    forward = model.net.forward
+    model.net.forward = lambda *given: (passes.append(int(given[1][0])), forward(*given))[1]
+    model.sample(condition, steps=10, start=start, strength=0.3)
+    assert passes == [299, 199, 99]
+    with pytest.raises(UsageError, match="start from"):
+        model.sample(condition, steps=2, strength=0.3)
+
+
+@pytest.mark.parametrize("sampler", sorted(noise.SAMPLERS))
+def test_every_sampler_costs_one_pass_per_step_and_repeats_itself(sampler):
+    model, condition = randomised(TINY), some_condition()
+    passes = []
+    forward = model.net.forward
+    model.net.forward = lambda *given: (passes.append(1), forward(*given))[1]
+    first = model.sample(condition, steps=3, sampler=sampler)
+    assert len(passes) == 3
+    assert torch.equal(first.rgb, model.sample(condition, steps=3, sampler=sampler).rgb)
+
+
+def test_depth_that_contradicts_a_measurement_costs_confidence():
+    condition = some_condition(frames=1)
+    same = mdm.depth_agreement(condition.depth, condition)
+    assert torch.allclose(same, torch.ones_like(same))
+    valid = torch.zeros_like(condition.valid)
+    valid[..., 8, 12] = True
+    alone = replace(condition, valid=valid)
+    off = mdm.depth_agreement(condition.depth * 1.5, alone)
+    assert float(off[0, 0, 8, 12]) == pytest.approx(max(0.2, 1.5**-5), rel=1e-4)
+    assert float(off[0, 0, 6, 10]) == pytest.approx(float(off[0, 0, 8, 12]))
+    assert float(off[0, 0, 0, 0]) == 1.0
 
 
 def test_confidence_falls_with_change_and_distance():

@@ -175,3 +175,107 @@ def test_bad_schedules_are_refused():
     for config in (ScheduleConfig(steps=1), ScheduleConfig(beta_start=0.2, beta_end=0.1)):
         with pytest.raises(UsageError):
             Schedule(config)
+
+
+def gaussian_denoiser(schedule, mean, spread):
+    """E[x0 | x_t] of data drawn from a normal distribution, and the exact end of the probability flow from `x`."""
+
+    def denoise(x, t):
+        alpha, sigma = schedule.alpha[t].double(), schedule.sigma[t].double()
+        gain = alpha * spread**2 / (alpha**2 * spread**2 + sigma**2)
+        return mean + gain * (x - alpha * mean)
+
+    return denoise
+
+
+@pytest.mark.parametrize("prediction", ["x0", "v"])
+def test_second_order_solver_comes_nearer_to_the_exact_flow_than_ddim(prediction):
+    """The flow of a Gaussian maps x_T to mean + spread * x_T."""
+    schedule, mean, spread = Schedule(), 0.7, 0.4
+    exact_x0 = gaussian_denoiser(schedule, mean, spread)
+    start = torch.linspace(-2, 2, 9, dtype=torch.float64).view(1, 9)
+
+    def denoise(x, t):
+        x0 = exact_x0(x, t)
+        if prediction == "x0":
+            return x0
+        alpha, sigma = schedule.alpha[t].double(), schedule.sigma[t].double()
+        return (alpha * x - x0) / sigma
+
+    def error(sampler, steps):
+        made = sampler(denoise, start, schedule, noise.trailing_steps(1000, steps), prediction=prediction)
+        return float((made - (mean + spread * start)).abs().max())
+
+    ours = [error(noise.dpm_solver, n) for n in (20, 80, 250)]
+    plain = [error(noise.ddim, n) for n in (20, 80, 250)]
+    assert all(a < share * b for a, b, share in zip(ours, plain, (0.8, 0.55, 0.45)))
+
+
+def test_second_order_solver_follows_the_published_update():
+    """Three steps written out in log-SNR and exponentials, from a level that has a log-SNR."""
+    schedule = Schedule()
+    denoise = lambda x, t: 0.3 * torch.tanh(x) + 0.0005 * t  # noqa: E731
+    start = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    indices = [899, 599, 299, 49]
+    alpha, sigma = schedule.alpha_bar[indices].sqrt(), (1 - schedule.alpha_bar[indices]).sqrt()
+    level = torch.log(alpha / sigma)
+    h = level[1:] - level[:-1]
+    x, estimates = start, []
+    for i in range(3):
+        estimates.append(denoise(x, indices[i]))
+        r = h[i - 1] / h[i]
+        mixed = estimates[-1] if i == 0 else (1 + 1 / (2 * r)) * estimates[-1] - estimates[-2] / (2 * r)
+        x = sigma[i + 1] / sigma[i] * x - alpha[i + 1] * torch.expm1(-h[i]) * mixed
+    made = noise.dpm_solver(denoise, start, schedule, indices)
+    assert torch.allclose(made, denoise(x, 49), atol=1e-6)
+
+
+def test_first_steps_of_the_second_order_solver_are_those_of_ddim():
+    """From pure noise the first two steps have nothing to extrapolate from."""
+    schedule = Schedule()
+    start = torch.randn(1, 6, generator=torch.Generator().manual_seed(0))
+    denoise = lambda x, t: 0.3 * torch.tanh(x) + 0.001 * t  # noqa: E731
+    indices = noise.trailing_steps(1000, 20)[:3]
+    seen = {}
+    for sampler in (noise.ddim, noise.dpm_solver):
+        estimates = []
+        sampler(denoise, start, schedule, indices, on_step=lambda n, x0, kept=estimates: kept.append(x0))
+        seen[sampler] = estimates
+    for a, b in zip(seen[noise.ddim], seen[noise.dpm_solver]):
+        assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_renoise_forgets_a_wrong_first_estimate():
+    """A denoiser that is wrong at the first step only: fresh noise leaves no trace of it, DDIM carries it on."""
+    schedule = Schedule()
+    indices = noise.trailing_steps(1000, 2)
+    truth = torch.full((1, 4), 0.5)
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda: torch.randn(1, 4, generator=generator)  # noqa: E731
+    visited = {}
+
+    def denoise(x, t):
+        visited[t] = x
+        return truth + (3.0 if t == indices[0] else 0.0)
+
+    made = noise.renoise(denoise, torch.zeros(1, 4), schedule, indices, draw=draw)
+    assert torch.equal(made, truth)
+    expected = schedule.alpha[indices[1]] * (truth + 3.0)
+    generator.manual_seed(0)
+    assert torch.allclose(visited[indices[1]], expected + schedule.sigma[indices[1]] * torch.randn(1, 4, generator=generator))
+    with pytest.raises(UsageError):
+        noise.renoise(denoise, torch.zeros(1, 4), schedule, indices)
+
+
+def test_a_start_from_given_data_runs_the_late_steps_only():
+    indices = noise.trailing_steps(1000, 10)
+    assert noise.partial_steps(indices, 1000, 1.0) == indices
+    assert noise.partial_steps(indices, 1000, 0.5) == [499, 399, 299, 199, 99]
+    assert noise.partial_steps(indices, 1000, 0.01) == [99]
+    with pytest.raises(UsageError):
+        noise.partial_steps(indices, 1000, 0.0)
+
+
+def test_solver_refuses_what_it_does_not_know():
+    with pytest.raises(UsageError, match="rescale"):
+        noise.dpm_solver(lambda x, t: x, torch.zeros(1, 2), Schedule(ScheduleConfig(base_scale=0.7)), [999, 499])

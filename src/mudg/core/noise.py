@@ -234,5 +234,93 @@ def ancestral(denoise: Denoise, start: Tensor, schedule: Schedule, step_indices:
     return ddim(denoise, start, schedule, step_indices, **{**options, "eta": 1.0})  # type: ignore[arg-type]
 
 
-SAMPLERS: dict[str, Callable[..., Tensor]] = {"ddim": ddim, "ancestral": ancestral}
-"""Every sampler by name. A new one is a function with the signature of `ddim` and one row here."""
+def dpm_solver(
+    denoise: Denoise,
+    start: Tensor,
+    schedule: Schedule,
+    step_indices: Sequence[int],
+    *,
+    prediction: Prediction = "x0",
+    on_step: Callable[[int, Tensor], None] | None = None,
+    **_: object,
+) -> Tensor:
+    """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order from two consecutive estimates of x0, deterministic.
+
+    With lambda = log(alpha / sigma) and h its step, x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) D, where D is
+    extrapolated from the last two estimates. A first step at zero SNR (lambda = -infinity) is taken at first order, and so
+    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. `eta` and `draw`
+    are not used. A dynamic rescale is refused. Arguments and result as for `ddim`.
+    """
+    if bool((schedule.scale != 1).any()):
+        raise UsageError("dpm_solver does not know the dynamic rescale", expected="sampler = ddim", got="base_scale set")
+    alpha, sigma = schedule.alpha_bar.sqrt(), (1 - schedule.alpha_bar).clamp(min=0).sqrt()
+    level = torch.log(alpha / sigma)
+    x, before, step_before = start, None, math.inf
+    for number, t in enumerate(step_indices):
+        x0, _ = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)
+        if on_step is not None:
+            on_step(number, x0)
+        if number + 1 == len(step_indices):
+            return x0
+        following = step_indices[number + 1]
+        step = float(level[following] - level[t])
+        estimate = x0
+        if before is not None and math.isfinite(step_before):
+            weight = step / (2 * step_before)
+            estimate = (1 + weight) * x0 - weight * before
+        shrink = float(sigma[following] / sigma[t])
+        grow = float(alpha[following]) - shrink * float(alpha[t])  # = -alpha_next (exp(-h) - 1), also for h = infinity
+        x = shrink * x + grow * estimate
+        before, step_before = x0, step
+    return x
+
+
+def renoise(
+    denoise: Denoise,
+    start: Tensor,
+    schedule: Schedule,
+    step_indices: Sequence[int],
+    *,
+    prediction: Prediction = "x0",
+    draw: Callable[[], Tensor] | None = None,
+    on_step: Callable[[int, Tensor], None] | None = None,
+    **_: object,
+) -> Tensor:
+    """Few-step sampling: state x0, add fresh noise for the next level, repeat (as consistency models are sampled).
+
+    All of the noise is fresh at each step, so an error of the first estimate is not carried on. Meant for 1 to 4 steps.
+    Arguments and result as for `ddim`; a dynamic rescale multiplies x0 as in training.
+    """
+    if draw is None and len(step_indices) > 1:
+        raise UsageError("stochastic sampling needs a source of noise", where="noise.renoise")
+    x, x0 = start, start
+    for number, t in enumerate(step_indices):
+        x0, _ = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)
+        x0 = x0 / schedule.scale[t]
+        if on_step is not None:
+            on_step(number, x0)
+        if number + 1 < len(step_indices) and draw is not None:
+            following = step_indices[number + 1]
+            x = schedule.alpha[following] * schedule.scale[following] * x0 + schedule.sigma[following] * draw()
+    return x0
+
+
+def partial_steps(indices: Sequence[int], steps: int, strength: float) -> list[int]:
+    """The part of descending step `indices` that a start from given data runs: those below `strength` * steps.
+
+    At least the last one. strength 1 = all of them, from pure noise (Meng et al., "SDEdit").
+    """
+    if not 0 < strength <= 1:
+        raise UsageError("strength is out of range", expected="0 < strength <= 1", got=str(strength))
+    kept = [t for t in indices if t < strength * steps]
+    return kept or [indices[-1]]
+
+
+SAMPLERS: dict[str, Callable[..., Tensor]] = {
+    "ddim": ddim,
+    "ancestral": ancestral,
+    "dpm_solver": dpm_solver,
+    "renoise": renoise,
+}
+"""Every sampler by name. A new one is a function with the signature of `ddim` and one row here. Each costs one denoiser
+pass per step (two with classifier-free guidance)."""

@@ -1,7 +1,8 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
 Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to do,
-`encode_condition`, `loss` and `sample`. `UNet` is the network. `MDMConfig` is all that distinguishes one model from another.
+`encode_condition`, `loss` and `sample`. The network is in `models.unet`, the step from latents to pixels in
+`models.refine`. `MDMConfig` is all that distinguishes one model from another.
 
 The network's input is, per latent cell, [noisy latent | latent of the colour condition | latent of the depth condition],
 12 channels in the published model, with optional mask planes after them. What it denoises is chosen by the modality label
@@ -15,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,11 +30,11 @@ from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Condition
 from mudg.core import noise
 from mudg.core.noise import Schedule, ScheduleConfig
-from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares, temporal_shift
+from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares
+from mudg.models.unet import UNet
 from mudg.models.vae import (
     CLASSES,
     MODALITIES,
-    ChannelNorm,
     CodecConfig,
     Decoded,
     Modality,
@@ -148,189 +148,6 @@ def config_from_dict(values: Mapping[str, Any], where: str = "model configuratio
         return MDMConfig(**top)
     except TypeError as error:
         raise InputError("a model configuration has a value of a wrong type", where=where, got=str(error)) from error
-
-
-# network --------------------------------------------------------------------------------------------------------------
-
-
-def sinusoid(t: Tensor, width: int) -> Tensor:
-    """[cos, sin] features f32[N,width] of `t` [N], frequencies 10000^(-i / (width/2))."""
-    half = width // 2
-    frequencies = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device) / half)
-    angles = t.float()[:, None] * frequencies
-    return torch.cat([angles.cos(), angles.sin()], 1)
-
-
-def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Softmax attention of `q` [..,N,C] over `k`, `v` [..,M,C] -> [..,N,C].
-
-    In training as two matrix products (on CPUs the backward pass of the fused kernel costs several times more at these
-    sizes), otherwise through the fused kernel, which never stores the N x M scores.
-    """
-    if torch.is_grad_enabled():
-        scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
-        return scores.softmax(-1).to(v.dtype) @ v
-    return functional.scaled_dot_product_attention(q, k, v)
-
-
-class ResBlock(nn.Module):
-    """norm - temporal shift - conv - norm scaled and moved by the embedding - SiLU - conv, around a residual."""
-
-    def __init__(self, inside: int, outside: int, embed: int) -> None:
-        super().__init__()
-        self.norm1 = ChannelNorm(inside)
-        self.conv1 = nn.Conv2d(inside, outside, 3, padding=1)
-        self.norm2 = ChannelNorm(outside, elementwise_affine=False)
-        self.modulate = nn.Linear(embed, 2 * outside)
-        self.conv2 = nn.Conv2d(outside, outside, 3, padding=1)
-        self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
-        nn.init.zeros_(self.conv2.weight)
-        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
-
-    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
-        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
-        scale, move = self.modulate(embedding)[:, :, None, None].chunk(2, 1)
-        h = self.conv1(temporal_shift(self.norm1(x), frames))
-        h = functional.silu(torch.addcmul(move, self.norm2(h), 1 + scale))
-        return self.skip(x) + self.conv2(h)
-
-
-class SpatialAttention(nn.Module):
-    """Self-attention over the cells of a frame; keys and values also come from frame 0 of the clip."""
-
-    def __init__(self, width: int, head_width: int) -> None:
-        super().__init__()
-        self.heads = width // head_width
-        self.norm = nn.LayerNorm(width)
-        self.query = nn.Linear(width, width)
-        self.key_value = nn.Linear(width, 2 * width)
-        self.out = nn.Linear(width, width)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-
-    def forward(self, x: Tensor, frames: int) -> Tensor:
-        """[B*T,C,h,w] -> the same."""
-        n, c, height, width = x.shape
-        tokens = x.permute(0, 2, 3, 1).reshape(n, height * width, c)
-        normed = self.norm(tokens)
-        key_value = self.key_value(normed)
-        if frames > 1:
-            per_clip = key_value.unflatten(0, (n // frames, frames))
-            first = per_clip[:, :1].expand(-1, frames, -1, -1)
-            key_value = torch.cat([per_clip, first], 2).flatten(0, 1)
-        key, value = key_value.chunk(2, -1)
-        q, k, v = (y.unflatten(-1, (self.heads, -1)).transpose(1, 2) for y in (self.query(normed), key, value))
-        mixed = attend(q, k, v).transpose(1, 2).flatten(2)
-        return (tokens + self.out(mixed)).reshape(n, height, width, c).permute(0, 3, 1, 2)
-
-
-class TemporalAttention(nn.Module):
-    """Self-attention over the frames of a clip at each cell."""
-
-    def __init__(self, width: int, head_width: int) -> None:
-        super().__init__()
-        self.heads = width // head_width
-        self.norm = nn.LayerNorm(width)
-        self.mix = nn.Linear(width, 3 * width)
-        self.out = nn.Linear(width, width)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-
-    def forward(self, x: Tensor, frames: int) -> Tensor:
-        """[B*T,C,h,w] -> the same."""
-        n, c, height, width = x.shape
-        y = x.permute(0, 2, 3, 1).reshape(n // frames, frames, height * width, c).transpose(1, 2)
-        place = sinusoid(torch.arange(frames, device=x.device), c).to(y.dtype)
-        q, k, v = self.mix(self.norm(y) + place).unflatten(-1, (3, self.heads, -1)).movedim(-3, 0)
-        q, k, v = (z.transpose(-3, -2).flatten(0, 1) for z in (q, k, v))
-        mixed = attend(q, k, v)
-        mixed = mixed.unflatten(0, y.shape[:2]).transpose(-3, -2).flatten(-2)
-        y = (y + self.out(mixed)).transpose(1, 2).reshape(n, height, width, c)
-        return y.permute(0, 3, 1, 2)
-
-
-class Stage(nn.Module):
-    """One residual block and the attentions that its level has."""
-
-    def __init__(self, inside: int, outside: int, config: MDMConfig, level: int) -> None:
-        super().__init__()
-        self.block = ResBlock(inside, outside, config.embed_width)
-        spatial, temporal = config.spatial_attention[level], config.temporal_attention[level]
-        self.spatial = SpatialAttention(outside, config.head_width) if spatial else None
-        self.temporal = TemporalAttention(outside, config.head_width) if temporal else None
-
-    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
-        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
-        x = self.block(x, embedding, frames)
-        if self.spatial is not None:
-            x = self.spatial(x, frames)
-        if self.temporal is not None:
-            x = self.temporal(x, frames)
-        return x
-
-
-class UNet(nn.Module):
-    """The denoising network of the small models: a U of `Stage`s over the cells of a patched latent video."""
-
-    def __init__(self, config: MDMConfig, planes_in: int, planes_out: int) -> None:
-        super().__init__()
-        widths, embed, area = config.widths, config.embed_width, config.patch**2
-        self.patch = config.patch
-        self.time = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
-        self.label = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
-        self.enter = nn.Conv2d(planes_in * area, widths[0], 1)
-        width, skips = widths[0], [widths[0]]
-        self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
-        for level, outside in enumerate(widths):
-            stages = nn.ModuleList()
-            for _ in range(config.blocks[level]):
-                stages.append(Stage(width, outside, config, level))
-                width = outside
-                skips.append(width)
-            self.down.append(stages)
-            if level + 1 < len(widths):
-                self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
-                width = widths[level + 1]
-                skips.append(width)
-        self.middle = Stage(width, width, config, len(widths) - 1)
-        self.up, self.grow = nn.ModuleList(), nn.ModuleList()
-        for level in reversed(range(len(widths))):
-            stages = nn.ModuleList()
-            for _ in range(config.blocks[level] + 1):
-                stages.append(Stage(width + skips.pop(), widths[level], config, level))
-                width = widths[level]
-            self.up.append(stages)
-            if level:
-                self.grow.append(nn.Conv2d(width, 4 * widths[level - 1], 1))
-                width = widths[level - 1]
-        self.norm = ChannelNorm(width)
-        self.leave = nn.Conv2d(width, planes_out * area, 1)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
-
-    def forward(self, x: Tensor, t: Tensor, label: Tensor) -> Tensor:
-        """`x` [B,T,planes_in,h,w], `t` and `label` i64[B] -> f32 [B,T,planes_out,h,w]."""
-        batch, frames = x.shape[:2]
-        embedding = self.time(sinusoid(t, 64)) + self.label(sinusoid(label, 64))
-        embedding = functional.silu(embedding).repeat_interleave(frames, 0)
-        h = functional.pixel_unshuffle(x.flatten(0, 1), self.patch)
-        h = self.enter(h.contiguous(memory_format=torch.channels_last))
-        skips = [h]
-        for level, stages in enumerate(self.down):
-            for stage in stages:
-                h = stage(h, embedding, frames)
-                skips.append(h)
-            if level < len(self.shrink):
-                h = self.shrink[level](h)
-                skips.append(h)
-        h = self.middle(h, embedding, frames)
-        for index, stages in enumerate(self.up):
-            for stage in stages:
-                h = stage(torch.cat([h, skips.pop()], 1), embedding, frames)
-            if index < len(self.grow):
-                h = functional.pixel_shuffle(self.grow[index](h), 2).contiguous(memory_format=torch.channels_last)
-        h = self.leave(functional.silu(self.norm(h)))
-        return functional.pixel_shuffle(h.float(), self.patch).unflatten(0, (batch, frames))
 
 
 # model ----------------------------------------------------------------------------------------------------------------
@@ -597,6 +414,14 @@ class MDM(nn.Module):
         u = float(torch.rand((), generator=generator))
         return [self.passes[0 if u < 0.5 else 1 if u < 0.75 else 2]]
 
+    def condition_latents(self, condition: Condition) -> dict[Modality, Tensor]:
+        """The condition as latents [T,C,h,w] of all modalities, to `start` from; classes that are not given are all alike."""
+        encoded = self.encode_condition(condition)
+        latents = {m: encoded.copy[m][0] for m in ("rgb", "depth")}
+        unknown = torch.full_like(condition.valid[:, 0], 255, dtype=torch.long)
+        ids = unknown if condition.semantics is None else condition.semantics[:, 0].long()
+        return {**latents, "semantics": self.codec.encode_semantics(ids)}  # type: ignore[dict-item]
+
     # sampling ---------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
@@ -612,6 +437,8 @@ class MDM(nn.Module):
         modalities: Sequence[Modality] = MODALITIES,
         n_samples: int = 1,
         known: Mapping[Modality, Tensor] | None = None,
+        start: Mapping[Modality, Tensor] | None = None,
+        strength: float = 1.0,
         bf16: bool = False,
     ) -> Sample:
         """Generate one clip.
@@ -621,7 +448,9 @@ class MDM(nn.Module):
         seed, index all noise is drawn from (seed, index): same in, same out
         sampler     a row of `noise.SAMPLERS`
         known       latents [k,C,h,w] of the clip's first k frames, from the previous window: they are kept
-        n_samples   > 1: the first sample is returned, the spread of all sets the confidence
+        start       latents [T,C,h,w] of all modalities to start from instead of pure noise, for example of the condition
+                    (`condition_latents`) or of a render; `strength` in (0, 1] is the share of the schedule that is run
+        n_samples   > 1: the first sample is returned, the spread of all lowers the confidence
         bf16        run the network in bfloat16
 
         Measured depth (`condition.valid`) replaces generated depth; sky is set to the codec's far distance. See
@@ -640,7 +469,7 @@ class MDM(nn.Module):
             latents: dict[Modality, Tensor] = {}
             for names in passes:
                 part, moved = self._denoise(encoded, names, steps, seeds.key(seed, index * 64 + number, "sample"), sampler,
-                                            eta, known, bf16)  # fmt: skip
+                                            eta, known, start, strength, bf16)  # fmt: skip
                 latents |= part
                 change = torch.maximum(change, moved)
             drawn.append(latents)
@@ -655,8 +484,11 @@ class MDM(nn.Module):
             else:
                 decoded, error = self._decode_refined(latents, encoded.pixels)
                 confidence = torch.exp(-error / TRUSTED_ERROR)
+                if n_samples > 1:
+                    confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
         depth, ids = decoded.depth, decoded.semantics
         if depth is not None:
+            confidence = confidence * depth_agreement(depth, condition)
             depth = settle_depth(depth, condition, ids, self.config.codec.far_m)
         wanted = lambda m, x: x if m in modalities else None  # noqa: E731
         return Sample(wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents)
@@ -679,6 +511,8 @@ class MDM(nn.Module):
         sampler: str,
         eta: float,
         known: Mapping[Modality, Tensor] | None,
+        start: Mapping[Modality, Tensor] | None,
+        strength: float,
         bf16: bool,
     ) -> tuple[dict[Modality, Tensor], Tensor]:
         """Run the sampler for the modalities of one pass; returns latents [1,T,C,h,w] and the change over the late steps."""
@@ -690,6 +524,13 @@ class MDM(nn.Module):
         draw = lambda: noise.video_noise(shape, generator, self.config.shared_noise)  # noqa: E731
         estimates: list[Tensor] = []
         indices = noise.trailing_steps(len(self.schedule), steps)
+        begin = draw()
+        if start is not None:
+            indices = noise.partial_steps(indices, len(self.schedule), strength)
+            given = torch.cat([start[m] for m in names], 1)[None]
+            begin = self.schedule.add_noise(given, begin, torch.full((lead[0],), indices[0]))
+        elif strength != 1.0:
+            raise UsageError("strength needs something to start from", got=str(strength), remedy="strength = 1")
 
         def denoise(x: Tensor, t: int) -> Tensor:
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
@@ -705,7 +546,7 @@ class MDM(nn.Module):
                 estimates.append(x0[:, :, : sizes[0]])
 
         x = noise.SAMPLERS[sampler](
-            denoise, draw(), self.schedule, indices, prediction=self.config.head, eta=eta, draw=draw, on_step=watch
+            denoise, begin, self.schedule, indices, prediction=self.config.head, eta=eta, draw=draw, on_step=watch
         )
         moved = torch.stack([(e - x[:, :, : sizes[0]]).abs().mean(2, keepdim=True) for e in estimates]).mean(0)
         return dict(zip(names, x.split(sizes, 2))), moved
@@ -724,6 +565,22 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     coverage = 0.35 + 0.65 * torch.maximum(seen, near)
     value = coverage * torch.exp(-2.0 * change)
     return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
+
+
+def depth_agreement(depth: Tensor, condition: Condition, reach_px: int = 2) -> Tensor:
+    """How far generated depth f32[T,1,H,W] agrees with what was measured nearby, f32[T,1,H,W] in [0.2, 1].
+
+    exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within `reach_px` as the mean of
+    those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not to
+    be trusted either.
+    """
+    seen = condition.valid.float()
+    ratio = (depth.clamp(min=0.1) / condition.depth.clamp(min=0.1)).log().abs()
+    agrees = torch.exp(-5.0 * ratio).clamp(min=0.2)
+    window = 2 * reach_px + 1
+    pool = lambda x: functional.avg_pool2d(x, window, stride=1, padding=reach_px, count_include_pad=True)  # noqa: E731
+    near = pool(seen)
+    return torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
 
 
 def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, far_m: float) -> Tensor:
