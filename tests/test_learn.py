@@ -12,8 +12,9 @@ from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.base.types import Camera, Clip, Condition, View
 from mudg.data import clip_shards
 from mudg.models import mdm
-from mudg.stages import learn, learn_score
+from mudg.stages import learn, learn_clips, learn_score
 from mudg.stages.config import LearnConfig
+from mudg.stages.learn_state import TrainingState
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
 
@@ -41,7 +42,7 @@ def made_up_clip(seed):
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clips")
-    for number in [*range(3), learn.HELD_OUT]:
+    for number in [*range(3), learn_clips.HELD_OUT]:
         made = [made_up_clip(number * 7 + k) for k in range(2)]
         clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0]))
     return folder
@@ -64,18 +65,17 @@ def weights(folder):
 def test_resume_equals_the_uninterrupted_run(clips, tmp_path, monkeypatch):
     config = tiny(clips)
     whole = learn.run(config, tmp_path / "whole")
-    save = checkpoint.save
+    save = TrainingState.save
 
-    def save_then_stop(folder, step, *args, **kwargs):
-        result = save(folder, step, *args, **kwargs)
-        if folder.name == "steps" and step == 2:
+    def save_then_stop(state, *args, **kwargs):
+        save(state, *args, **kwargs)
+        if state.step == 2:
             raise KeyboardInterrupt
-        return result
 
-    monkeypatch.setattr(checkpoint, "save", save_then_stop)
+    monkeypatch.setattr(TrainingState, "save", save_then_stop)
     with pytest.raises(KeyboardInterrupt):
         learn.run(config, tmp_path / "parts")
-    monkeypatch.setattr(checkpoint, "save", save)
+    monkeypatch.setattr(TrainingState, "save", save)
     assert not (tmp_path / "parts" / "model").exists()
     parts = learn.run(config, tmp_path / "parts")
     first, second = weights(whole), weights(parts)
@@ -148,18 +148,18 @@ def test_schedules(clips):
     assert learn.learning_rate(config, 300) == pytest.approx(1e-3)
     assert learn.learning_rate(config, 750) == pytest.approx(5e-4)
     assert learn.learning_rate(config, 999) == pytest.approx(2e-5)
-    assert learn.cities_at(config, 0) == 1
-    assert learn.cities_at(config, 600) == 3
+    assert learn_clips.cities_at(config, 0) == 1
+    assert learn_clips.cities_at(config, 600) == 3
     assert [learn.frames_at(config, s) for s in (0, 499, 500)] == [2, 2, 4]
 
 
 def test_clips_that_never_come_are_an_error(tmp_path):
     with pytest.raises(ResourceError, match="not arriving"):
-        learn._await_shard(tmp_path, 1, patience_s=0.0)
+        learn_clips.await_shard(tmp_path, 1, patience_s=0.0)
 
 
 def test_perfect_samples_score_perfectly(clips):
-    batch = clip_shards.read_batch(clips, [(learn.HELD_OUT, 0, range(WINDOW))])
+    batch = clip_shards.read_batch(clips, [(learn_clips.HELD_OUT, 0, range(WINDOW))])
     depth = batch.depth[0].clamp(max=100.0)
     sample = mdm.Sample(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
     row, counts = learn_score.score_clip(batch, sample)
