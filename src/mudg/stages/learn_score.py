@@ -228,7 +228,8 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
         entry = json.loads(line)
         if "total" in entry and "step" in entry:
             for name in ("total", "rgb", "depth", "semantics"):
-                points.setdefault(name, {})[int(entry["step"])] = float(entry.get(name, math.nan))
+                if name in entry:  # separate passes: a step has one modality
+                    points.setdefault(name, {})[int(entry["step"])] = float(entry[name])
     series = {n: sorted(p.items()) for n, p in points.items()}
     values = [v for p in series.values() for _, v in p if v > 0 and math.isfinite(v)]
     if not values:

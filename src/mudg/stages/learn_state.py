@@ -215,5 +215,6 @@ def newest(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
 
 
 def mean_of(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Mean of each value over several steps, to nine digits."""
-    return {k: float(f"{np.mean([r[k] for r in rows]):.9g}") for k in rows[0]} if rows else {}
+    """Mean of each value over those of several steps that have it, to nine digits."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: float(f"{np.mean([row[name] for row in rows if name in row]):.9g}") for name in names}
