@@ -8,12 +8,12 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["GLOO_SOCKET_IFNAME"] = "lo"
 
-import torch.distributed as dist  # noqa: E402
-from toy_clips import tiny  # noqa: E402
+import torch.distributed as dist
+from toy_clips import tiny
 
-from mudg.base.errors import NumericsError, UsageError  # noqa: E402
-from mudg.stages import learn  # noqa: E402
-from mudg.stages.learn_parallel import Interruption  # noqa: E402
+from mudg.base.errors import NumericsError, UsageError
+from mudg.stages import learn
+from mudg.stages.learn_parallel import Interruption
 
 rank, store, clips, out = int(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)

@@ -37,9 +37,21 @@ def separate(tmp_path_factory):
     """A model with one pass per modality, in which the modality label matters, and a reference image in the first frame."""
     model = MDM(
         MDMConfig(
-            codec=CodecConfig(semantics_code="palette"), joint=False, head="v", copy_condition=False, backdrop=False,
-            mask_planes="none", reference="first_frame", widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True),
-            temporal_attention=(False, True), given_classes=False, refine_widths=(), refine_blocks=(), window=WINDOW,
+            codec=CodecConfig(semantics_code="palette"),
+            joint=False,
+            head="v",
+            copy_condition=False,
+            backdrop=False,
+            mask_planes="none",
+            reference="first_frame",
+            widths=(16, 32),
+            blocks=(1, 1),
+            spatial_attention=(False, True),
+            temporal_attention=(False, True),
+            given_classes=False,
+            refine_widths=(),
+            refine_blocks=(),
+            window=WINDOW,
         )  # fmt: skip
     )
     learn._draw_weights(model.net, 3, "weights")
@@ -50,7 +62,9 @@ def separate(tmp_path_factory):
 
 
 def test_the_second_stage_takes_over_everything_at_another_size(large_clips, stage_one, tmp_path):
-    config = tiny(large_clips, start=str(stage_one), steps=1, width=96, height=64, frozen="temporal_transformers", average_decay=0)
+    config = tiny(
+        large_clips, start=str(stage_one), steps=1, width=96, height=64, frozen="temporal_transformers", average_decay=0
+    )
     begun, fresh = learn.starting_model(config)
     before, start = mdm.load(stage_one).state_dict(), begun.state_dict()
     assert not fresh
@@ -163,7 +177,9 @@ def test_clips_of_another_size_are_refused(clips, stage_one, tmp_path):
 
 def test_tensorboard_is_asked_for_in_words(clips, tmp_path, monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "tensorboard" else find(name, *rest))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "tensorboard" else find(name, *rest)
+    )
     with pytest.raises(ResourceError, match=r"pip install 'mudg\[track\]'"):
         learn.run(tiny(clips, tensorboard=True), tmp_path / "run")
 

@@ -2,14 +2,16 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 import torch
-from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 from torch import nn
+from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
@@ -59,7 +61,9 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     arguments = [str(tmp_path / "store"), str(clips), str(tmp_path)]
     script = str(Path(__file__).with_name("learn_together.py"))
     both = [
-        subprocess.Popen([sys.executable, script, str(rank), *arguments], env=environment(), stderr=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [sys.executable, script, str(rank), *arguments], env=environment(), stderr=subprocess.PIPE, text=True
+        )
         for rank in (0, 1)
     ]
     errors = [process.communicate(timeout=540)[1] for process in both]
@@ -83,20 +87,51 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
 
-@pytest.mark.slow
-def test_torchrun_trains(clips, tmp_path):
+def torchrun(clips, out, **changes):
+    """The command that trains on two processes started by torch's launcher."""
     flags = {
-        "clips": clips, "out": tmp_path / "out", "cities": 3, "first-cities": 2, "held-out": 1, "workers": 0, "width": WIDTH,
+        "clips": clips, "out": out, "cities": 3, "first-cities": 2, "held-out": 1, "workers": 0, "width": WIDTH,
         "height": HEIGHT, "window": WINDOW, "codec-steps": 2, "codec-batch": 2, "codec-fit-batches": 1, "steps": 2,
-        "batch-frames": 8, "sample-steps": 1, "score-steps": 1, "parallel": "fsdp",
+        "batch-frames": 8, "sample-steps": 1, "score-steps": 1, "log-every": 1, "parallel": "fsdp", **changes,
     }  # fmt: skip
-    words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
+    words = [word for name, value in flags.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     words += ["--widths", "16", "32", "--blocks", "1", "1", "--refine-widths", "8", "16", "--refine-blocks", "1", "1"]
     words += ["--spatial-attention", "False", "True", "--temporal-attention", "False", "True"]
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mudg", "learn"]
-    done = subprocess.run([*launcher, *words], env=environment(), capture_output=True, text=True, timeout=600)
+    return [
+        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mudg", "learn", *words,
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_torchrun_trains(clips, tmp_path):
+    command = torchrun(clips, tmp_path / "out")
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     assert mdm.load(tmp_path / "out" / "model").config.widths == (16, 32)
+
+
+@pytest.mark.slow
+def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
+    """The terminal sends the signal to all processes, and the launcher sends it on once more."""
+    out = tmp_path / "out"
+    command = torchrun(clips, out, steps=5000, checkpoint_every=5000)
+    process = subprocess.Popen(command, env=environment(), start_new_session=True, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 500
+        while time.monotonic() < deadline and process.poll() is None:
+            if (out / "steps").is_dir() or len(losses_of(out) if (out / "log.jsonl").is_file() else {}) > 1:
+                break
+            time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)
+        said = process.communicate(timeout=120)[1]
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode not in (0, None)
+    saved = checkpoint.latest(out / "steps")
+    assert saved is not None, said
+    assert saved.step == max(losses_of(out)), said
+    assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
 
 
 def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
@@ -175,6 +210,8 @@ def test_a_term_that_is_not_finite_is_named():
 
 
 def test_blocks_are_what_repeats():
-    first, second, outer = (nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.Sequential(nn.Linear(2, 2))])) for _ in range(3))
+    first, second, outer = (
+        nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.Sequential(nn.Linear(2, 2))])) for _ in range(3)
+    )
     part = nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.ModuleList([first, second]), nn.Linear(2, 2), outer]))
     assert [id(m) for m in learn_parallel.blocks(part)] == [id(first), id(second), id(outer)]

@@ -157,15 +157,21 @@ def starting_model(config: LearnConfig) -> tuple[MDM, set[str]]:
     """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
 
     With `start` the network is that of the earlier model, grown by a refiner and given classes where the settings ask for
-    them. If the settings do not describe that network but are the defaults, it is taken as it is.
+    them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
+    size and length than before.
 
     Raises:
-        UsageError: the settings ask for another network than the earlier model has, or for another window.
+        UsageError: the settings ask for another network than the earlier model has.
     """
     wanted = model_config(config)
     if not config.start:
         return MDM(wanted), {"codec", "refiner"}
     before = mdm.load(config.start)
+    if before.config.window != config.window:
+        log.info(f"learn: clips of {config.window} frames; the model to continue from had {before.config.window}")
+        resized = MDM(dataclasses.replace(before.config, window=config.window))
+        resized.load_state_dict(before.state_dict())
+        before = resized
     grows_refiner = bool(wanted.refine_widths) and before.refiner is None
     if wanted == before.config:
         return before, set()
