@@ -29,6 +29,7 @@ from mudg.base import palette, seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Condition
 from mudg.core import noise
+from mudg.core.align import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
 from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares
 from mudg.models.unet import UNet
@@ -66,9 +67,10 @@ class MDMConfig:
     """Four more input channels: a recorded image carried over as if far away; it can be copied like the condition."""
     mask_planes: Literal["none", "valid", "valid_image"] = "valid_image"
     """Extra input planes: none (12 channels, published), where points were seen, and where a recorded image was warped."""
-    reference: Literal["first_frame", "warped"] = "warped"
+    reference: Literal["first_frame", "warped", "concatenated", "none"] = "warped"
     """first_frame: the dense reference replaces frame 0 of the colour condition (published); warped: the condition
-    builder has already warped recorded images into every frame."""
+    builder has already warped recorded images into every frame; concatenated: four more planes hold its latent in every
+    frame; none: it is not used."""
     patch: int = 2
     """Latent cells per side of one network cell."""
     widths: tuple[int, ...] = (64, 128, 224)
@@ -182,6 +184,8 @@ class Sample:
     semantics: Tensor | None
     confidence: Tensor
     latents: dict[Modality, Tensor] = field(repr=False)
+    depth_fits: tuple[DepthFit, ...] = ()
+    """One per frame: how depth was brought to the measured scale; empty if that was not asked for."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +222,8 @@ class MDM(nn.Module):
         self.gates = (
             (2 if config.copy_condition else 0) + (1 if config.backdrop else 0) + (1 if config.given_classes else 0)
         )
-        planes = noisy + 8 + (4 if config.backdrop else 0) + masks + (CLASSES + 1 if config.given_classes else 0)
+        concatenated = 4 if config.reference == "concatenated" else 0
+        planes = noisy + 8 + (4 if config.backdrop else 0) + masks + concatenated + (CLASSES + 1 if config.given_classes else 0)
         self.net = UNet(config, planes, noisy + self.gates).to(memory_format=torch.channels_last)
         self.refiner: Refiner | None = None
         if config.refine_widths:
@@ -273,6 +278,8 @@ class MDM(nn.Module):
             *([] if far is None else [far]),
             *(functional.pixel_unshuffle(m, factor) for m in masks),
         ]
+        if self.config.reference == "concatenated":
+            planes.append(self.codec.encode_rgb(reference)[:, None].expand(-1, color.shape[1], -1, -1, -1))
         pool = lambda m: functional.avg_pool2d(m.flatten(0, 1), factor).unflatten(0, m.shape[:2])  # noqa: E731
         seen: dict[Modality, Tensor] = {"rgb": pool(torch.maximum(valid, warped)), "depth": pool(valid)}
         if self.config.given_classes:
@@ -439,6 +446,7 @@ class MDM(nn.Module):
         known: Mapping[Modality, Tensor] | None = None,
         start: Mapping[Modality, Tensor] | None = None,
         strength: float = 1.0,
+        align: bool = True,
         bf16: bool = False,
     ) -> Sample:
         """Generate one clip.
@@ -451,6 +459,7 @@ class MDM(nn.Module):
         start       latents [T,C,h,w] of all modalities to start from instead of pure noise, for example of the condition
                     (`condition_latents`) or of a render; `strength` in (0, 1] is the share of the schedule that is run
         n_samples   > 1: the first sample is returned, the spread of all lowers the confidence
+        align       bring each frame's depth to the measured scale first (`core.align`)
         bf16        run the network in bfloat16
 
         Measured depth (`condition.valid`) replaces generated depth; sky is set to the codec's far distance. See
@@ -487,11 +496,16 @@ class MDM(nn.Module):
                 if n_samples > 1:
                     confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
         depth, ids = decoded.depth, decoded.semantics
+        fits: list[DepthFit] = []
         if depth is not None:
+            if align:
+                depth, fits = align_depth(depth, condition.depth, condition.valid)
             confidence = confidence * depth_agreement(depth, condition)
             depth = settle_depth(depth, condition, ids, self.config.codec.far_m)
         wanted = lambda m, x: x if m in modalities else None  # noqa: E731
-        return Sample(wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents)
+        return Sample(
+            wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents, tuple(fits)
+        )
 
     def _decode_refined(self, latents: dict[Modality, Tensor], given: ConditionPixels) -> tuple[Decoded, Tensor]:
         """Pixels of one clip through the refiner, and the expected error of the colour f32[T,1,H,W] in [0,1]."""

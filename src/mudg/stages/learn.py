@@ -59,9 +59,9 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     with _making_clips(config, clips):
         if before is None:
             _train_codec(model, config, directory, clips, bf16)
-            _draw_weights(model.net, config.seed, "weights")
+            draw_weights(model.net, config.seed, "weights")
         if model.refiner is not None and (before is None or before.refiner is None):
-            _draw_weights(model.refiner, config.seed, "refiner weights")
+            draw_weights(model.refiner, config.seed, "refiner weights")
             model.refiner.reset()
         model.codec.requires_grad_(False)
         _train_network(model, config, directory, clips, bf16)
@@ -191,7 +191,7 @@ def _train_codec(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder:
         _load_moments(optimizer, saved.tensors("optimizer"))
         start = saved.step
     else:
-        _draw_weights(codec, config.seed, "codec weights")
+        draw_weights(codec, config.seed, "codec weights")
         first = [draw_batch(config, folder, n, 8, 1, "codec fit") for n in range(config.codec_fit_batches)]
         codec.fit_colour(torch.cat([b.rgb.flatten(0, 1) for b in first]))
         codec.fit_depth(torch.cat([b.depth.flatten(0, 1) for b in first]))
@@ -380,7 +380,7 @@ def _look(
     log.info(f"step {step}\n{learn_score.table(scores)}")
 
 
-def _draw_weights(net: torch.nn.Module, seed: int, purpose: str) -> None:
+def draw_weights(net: torch.nn.Module, seed: int, purpose: str) -> None:
     """Draw all weights that are not zero at the start from the run's seed (the constructor's own draw is not used)."""
     generator = seeds.torch_generator(seed, 0, purpose)
     with torch.no_grad():
