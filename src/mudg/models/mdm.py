@@ -86,6 +86,8 @@ class MDMConfig:
     refine_blocks: tuple[int, ...] = (2, 3)
     window: int = 8
     """Frames per clip the model was made for; other numbers work, only this one is tested."""
+    area_px: int = 192 * 128
+    """Pixels per frame that the model was trained at."""
     shared_noise: float = 0.3
     """Share of the noise variance common to all frames, in training and sampling."""
 
@@ -618,7 +620,9 @@ def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, 
 # files ----------------------------------------------------------------------------------------------------------------
 
 MODEL_FILE = "model.json"
-EMBEDDED = Path(__file__).resolve().parent.parent / "assets" / "mdm_small"
+_ASSETS = Path(__file__).resolve().parent.parent / "assets"
+EMBEDDED: dict[str, Path] = {"embedded": _ASSETS / "mdm_small", "embedded-tiny": _ASSETS / "mdm_tiny"}
+"""Models that come with the package, by the names that stand for their folders."""
 PART_BYTES = 15 * 1024 * 1024
 """Weights are split into files of at most this size."""
 
@@ -645,14 +649,19 @@ def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
     )
 
 
+def folder_of(path: Path | str) -> Path:
+    """The folder that a name of `EMBEDDED` stands for; any other text is a folder itself."""
+    return EMBEDDED.get(str(path), Path(path))
+
+
 def load(path: Path | str = "embedded") -> MDM:
-    """Read a model folder written by `save`; "embedded" is the one shipped with the package.
+    """Read a model folder written by `save`; the names of `EMBEDDED` stand for those shipped with the package.
 
     Raises:
         InputError: no model there, other fields or other weights than the configuration implies.
         IntegrityError: a weight file does not match its recorded hash.
     """
-    folder = EMBEDDED if str(path) == "embedded" else Path(path)
+    folder = folder_of(path)
     where = folder / MODEL_FILE
     if not where.is_file():
         raise InputError("no diffusion model here", where=str(folder), expected=f"a file {MODEL_FILE}")
@@ -683,9 +692,9 @@ def grown(before: MDM, config: MDMConfig) -> MDM:
     if `before` has one of the same shape. For continuing the training of an earlier, plainer model.
 
     Raises:
-        UsageError: the two differ in more than `given_classes` and the refiner.
+        UsageError: the two differ in more than `given_classes`, the refiner and the size trained at.
     """
-    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
+    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": (), "area_px": 0}
     if dataclasses.replace(before.config, **plain) != dataclasses.replace(config, **plain):
         raise UsageError(
             "the model to continue from is of another kind", expected=str(config), got=str(before.config),
@@ -705,13 +714,13 @@ def grown(before: MDM, config: MDMConfig) -> MDM:
 
 def facts(path: Path | str) -> dict[str, Any]:
     """The facts (recipe, scores) that `save` was given for a model folder or "embedded"."""
-    content = store.read_json((EMBEDDED if str(path) == "embedded" else Path(path)) / MODEL_FILE)
+    content = store.read_json(folder_of(path) / MODEL_FILE)
     return dict(content.get("facts", {}))
 
 
 def digest(path: Path | str) -> str:
     """Digest of a model's description, which holds the hashes of its weights."""
-    return store.digest((EMBEDDED if str(path) == "embedded" else Path(path)) / MODEL_FILE)
+    return store.digest(folder_of(path) / MODEL_FILE)
 
 
 def truth_shares(semantics: Tensor) -> Tensor:

@@ -143,7 +143,7 @@ class BenchConfig:
     """Measure the diffusion model on generated cities that it was never trained on, against exact truth."""
 
     model: str = "embedded"
-    """The model shipped with the package, or the folder of one made by learn."""
+    """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
     cities: Literal["reported", "development"] = "reported"
     """reported: the list on which nothing is chosen. development: the list to look at while choosing."""
     count: int = Field(default=6, ge=1, le=6)
@@ -170,7 +170,7 @@ class SynthesizeConfig:
     shifts_m: tuple[float, ...] = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
     """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded path."""
     model: str = "embedded"
-    """The model shipped with the package, or the folder of one made by learn."""
+    """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
     steps: int = Field(default=4, ge=1, le=1000)
     """Denoising steps. More give more texture, and less agreement with the truth pixel by pixel."""
     sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"

@@ -85,6 +85,7 @@ def model_config(config: LearnConfig) -> MDMConfig:
         temporal_attention=config.temporal_attention,
         patch=config.patch,
         window=config.window,
+        area_px=config.width * config.height,
         refine_widths=config.refine_widths,
         refine_blocks=config.refine_blocks if config.refine_widths else (),
     )

@@ -223,7 +223,7 @@ def make_trajectory(job: Job) -> int:
     if (folder / "observations.json").is_file():
         return len(path)
     camera = path.views[0].camera
-    area = TRAINED_AREA
+    area = model.config.area_px
     width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
     fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine)
@@ -269,10 +269,6 @@ def make_trajectory(job: Job) -> int:
 
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
-
-
-TRAINED_AREA = 128 * 192
-"""Pixels per frame that the embedded model was trained at."""
 
 
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
