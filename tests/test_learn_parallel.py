@@ -155,7 +155,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips, kind):
             blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), refine_widths=(), refine_blocks=(),
         )  # fmt: skip
     model = mdm.MDM(config)
-    learn._draw_weights(model.net, 0, "weights")
+    learn.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
     weights = learn_clips.class_weights(clips, 2, 0.5)
 

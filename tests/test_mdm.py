@@ -260,13 +260,14 @@ def test_measured_depth_is_taken_and_sky_is_far():
     assert bool((settled[~seen] == 100.0).all())
 
 
-def test_the_shipped_model_loads():
-    model = mdm.load("embedded")
+@pytest.mark.parametrize("name", sorted(mdm.EMBEDDED))
+def test_the_shipped_models_load(name):
+    model = mdm.load(name)
     assert model.config.window == 8
-    files = list(mdm.EMBEDDED.glob("*.safetensors"))
+    files = list(mdm.EMBEDDED[name].glob("*.safetensors"))
     assert all(f.stat().st_size < 16 * 1024 * 1024 for f in files)
-    assert sum(f.stat().st_size for f in files) < 40 * 1024 * 1024
-    assert mdm.facts("embedded")["held_out"]["clips"] == 24
+    assert sum(f.stat().st_size for f in files) < (8 if "tiny" in name else 40) * 1024 * 1024
+    assert mdm.facts(name)["held_out"]["clips"] == 24
 
 
 def test_a_start_from_the_condition_keeps_more_of_it_the_less_is_run():

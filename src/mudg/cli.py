@@ -91,6 +91,13 @@ def _name_and_folder(item: str) -> tuple[str, Path]:
     return name, Path(folder)
 
 
+def _bench(args: f.Bench) -> dict[str, Any]:
+    from mudg.stages import bench
+
+    made = bench.run(args.name, args.settings, args.out, overwrite=args.overwrite)
+    return {"bench": made / "bench.json", "text": (made / "bench.md").read_text(encoding="utf-8")}
+
+
 def _run(args: f.Run) -> dict[str, Any]:
     from mudg.stages import run
 
@@ -177,11 +184,17 @@ VERBS: dict[str, Verb] = {
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
         _score,
     ),
+    "bench": Verb(
+        "Measurements against exact truth: mdm, mdm-ablation.",
+        ("mudg bench mdm --out runs/bench", "mudg bench mdm-ablation --out runs/ablation"),
+        _bench,
+    ),
 }  # fmt: skip
 
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("the steps, one by one", ("ingest", "annotate", "fuse", "learn", "synthesize", "fit", "render", "score")),
+    ("measure", ("bench",)),
 )
 
 

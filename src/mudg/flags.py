@@ -158,6 +158,15 @@ class Demo(Output):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Bench(Output):
+    """Flags of ``mudg bench``."""
+
+    name: Positional[str]
+    """mdm or mdm-ablation."""
+    settings: Annotated[stage_config.BenchConfig, arg(name="")] = stage_config.BenchConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
     """Flags of ``mudg doctor``."""
 
@@ -168,6 +177,7 @@ class Doctor(Common):
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
     "synthesize": Synthesize, "fit": Fit, "render": Render, "score": Score,
+    "bench": Bench,
 }  # fmt: skip
 
 

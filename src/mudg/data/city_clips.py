@@ -11,6 +11,7 @@ of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of th
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,11 @@ from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
 HELD_OUT = 1_000_000
 """City numbers from here on are for scoring: standard rig, all cameras, shifts of exactly 2, 3 and 4 m, whatever the seed."""
 
+DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
+"""Cities to look at while choosing; also what `learn` watches."""
+REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
+"""Cities whose scores are reported and on which nothing is chosen."""
+
 FRAMES = 12
 FIRST = 2
 """Clips start at this frame of the log, so that it reaches a little beyond them at both ends."""
@@ -46,6 +52,8 @@ class CityClipRules:
     clips: int = 4
     fine: int = 2
     """Recorded images are this many times larger than the clips; their colours are gathered at that size."""
+    point_colors: bool = False
+    """Also keep the colours of the nearest points, without images, in training clips (clips for scoring always do)."""
 
 
 @dataclass(frozen=True)
@@ -94,19 +102,19 @@ def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
     return tuple([*shifted, 0.0][-rules.clips :]) if rules.clips > 1 else (shifted[0],)
 
 
-def make_log(rules: CityClipRules, city: int) -> CityLog:
-    """Generate, record and fuse one city."""
-    config = city_config(rules, city)
+def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
+    """Generate, record and fuse one city; `frames` long."""
+    config = dataclasses.replace(city_config(rules, city), n_frames=frames)
     rng = seeds.numpy_rng(rules.seed, city, "log")
     world = CityWorld(config)
     truths: dict[str, list[CityTruth]] = {
         name: [world.render(view, sensor_noise=True) for view in world.frame_views(name)] for name in config.cameras
     }
-    used = range(FRAMES)
+    used: Sequence[int] = range(frames)
     jitter_m, jitter_rad = 0.0, 0.0
     if city < HELD_OUT:
         if rng.random() < 0.35:
-            used = sorted(rng.choice(FRAMES, int(rng.integers(4, FRAMES)), replace=False).tolist())
+            used = sorted(rng.choice(frames, int(rng.integers(4, frames)), replace=False).tolist())
         if rng.random() < 0.4:
             jitter_m, jitter_rad = float(rng.uniform(0, 0.05)), float(np.deg2rad(rng.uniform(0, 0.15)))
     sweeps = []
@@ -187,7 +195,7 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     log = make_log(rules, city)
     clips, shifts = make_clips(rules, city, log)
     points = None
-    if city >= HELD_OUT:
+    if city >= HELD_OUT or rules.point_colors:
         plain = ConditionRules(rules.width, rules.height, warp=False)
         tracks = log.world.tracks()
         points = [build_condition(log.cloud, tracks, c.condition.views, (), plain).color for c in clips]

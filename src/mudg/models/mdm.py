@@ -29,6 +29,7 @@ from mudg.base import palette, seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Condition
 from mudg.core import noise
+from mudg.core.align import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
 from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares
 from mudg.models.unet import TemporalAttention, UNet
@@ -66,9 +67,10 @@ class MDMConfig:
     """Four more input channels: a recorded image carried over as if far away; it can be copied like the condition."""
     mask_planes: Literal["none", "valid", "valid_image"] = "valid_image"
     """Extra input planes: none (12 channels, published), where points were seen, and where a recorded image was warped."""
-    reference: Literal["first_frame", "warped"] = "warped"
+    reference: Literal["first_frame", "warped", "concatenated", "none"] = "warped"
     """first_frame: the dense reference replaces frame 0 of the colour condition (published); warped: the condition
-    builder has already warped recorded images into every frame."""
+    builder has already warped recorded images into every frame; concatenated: four more planes hold its latent in every
+    frame; none: it is not used."""
     patch: int = 2
     """Latent cells per side of one network cell."""
     widths: tuple[int, ...] = (64, 128, 224)
@@ -84,6 +86,8 @@ class MDMConfig:
     refine_blocks: tuple[int, ...] = (2, 3)
     window: int = 8
     """Frames per clip the model was made for; other numbers work, only this one is tested."""
+    area_px: int = 192 * 128
+    """Pixels per frame that the model was trained at."""
     shared_noise: float = 0.3
     """Share of the noise variance common to all frames, in training and sampling."""
 
@@ -182,6 +186,8 @@ class Sample:
     semantics: Tensor | None
     confidence: Tensor
     latents: dict[Modality, Tensor] = field(repr=False)
+    depth_fits: tuple[DepthFit, ...] = ()
+    """One per frame: how depth was brought to the measured scale; empty if that was not asked for."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +224,8 @@ class MDM(nn.Module):
         self.gates = (
             (2 if config.copy_condition else 0) + (1 if config.backdrop else 0) + (1 if config.given_classes else 0)
         )
-        planes = noisy + 8 + (4 if config.backdrop else 0) + masks + (CLASSES + 1 if config.given_classes else 0)
+        concatenated = 4 if config.reference == "concatenated" else 0
+        planes = noisy + 8 + (4 if config.backdrop else 0) + masks + concatenated + (CLASSES + 1 if config.given_classes else 0)
         self.net = UNet(config, planes, noisy + self.gates).to(memory_format=torch.channels_last)
         self.refiner: Refiner | None = None
         if config.refine_widths:
@@ -273,6 +280,8 @@ class MDM(nn.Module):
             *([] if far is None else [far]),
             *(functional.pixel_unshuffle(m, factor) for m in masks),
         ]
+        if self.config.reference == "concatenated":
+            planes.append(self.codec.encode_rgb(reference)[:, None].expand(-1, color.shape[1], -1, -1, -1))
         pool = lambda m: functional.avg_pool2d(m.flatten(0, 1), factor).unflatten(0, m.shape[:2])  # noqa: E731
         seen: dict[Modality, Tensor] = {"rgb": pool(torch.maximum(valid, warped)), "depth": pool(valid)}
         if self.config.given_classes:
@@ -471,6 +480,7 @@ class MDM(nn.Module):
         known: Mapping[Modality, Tensor] | None = None,
         start: Mapping[Modality, Tensor] | None = None,
         strength: float = 1.0,
+        align: bool = True,
         bf16: bool = False,
     ) -> Sample:
         """Generate one clip.
@@ -483,6 +493,7 @@ class MDM(nn.Module):
         start       latents [T,C,h,w] of all modalities to start from instead of pure noise, for example of the condition
                     (`condition_latents`) or of a render; `strength` in (0, 1] is the share of the schedule that is run
         n_samples   > 1: the first sample is returned, the spread of all lowers the confidence
+        align       bring each frame's depth to the measured scale first (`core.align`)
         bf16        run the network in bfloat16
 
         Measured depth (`condition.valid`) replaces generated depth; sky is set to the codec's far distance. See
@@ -519,11 +530,16 @@ class MDM(nn.Module):
                 if n_samples > 1:
                     confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
         depth, ids = decoded.depth, decoded.semantics
+        fits: list[DepthFit] = []
         if depth is not None:
+            if align:
+                depth, fits = align_depth(depth, condition.depth, condition.valid)
             confidence = confidence * depth_agreement(depth, condition)
             depth = settle_depth(depth, condition, ids, self.config.codec.far_m)
         wanted = lambda m, x: x if m in modalities else None  # noqa: E731
-        return Sample(wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents)
+        return Sample(
+            wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents, tuple(fits)
+        )
 
     def _decode_refined(self, latents: dict[Modality, Tensor], given: ConditionPixels) -> tuple[Decoded, Tensor]:
         """Pixels of one clip through the refiner, and the expected error of the colour f32[T,1,H,W] in [0,1]."""
@@ -636,7 +652,9 @@ def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, 
 # files ----------------------------------------------------------------------------------------------------------------
 
 MODEL_FILE = "model.json"
-EMBEDDED = Path(__file__).resolve().parent.parent / "assets" / "mdm_small"
+_ASSETS = Path(__file__).resolve().parent.parent / "assets"
+EMBEDDED: dict[str, Path] = {"embedded": _ASSETS / "mdm_small", "embedded-tiny": _ASSETS / "mdm_tiny"}
+"""Models that come with the package, by the names that stand for their folders."""
 PART_BYTES = 15 * 1024 * 1024
 """Weights are split into files of at most this size."""
 
@@ -663,14 +681,19 @@ def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
     )
 
 
+def folder_of(path: Path | str) -> Path:
+    """The folder that a name of `EMBEDDED` stands for; any other text is a folder itself."""
+    return EMBEDDED.get(str(path), Path(path))
+
+
 def load(path: Path | str = "embedded") -> MDM:
-    """Read a model folder written by `save`; "embedded" is the one shipped with the package.
+    """Read a model folder written by `save`; the names of `EMBEDDED` stand for those shipped with the package.
 
     Raises:
         InputError: no model there, other fields or other weights than the configuration implies.
         IntegrityError: a weight file does not match its recorded hash.
     """
-    folder = EMBEDDED if str(path) == "embedded" else Path(path)
+    folder = folder_of(path)
     where = folder / MODEL_FILE
     if not where.is_file():
         raise InputError("no diffusion model here", where=str(folder), expected=f"a file {MODEL_FILE}")
@@ -701,9 +724,9 @@ def grown(before: MDM, config: MDMConfig) -> MDM:
     if `before` has one of the same shape. For continuing the training of an earlier, plainer model.
 
     Raises:
-        UsageError: the two differ in more than `given_classes` and the refiner.
+        UsageError: the two differ in more than `given_classes`, the refiner and the size trained at.
     """
-    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
+    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": (), "area_px": 0}
     if dataclasses.replace(before.config, **plain) != dataclasses.replace(config, **plain):
         raise UsageError(
             "the model to continue from is of another kind", expected=str(config), got=str(before.config),
@@ -723,13 +746,13 @@ def grown(before: MDM, config: MDMConfig) -> MDM:
 
 def facts(path: Path | str) -> dict[str, Any]:
     """The facts (recipe, scores) that `save` was given for a model folder or "embedded"."""
-    content = store.read_json((EMBEDDED if str(path) == "embedded" else Path(path)) / MODEL_FILE)
+    content = store.read_json(folder_of(path) / MODEL_FILE)
     return dict(content.get("facts", {}))
 
 
 def digest(path: Path | str) -> str:
     """Digest of a model's description, which holds the hashes of its weights."""
-    return store.digest((EMBEDDED if str(path) == "embedded" else Path(path)) / MODEL_FILE)
+    return store.digest(folder_of(path) / MODEL_FILE)
 
 
 def truth_shares(semantics: Tensor) -> Tensor:

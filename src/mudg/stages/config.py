@@ -180,6 +180,29 @@ class LearnConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class BenchConfig:
+    """Measure the diffusion model on generated cities that it was never trained on, against exact truth."""
+
+    model: str = "embedded"
+    """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
+    cities: Literal["reported", "development"] = "reported"
+    """reported: the list on which nothing is chosen. development: the list to look at while choosing."""
+    count: int = Field(default=6, ge=1, le=6)
+    """How many cities of the list; four clips each (2, 3, 4 m and the recorded path)."""
+    steps: tuple[int, ...] = (1, 4, 8)
+    """Denoising steps to compare."""
+    sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
+    eta: float = Field(default=1.0, ge=0, le=1)
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    threads: int = Field(default=1, ge=1)
+    seed: int = 0
+    ablation_steps: int = Field(default=1500, ge=1)
+    """mdm-ablation: training steps of each variant."""
+    ablation_cities: int = Field(default=40, ge=1)
+    """mdm-ablation: cities to train on."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class SynthesizeConfig:
     """Generate dense RGB, depth and semantics on shifted trajectories with the diffusion model."""
 
@@ -188,11 +211,22 @@ class SynthesizeConfig:
     shifts_m: tuple[float, ...] = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
     """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded path."""
     model: str = "embedded"
-    """The model shipped with the package, or the folder of one made by learn."""
+    """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
     steps: int = Field(default=4, ge=1, le=1000)
     """Denoising steps. More give more texture, and less agreement with the truth pixel by pixel."""
+    sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
+    """How the steps are taken. Each costs one pass of the network per step."""
     eta: float = Field(default=1.0, ge=0, le=1)
-    """Noise added between steps: 0 = deterministic sampler, 1 = ancestral."""
+    """Noise that ddim adds between steps: 0 = deterministic, 1 = ancestral."""
+    start: Literal["noise", "condition"] = "noise"
+    """condition: start from the condition with noise on it, and run only the share `strength` of the schedule."""
+    strength: float = Field(default=1.0, gt=0, le=1)
+    samples: int = Field(default=1, ge=1)
+    """Samples per clip; the first is kept, the spread of all lowers the confidence. Costs that many times the passes."""
+    given_classes: bool = True
+    """Let the classes of labelled points and recorded images into the condition, where the scene has labels."""
+    align_depth: bool = True
+    """Bring generated depth to the scale of the LiDAR points in the same view (scale and shift per frame)."""
     overlap: int = Field(default=2, ge=0)
     """Frames that a window of the model shares with the one before; they are kept, so that the video continues."""
     width_px: int = Field(default=0, ge=0)

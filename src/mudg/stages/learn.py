@@ -125,9 +125,9 @@ def _run(model: MDM, fresh: set[str], config: LearnConfig, directory: store.RunD
         if "codec" in fresh:
             ranks.leader_does(lambda: _train_codec(model, config, directory, clips, bf16))
             _take_codec(model, out, ranks)
-            _draw_weights(model.net, config.seed, "weights")
+            draw_weights(model.net, config.seed, "weights")
         if model.refiner is not None and "refiner" in fresh:
-            _draw_weights(model.refiner, config.seed, "refiner weights")
+            draw_weights(model.refiner, config.seed, "refiner weights")
             model.refiner.reset()
         model.codec.requires_grad_(False)
         with cached_latents(model.codec, out / "latents") if config.cache_latents else contextlib.nullcontext():
@@ -169,18 +169,28 @@ def starting_model(config: LearnConfig) -> tuple[MDM, set[str]]:
     before = mdm.load(config.start)
     if before.config.window != config.window:
         log.info(f"learn: clips of {config.window} frames; the model to continue from had {before.config.window}")
-        resized = MDM(dataclasses.replace(before.config, window=config.window))
-        resized.load_state_dict(before.state_dict())
-        before = resized
-    grows_refiner = bool(wanted.refine_widths) and before.refiner is None
-    if wanted == before.config:
-        return before, set()
-    same_kind = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
-    differs = dataclasses.replace(before.config, **same_kind) != dataclasses.replace(wanted, **same_kind)  # type: ignore[arg-type]
-    if differs and wanted == model_config(dataclasses.replace(LearnConfig(), window=before.config.window)):
+    now = {"window": config.window, "area_px": wanted.area_px}
+    resized = MDM(dataclasses.replace(before.config, **now))
+    resized.load_state_dict(before.state_dict())
+    if wanted != resized.config and not _is_kind_of(resized.config, wanted) and _says_nothing(config):
         log.info("learn: the network is that of the model to continue from")
-        return before, set()
-    return mdm.grown(before, wanted), {"refiner"} if grows_refiner else set()
+        wanted = resized.config
+    if wanted == resized.config:
+        return resized, set()
+    grows_refiner = bool(wanted.refine_widths) and before.refiner is None
+    return mdm.grown(resized, wanted), {"refiner"} if grows_refiner else set()
+
+
+def _is_kind_of(one: MDMConfig, other: MDMConfig) -> bool:
+    """Whether two networks differ at most in what `mdm.grown` can add."""
+    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
+    return dataclasses.replace(one, **plain) == dataclasses.replace(other, **plain)
+
+
+def _says_nothing(config: LearnConfig) -> bool:
+    """Whether the settings leave the network as it is by default."""
+    default = LearnConfig(window=config.window, width=config.width, height=config.height)
+    return model_config(config) == model_config(default)
 
 
 def with_weights(model: MDM, weights: dict[str, Tensor]) -> MDM:
@@ -200,6 +210,7 @@ def model_config(config: LearnConfig) -> MDMConfig:
         temporal_attention=config.temporal_attention,
         patch=config.patch,
         window=config.window,
+        area_px=config.width * config.height,
         refine_widths=config.refine_widths,
         refine_blocks=config.refine_blocks if config.refine_widths else (),
     )
@@ -219,7 +230,7 @@ def _train_codec(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder:
         _load_moments(optimizer, saved.tensors("optimizer"))
         start = saved.step
     else:
-        _draw_weights(codec, config.seed, "codec weights")
+        draw_weights(codec, config.seed, "codec weights")
         first = [draw_batch(config, folder, n, 8, 1, "codec fit") for n in range(config.codec_fit_batches)]
         codec.fit_colour(torch.cat([b.rgb.flatten(0, 1) for b in first]))
         codec.fit_depth(torch.cat([b.depth.flatten(0, 1) for b in first]))
@@ -479,7 +490,7 @@ def _look(shown: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, 
     log.info(f"step {step}\n{learn_score.table(scores)}")
 
 
-def _draw_weights(net: torch.nn.Module, seed: int, purpose: str) -> None:
+def draw_weights(net: torch.nn.Module, seed: int, purpose: str) -> None:
     """Draw all weights that are not zero at the start from the run's seed (the constructor's own draw is not used)."""
     generator = seeds.torch_generator(seed, 0, purpose)
     with torch.no_grad():

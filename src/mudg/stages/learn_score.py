@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,10 @@ from mudg.stages.config import LearnConfig
 SKY = palette.ID["sky"]
 SCORES = (
     ("psnr", "RGB PSNR dB"), ("psnr_seen", "- where seen"), ("psnr_unseen", "- unseen"), ("psnr_condition", "- of the condition"),
+    ("psnr_points", "- nearest point"), ("psnr_reference", "- points + one image"),
     ("ssim", "SSIM"), ("sharpness", "sharpness (1 = truth)"), ("abs_rel", "depth AbsRel"), ("delta1", "delta1"),
     ("abs_rel_nearest", "AbsRel nearest fill"), ("delta1_nearest", "delta1 nearest fill"), ("miou", "mIoU"), ("accuracy", "accuracy"),
+    ("flicker", "flicker (1 = truth)"),
     ("sky_near", "sky nearer 80 m"), ("edges_agree", "depth edges on class edges"), ("confidence_gap", "confidence AUC"),
 )  # fmt: skip
 
@@ -40,9 +43,15 @@ def score(
     seed: int,
     bf16: bool,
     eta: float = 1.0,
+    sampler: str = "ddim",
+    given_classes: bool = True,
+    prepare: Callable[[Batch], Batch] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
+
+    Without `given_classes` the condition's classes are withheld, as for a log without labels. `prepare` changes each batch
+    of one clip before it is used.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": steps}. Keys as in
     `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
@@ -54,8 +63,12 @@ def score(
         for clip in range(clip_shards.clips_in(folder, city)):
             frames = range(model.config.window)
             batch = clip_shards.read_batch(folder, [(city, clip, frames)])
+            batch = batch if prepare is None else prepare(batch)
+            if not given_classes:
+                unknown = torch.full_like(batch.ids, 255)
+                batch = dataclasses.replace(batch, ids=unknown, backdrop_ids=unknown)
             sample = model.sample(
-                condition_of(batch), steps=steps, seed=seed, index=city * 16 + clip, eta=eta, bf16=bf16
+                condition_of(batch), steps=steps, seed=seed, index=city * 16 + clip, sampler=sampler, eta=eta, bf16=bf16
             )
             shift = batch.shift_m[0]
             name = "recorded" if shift == 0 else f"{abs(shift):.0f} m"
@@ -95,32 +108,84 @@ def condition_of(batch: Batch, index: int = 0) -> Condition:
 def score_clip(batch: Batch, sample: Sample) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip (batch of one) and its class confusion i64[19,20]."""
     rgb, depth, ids = batch.rgb[0], batch.depth[0], batch.semantics[0]
+    depth = torch.where(batch.depth_known[0], depth, torch.full_like(depth, clip_shards.FAR_M))  # far depth does not count
     if sample.rgb is None or sample.depth is None or sample.semantics is None:
         raise ValueError("scoring needs all three modalities")
     seen = batch.valid[0] | batch.warped[0]
-    solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY) & batch.depth_known[0]
+    solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
     nearest = metrics.depth_errors(flat(batch.sparse_depth[0]), flat(depth), flat(solid))
     matrix = metrics.confusion(sample.semantics.flatten(0, 1), ids.flatten(0, 1))
     sky = (ids == SKY).unsqueeze(1)
     wrong = (sample.rgb - rgb).abs().mean(1, keepdim=True)
+    points = None if batch.point_color is None else batch.point_color[0]
+    one_image = rgb if points is None else torch.where(batch.valid[0], points, batch.backdrop[0])
     row = {
         "psnr": metrics.psnr(flat(sample.rgb), flat(rgb)),
         "psnr_seen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(seen)),
         "psnr_unseen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(~seen)),
         "psnr_condition": metrics.psnr(flat(batch.color[0]), flat(rgb)),
+        "psnr_points": math.nan if points is None else metrics.psnr(flat(points), flat(rgb)),
+        "psnr_reference": math.nan if points is None else metrics.psnr(flat(one_image), flat(rgb)),
         "ssim": float(np.mean([metrics.ssim(a, b) for a, b in zip(sample.rgb, rgb)])),
         "sharpness": _gradient(sample.rgb) / max(_gradient(rgb), 1e-6),
         "abs_rel": error.abs_rel,
         "delta1": error.delta1,
         "abs_rel_nearest": nearest.abs_rel,
         "delta1_nearest": nearest.delta1,
+        "flicker": flicker(sample.rgb, rgb, depth, ids, batch.world_from_cam[0], batch.intrinsics[0]),
         "sky_near": float((sample.depth[sky] < 80).float().mean()) if bool(sky.any()) else math.nan,
         "edges_agree": edges_agree(sample.depth, sample.semantics),
         "confidence_gap": _auc(sample.confidence.flatten(), wrong.flatten()),
     }
     return row, matrix
+
+
+MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"))
+
+
+def flicker(
+    made: Tensor, truth: Tensor, depth: Tensor, ids: Tensor, world_from_cam: Tensor, intrinsics: Tensor
+) -> float:
+    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as calm as the truth).
+
+    Arguments as for `changes`. NaN for one frame or without such pixels.
+    """
+    pairs = changes(made, truth, depth, ids, world_from_cam, intrinsics)
+    of_truth = sum(t for _, t in pairs)
+    return sum(m for m, _ in pairs) / of_truth if of_truth > 0 else math.nan
+
+
+def changes(
+    made: Tensor, truth: Tensor, depth: Tensor, ids: Tensor, world_from_cam: Tensor, intrinsics: Tensor
+) -> list[tuple[float, float]]:
+    """Summed absolute change of static surfaces between each frame and the next, in `made` and in `truth`.
+
+    made, truth f32[T,3,H,W]; depth f32[T,1,H,W] metres and ids i64[T,H,W] are true; world_from_cam f64[T,4,4]; intrinsics f64[T,4].
+    Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
+    there (bilinear), if the same surface is seen there (depths within 3 %).
+    """
+    height, width = truth.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    static = ~torch.isin(ids, torch.tensor(MOVABLE)) & (depth[:, 0] < 90.0)
+    pairs = []
+    for t in range(len(truth) - 1):
+        fx, fy, cx, cy = intrinsics[t].float()
+        z = depth[t, 0]
+        points = torch.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z, torch.ones_like(z)])
+        pose = (torch.linalg.inv(world_from_cam[t + 1]) @ world_from_cam[t]).float()
+        x, y, ahead, _ = torch.einsum("ij,jhw->ihw", pose, points)
+        fx, fy, cx, cy = intrinsics[t + 1].float()
+        there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[None]
+        look = lambda image, mode, grid=there: torch.nn.functional.grid_sample(  # noqa: E731
+            image[None], grid, mode=mode, align_corners=False)[0]  # fmt: skip
+        within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)
+        same = within & static[t] & ((look(depth[t + 1], "nearest")[0] / ahead - 1).abs() < 0.03)
+        pairs.append(
+            tuple(float((look(v[t + 1], "bilinear") - v[t]).abs().mean(0)[same].double().sum()) for v in (made, truth))
+        )
+    return pairs
 
 
 def edges_agree(depth: Tensor, semantics: Tensor) -> float:

@@ -17,7 +17,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ from mudg.core import trajectory
 from mudg.data.clips import ConditionRules, Recorded, Source, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter
-from mudg.data.scenefile import read_image, read_scene
+from mudg.data.scenefile import read_image, read_label, read_scene
 from mudg.models import mdm
 from mudg.models.mdm import MDM, Sample
 from mudg.models.vae import Modality
@@ -193,30 +193,46 @@ def model_size(width: int, height: int, multiple: int, area: int, width_px: int 
     return chosen
 
 
-def recorded_images(scene: Scene, held_out: bool) -> list[Recorded]:
-    """Recorded images that may be warped in, of all cameras."""
+def recorded_images(scene: Scene, held_out: bool, classes: bool) -> list[Recorded]:
+    """Recorded images that may be warped in, of all cameras, with their semantic labels if `classes`."""
     frames = scene.frames if held_out else scene.frames_in("train")
-    return [Recorded(frame.view, read_image(scene, frame)) for frame in frames]
+    return [
+        Recorded(
+            frame.view,
+            read_image(scene, frame),
+            read_label(scene, frame, "semantics") if classes and "semantics" in frame.labels else None,
+        )
+        for frame in frames
+    ]
+
+
+def without_classes(cloud: FusedCloud) -> FusedCloud:
+    """The cloud without its points' classes."""
+    bare = lambda points: replace(points, semantics=None)  # noqa: E731
+    return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()})
 
 
 def make_trajectory(job: Job) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one."""
     config = job.config
     scene, cloud = read_scene(job.scene), read_fused(job.fused)
+    cloud = cloud if config.given_classes else without_classes(cloud)
     model = mdm.load(config.model)
     path = trajectory_of(scene, job)
     folder = job.out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
     camera = path.views[0].camera
-    area = TRAINED_AREA
+    area = model.config.area_px
     width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
     fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine)
-    maker = ViewMaker(model, scene, cloud, recorded_images(scene, config.held_out_images), rules, config)
+    recorded = recorded_images(scene, config.held_out_images, config.given_classes)
+    maker = ViewMaker(model, scene, cloud, recorded, rules, config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
+    fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     sheet: list[np.ndarray] = []
     every = max(1, len(path) // 5)
     with ObservationWriter(folder, path.name, SOURCE) as writer:
@@ -229,23 +245,30 @@ def make_trajectory(job: Job) -> int:
             known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
             views = [path.views[i] for i in span]
             sample, condition, observations = maker.make(views, number, known)
-            for index, observation in zip(span, observations):
+            for place, (index, observation) in enumerate(zip(span, observations)):
                 if index >= done:
                     writer.add(observation)
+                if index >= done and sample.depth_fits:
+                    fit = sample.depth_fits[place]
+                    numbers = (fit.scale, fit.shift_m, fit.residual_before, fit.residual)
+                    fits[f"{index:06d}"] = [round(x, 5) if math.isfinite(x) else None for x in numbers]
                 if index >= done and index % every == 0:
                     sheet.append(_sheet_row(condition, sample, index - span.start))
             done, tail = span.stop, sample.latents
+            store.write_json(state / FITS, fits)
             store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
             (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
         if sheet:
             with store.atomic_path(folder / "overview.png") as temporary:
                 Image.fromarray(np.concatenate(sheet)).save(temporary)
+        if fits:
+            store.write_json(folder / FITS, fits)
         shutil.rmtree(state, ignore_errors=True)
     return len(path)
 
 
-TRAINED_AREA = 128 * 192
-"""Pixels per frame that the embedded model was trained at."""
+FITS = "depth_fits.json"
+"""Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
 
 
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
@@ -289,9 +312,12 @@ class ViewMaker:
             self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources
         )
         config = self._config
+        start = self._model.condition_latents(condition) if config.start == "condition" else None
         sample = self._model.sample(
-            condition, steps=config.steps, seed=config.seed, index=number, eta=config.eta, known=known, bf16=self._bf16
-        )
+            condition, steps=config.steps, seed=config.seed, index=number, sampler=config.sampler, eta=config.eta,
+            n_samples=config.samples, known=known, start=start, strength=config.strength, align=config.align_depth,
+            bf16=self._bf16,
+        )  # fmt: skip
         if sample.rgb is None or sample.depth is None or sample.semantics is None:
             raise InputError("the model does not produce all modalities", where=config.model)
         sky = (sample.semantics == mdm.SKY).unsqueeze(1) & ~condition.valid
@@ -314,7 +340,8 @@ def enlarge(
     """Colour, depth, classes and confidence of a sample at the size of the fine condition.
 
     Colour: see `add_detail`. Depth f32[T,1,h,w] (NaN = none): nearest pixel, then the fine measured depth where it is
-    within a tenth of that. Classes: nearest pixel. Confidence: bilinear.
+    within a tenth of that. Classes: nearest pixel, then the class that the fine condition has there if the sample has it in
+    that pixel or beside it. Confidence: bilinear.
     """
     if sample.rgb is None or sample.semantics is None:
         raise InputError("a sample without colour or classes cannot be enlarged", where="synthesize.enlarge")
@@ -324,8 +351,24 @@ def enlarge(
     close = fine.valid & ((fine.depth - big_depth).abs() < 0.1 * big_depth)
     big_depth = torch.where(close, fine.depth, big_depth)
     ids = functional.interpolate(sample.semantics.unsqueeze(1).float(), size=size, mode="nearest-exact")[:, 0].long()
+    if fine.semantics is not None:
+        ids = finer_classes(ids, sample.semantics, fine.semantics)
     trust = functional.interpolate(sample.confidence, size=size, mode="bilinear", align_corners=False)
     return rgb, big_depth, ids, trust
+
+
+def finer_classes(enlarged: Tensor, made: Tensor, given: Tensor) -> Tensor:
+    """Classes i64[T,H,W]: those of `given` u8[T,1,H,W] where `made` i64[T,h,w] has that class in the pixel or one beside it,
+    else `enlarged` i64[T,H,W]. The outline is the given one; what is there, the model has decided."""
+    size = enlarged.shape[-2:]
+    around = functional.pad(made.unsqueeze(1).float(), (1, 1, 1, 1), mode="replicate")
+    height, width = made.shape[-2:]
+    wanted, there = given.float(), torch.zeros_like(given, dtype=torch.bool)
+    for row in range(3):
+        for column in range(3):
+            beside = around[..., row : row + height, column : column + width]
+            there |= functional.interpolate(beside, size=size, mode="nearest-exact") == wanted
+    return torch.where(there[:, 0], given[:, 0].long(), enlarged)
 
 
 def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:

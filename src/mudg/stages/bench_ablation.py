@@ -1,0 +1,157 @@
+"""What of its condition the diffusion model lives on: the published ablation of conditions, on generated cities.
+
+Four small models are trained alike, on the same clips, draws and steps, with what the published system is given (projected
+points with nothing filled in, zeros where nothing was seen; one reference image), and differ in the condition only:
+
+reference only       the dense reference image as frame 0 of an otherwise empty colour condition; no points
+sparse only          points, no reference image
+concatenated         points; the reference as four further input channels of every frame
+frame 0              points; the reference takes the place of frame 0 of the colour condition (the published choice)
+
+and, for comparison, ours: points filled in, recorded images warped in, masks and given classes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mudg.base import log, seeds
+from mudg.data import city_clips, clip_shards
+from mudg.data.city_clips import CityClipRules
+from mudg.data.clip_shards import Batch
+from mudg.models import mdm
+from mudg.models.mdm import MDM, MDMConfig
+from mudg.stages import learn, learn_score
+from mudg.stages.config import BenchConfig, LearnConfig
+from mudg.stages.precision import choose_bf16
+
+WIDTH, HEIGHT = 96, 64
+_SMALL: dict[str, Any] = {"widths": (48, 96, 160), "blocks": (1, 1, 2), "patch": 2}
+_PUBLISHED: dict[str, Any] = {
+    **_SMALL, "copy_condition": False, "backdrop": False, "mask_planes": "none", "given_classes": False,
+    "refine_widths": (), "refine_blocks": (),
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A row of the table: the model's configuration and what its batches are made into."""
+
+    config: MDMConfig
+    prepare: Callable[[Batch], Batch]
+
+
+def points_only(batch: Batch) -> Batch:
+    """The published condition: colour and depth of the points, 0 where none was seen; no class, no warped image."""
+    if batch.point_color is None:
+        raise ValueError("the clips were made without point colours")
+    seen = batch.valid.float()
+    color, unknown = batch.point_color * seen, torch.full_like(batch.ids, 255)
+    return dataclasses.replace(
+        batch, color=color, sparse_depth=batch.sparse_depth * seen, warped=torch.zeros_like(batch.warped), backdrop=color,
+        ids=unknown, backdrop_ids=unknown,
+    )  # fmt: skip
+
+
+def nothing_seen(batch: Batch) -> Batch:
+    """As `points_only`, without the points."""
+    empty = points_only(batch)
+    zeros = torch.zeros_like(empty.color)
+    return dataclasses.replace(
+        empty, color=zeros, backdrop=zeros, sparse_depth=torch.zeros_like(empty.sparse_depth), valid=torch.zeros_like(empty.valid)
+    )
+
+
+VARIANTS: dict[str, Variant] = {
+    "reference only": Variant(MDMConfig(**_PUBLISHED, reference="first_frame"), nothing_seen),
+    "sparse only": Variant(MDMConfig(**_PUBLISHED, reference="none"), points_only),
+    "concatenated": Variant(MDMConfig(**_PUBLISHED, reference="concatenated"), points_only),
+    "frame 0": Variant(MDMConfig(**_PUBLISHED, reference="first_frame"), points_only),
+    "ours": Variant(MDMConfig(**_SMALL, refine_widths=(32, 64)), lambda batch: batch),
+}
+
+
+def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
+    """Train and score all variants; returns the numbers and a table."""
+    folder, cities = out / "clips", _cities(config)
+    training = _learn_config(config, folder)
+    rules = CityClipRules(WIDTH, HEIGHT, clips=4, seed=config.seed, point_colors=True)
+    missing = [c for c in [*cities, *range(config.ablation_cities)] if not clip_shards.shard_path(folder, c).is_file()]
+    for city in log.progress(missing, len(missing), "generating cities"):
+        city_clips.write_city(rules, city, folder)
+    bf16 = choose_bf16(config.precision)
+    rows: dict[str, Any] = {}
+    for name, variant in VARIANTS.items():
+        model = _trained(name, variant, training, bf16)
+        rows[name] = learn_score.score(
+            model, cities, folder, steps=4, seed=config.seed, bf16=bf16, prepare=variant.prepare,
+            picture=out / f"{name.replace(' ', '_')}.png",
+        )["average"]  # fmt: skip
+        log.info(f"{name}: PSNR {rows[name]['psnr']:.2f} dB, AbsRel {rows[name]['abs_rel']:.3f}, mIoU {rows[name]['miou']:.3f}")
+    return {"cities": cities, "training_steps": config.ablation_steps, "rows": rows}, _table(rows, config)
+
+
+def _cities(config: BenchConfig) -> list[int]:
+    listed = city_clips.REPORTED if config.cities == "reported" else city_clips.DEVELOPMENT
+    return list(listed[: config.count])
+
+
+def _learn_config(config: BenchConfig, folder: Path) -> LearnConfig:
+    return LearnConfig(
+        seed=config.seed, cities=config.ablation_cities, first_cities=config.ablation_cities, clips=str(folder), workers=0,
+        width=WIDTH, height=HEIGHT, steps=config.ablation_steps, lr=1e-3, full_window_share=0.2, reference_dropout=0.0,
+    )  # fmt: skip
+
+
+def _trained(name: str, variant: Variant, config: LearnConfig, bf16: bool) -> MDM:
+    """A model of the variant after the training steps; codec of the shipped model, weights drawn from the seed."""
+    model = MDM(variant.config)
+    model.codec.load_state_dict(mdm.load("embedded").codec.state_dict())
+    model.codec.requires_grad_(False)
+    learn.draw_weights(model.net, config.seed, "ablation weights")
+    if model.refiner is not None:
+        learn.draw_weights(model.refiner, config.seed, "ablation refiner weights")
+        model.refiner.reset()
+    trained = [p for n, p in model.named_parameters() if not n.startswith("codec.")]
+    optimizer = torch.optim.AdamW(trained, lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01)
+    with log.task(name, config.steps) as bar:
+        for step in range(config.steps):
+            optimizer.param_groups[0]["lr"] = learn.learning_rate(config, step)
+            frames = learn.frames_at(config, step)
+            count = max(1, config.batch_frames // frames)
+            batch = variant.prepare(learn.draw_batch(config, Path(config.clips), step, count, frames, "ablation batch"))
+            with torch.no_grad():
+                truth = model.encode_truth(batch.rgb, batch.depth, batch.semantics)
+                encoded = model.encode_planes(batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop,
+                                              batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
+                pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics)
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                losses = model.loss(truth, encoded, seeds.torch_generator(config.seed, step, "ablation noise"),
+                                    shares=mdm.truth_shares(batch.semantics), pixels=pixels)  # fmt: skip
+            optimizer.zero_grad(set_to_none=True)
+            losses.total.backward()
+            if not math.isfinite(float(torch.nn.utils.clip_grad_norm_(trained, 1.0))):
+                optimizer.zero_grad(set_to_none=True)  # a step that is lost alike in every repetition
+                log.warn(f"{name}: the gradient of step {step} is not finite, the step is left out")
+                continue
+            optimizer.step()
+            bar.update(f"loss {float(losses.total.detach()):.3f}")
+            bar.advance()
+    return model.eval()
+
+
+def _table(rows: dict[str, Any], config: BenchConfig) -> str:
+    lines = [
+        f"# Conditions compared: {config.ablation_steps} training steps each, {WIDTH}x{HEIGHT}, {config.count} held-out cities", "",
+        "| condition | PSNR dB | SSIM | AbsRel | delta1 | mIoU | flicker |", "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name, row in rows.items():
+        values = (("psnr", ".2f"), ("ssim", ".3f"), ("abs_rel", ".3f"), ("delta1", ".3f"), ("miou", ".3f"), ("flicker", ".2f"))
+        lines.append(f"| {name} | " + " | ".join(format(row.get(key, math.nan), how) for key, how in values) + " |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,107 @@
+"""Measurements of the diffusion model: flicker at known values, conditions of the ablation, the command end to end."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mudg.base.errors import UsageError
+from mudg.data import city_clips, clip_shards
+from mudg.models import mdm
+from mudg.models.mdm import MDM, MDMConfig
+from mudg.models.vae import CodecConfig
+from mudg.stages import bench, bench_ablation, learn_score
+from mudg.stages.config import BenchConfig
+
+SMALL = MDMConfig(
+    widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
+    embed_width=16, patch=2, codec=CodecConfig(decoder_width=8, decoder_blocks=1), refine_widths=(8, 16), refine_blocks=(1, 1),
+)  # fmt: skip
+
+
+def still_wall(frames=3, height=12, width=16):
+    """A wall 10 m ahead, camera moving 0.5 m sideways (so 1 pixel) per frame: its picture moves, its surface does not change."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = 0.5 * np.arange(frames)
+    lens = torch.tensor([[20.0, 20.0, width / 2, height / 2]] * frames, dtype=torch.float64)
+    row = torch.rand(1, 3, height, width + frames, generator=torch.Generator().manual_seed(0))
+    rgb = torch.cat([row[..., t : t + width] for t in range(frames)])
+    depth = torch.full((frames, 1, height, width), 10.0)
+    ids = torch.full((frames, height, width), 2)
+    return rgb, depth, ids, torch.from_numpy(poses), lens
+
+
+def test_a_moving_camera_alone_is_no_change():
+    rgb, depth, ids, poses, lens = still_wall()
+    blinking = rgb + torch.tensor([0.0, 0.1, 0.0]).view(3, 1, 1, 1)
+    for made, truth in learn_score.changes(blinking, rgb, depth, ids, poses, lens):
+        assert truth == pytest.approx(0.0, abs=1e-3)
+        assert made == pytest.approx(0.1 * 12 * 15, rel=1e-3)
+
+
+def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
+    rgb, depth, ids, poses, lens = still_wall()
+    noise = torch.randn(rgb.shape, generator=torch.Generator().manual_seed(1))
+    truth, made = rgb + 0.1 * noise, rgb + 0.3 * noise
+    assert learn_score.flicker(made, truth, depth, ids, poses, lens) == pytest.approx(3.0, rel=1e-3)
+    cars = torch.full_like(ids, 13)
+    assert math.isnan(learn_score.flicker(made, truth, depth, cars, poses, lens))
+    assert math.isnan(learn_score.flicker(made[:1], truth[:1], depth[:1], ids[:1], poses, lens))
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips")
+    rules = city_clips.CityClipRules(48, 32, 4, clips=2)
+    city_clips.write_city(rules, city_clips.DEVELOPMENT[0], folder)
+    return clip_shards.read_batch(folder, [(city_clips.DEVELOPMENT[0], 0, range(4))])
+
+
+def test_conditions_of_the_ablation(city):
+    points = bench_ablation.points_only(city)
+    assert torch.equal(points.color[points.valid.expand_as(points.color)], city.point_color[city.valid.expand_as(city.color)])
+    assert float(points.color[~points.valid.expand_as(points.color)].abs().max()) == 0
+    assert not bool(points.warped.any())
+    assert bool((points.ids == 255).all())
+    nothing = bench_ablation.nothing_seen(city)
+    assert float(nothing.color.abs().max()) == 0
+    assert not bool(nothing.valid.any())
+    assert torch.equal(nothing.reference, city.reference)
+
+
+def test_concatenated_reference_adds_its_latent_to_every_frame(city):
+    plain = MDMConfig(**{**SMALL.__dict__, "reference": "none"})
+    both = MDMConfig(**{**SMALL.__dict__, "reference": "concatenated"})
+    given = (city.color, city.sparse_depth, city.valid, city.warped, city.backdrop, city.reference, city.ids, city.backdrop_ids)
+    without, within = MDM(plain).encode_planes(*given).planes, MDM(both).encode_planes(*given).planes
+    assert within.shape[2] == without.shape[2] + 4
+    latent = MDM(both).codec.encode_rgb(city.reference)
+    places = [c for c in range(within.shape[2] - 3) if torch.equal(within[0, 0, c : c + 4], latent[0])]
+    assert len(places) == 1
+    assert torch.equal(within[0, -1, places[0] : places[0] + 4], latent[0])
+
+
+def test_reported_and_development_cities_differ():
+    assert not set(city_clips.REPORTED) & set(city_clips.DEVELOPMENT)
+    assert min(city_clips.REPORTED + city_clips.DEVELOPMENT) >= city_clips.HELD_OUT
+    rules = city_clips.CityClipRules()
+    for number in (city_clips.REPORTED[0], city_clips.DEVELOPMENT[0]):
+        assert city_clips.city_config(rules, number) == city_clips.city_config(replace(rules, seed=7), number)
+
+
+@pytest.mark.slow
+def test_the_command_measures_a_model(tmp_path):
+    mdm.save(MDM(SMALL), tmp_path / "model", "card", {})
+    config = BenchConfig(model=str(tmp_path / "model"), cities="development", count=1, steps=(1,), precision="float32")
+    out = bench.run("mdm", config, tmp_path / "out")
+    content = json.loads((out / "bench.json").read_text())
+    assert [row["given_classes"] for row in content["rows"]] == [True, False]
+    average = content["rows"][0]["scores"]["average"]
+    assert {"psnr", "psnr_points", "psnr_reference", "flicker", "miou"} <= set(average)
+    assert content["seam"]["seams"] == [7, 13, 19]
+    assert "Seam" in (out / "bench.md").read_text()
+    with pytest.raises(UsageError, match="measurement"):
+        bench.run("nothing", config, tmp_path / "other")
