@@ -20,8 +20,8 @@ from mudg.stages import learn, learn_clips, learn_parallel
 from mudg.stages.learn_parallel import Ranks
 from mudg.stages.learn_state import RowFiles, TrainingState
 
-SAME = 1e-5
-"""Relative. Sums in another order; measured after 6 steps: 3e-7 for 1 -> 2 ddp -> 2 fsdp -> 1."""
+SAME = 2e-6
+"""Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows it)."""
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
 

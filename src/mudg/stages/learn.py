@@ -195,9 +195,9 @@ def _says_nothing(config: LearnConfig) -> bool:
 
 def with_weights(model: MDM, weights: dict[str, Tensor]) -> MDM:
     """A copy of a model on the CPU, ready for use, whose trained part has these weights."""
-    made = MDM(model.config)
-    made.codec.load_state_dict(model.codec.state_dict())
-    made.trained_part().load_state_dict(weights)
+    made = type(model)(model.config)
+    frozen = {name: value for name, value in model.state_dict().items() if name not in weights}
+    made.load_state_dict({**frozen, **weights})
     return made.eval()
 
 
