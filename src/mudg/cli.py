@@ -157,8 +157,10 @@ VERBS: dict[str, Verb] = {
         _fuse,
     ),
     "learn": Verb(
-        "Train the small diffusion model on generated cities.",
-        ("mudg learn --out runs/mdm", "mudg learn --config recipe.yaml --out runs/mdm"),
+        "Train a diffusion model on generated cities, or go on with one on your own logs.",
+        ("mudg learn --out runs/mdm", "mudg learn --config recipe.yaml --out runs/mdm",
+         "mudg learn --scenes runs/kitti --start embedded --lr 1e-4 --steps 500 --out runs/tuned",
+         "torchrun --nproc-per-node 8 -m mudg learn --parallel fsdp --config recipe.yaml --out runs/mdm"),
         _learn,
     ),
     "synthesize": Verb(

@@ -6,8 +6,9 @@ named and skipped in favour of an older one.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,16 +50,34 @@ def save(
         tensors: group name -> (tensor name -> tensor); one safetensors file per group.
         state: JSON-serialisable facts.
     """
-    final = folder / f"{_PREFIX}{step:08d}"
-    with store.atomic_directory(final) as partial:
+    with writing(folder, step, state, keep) as partial:
         for name, group in tensors.items():
             store.write_safetensors(partial / f"{name}.safetensors", dict(group))
+    return _path(folder, step)
+
+
+@contextlib.contextmanager
+def writing(folder: Path, step: int, state: Mapping[str, Any], keep: int = 2) -> Iterator[Path]:
+    """Yield the temporary folder of checkpoint ``step``; on success it gets state and manifest and its name, and the
+    oldest ones go. Other processes may write into it too (``partial_path``)."""
+    final = _path(folder, step)
+    with store.atomic_directory(final) as partial:
+        yield partial
         store.write_json(partial / "state.json", {"step": step, "state": dict(state)})
         store.write_manifest(partial)
     older = sorted(p for p in folder.glob(f"{_PREFIX}*") if p.is_dir() and p != final and not p.name.endswith(".part"))
     for stale in older[: max(0, len(older) + 1 - max(2, keep))]:
         shutil.rmtree(stale)
-    return final
+
+
+def partial_path(folder: Path, step: int) -> Path:
+    """The temporary folder that ``writing`` yields."""
+    final = _path(folder, step)
+    return final.with_name(final.name + ".part")
+
+
+def _path(folder: Path, step: int) -> Path:
+    return folder / f"{_PREFIX}{step:08d}"
 
 
 def latest(folder: Path) -> Checkpoint | None:

@@ -3,7 +3,8 @@
 A shard is a safetensors file with, for K clips of T frames,
 
     rgb u8[K,T,3,H,W]  depth f16[K,T,H,W] metres (codes beyond 1000 m and sky as 1000)  semantics u8[K,T,H,W]
-    color u8[K,T,3,H,W]  sparse_depth f16[K,T,H,W]  flags u8[K,T,H,W] (1 = a point was seen, 2 = colour warped)
+    color u8[K,T,3,H,W]  sparse_depth f16[K,T,H,W]  flags u8[K,T,H,W] (1 = a point was seen, 2 = colour warped, 4 = depth
+        is not true, it only fills a gap; clips of recorded logs)
     backdrop u8[K,T,3,H,W]  reference u8[K,3,H,W]  shift_m f32[K]
     ids, backdrop_ids u8[K,T,H,W]: classes that came with color and backdrop, 255 = unknown
     world_from_cam f64[K,T,4,4]  intrinsics f64[K,T,4] (fx, fy, cx, cy)
@@ -29,7 +30,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Clip
 
 FAR_M = 1000.0
-FLAG_VALID, FLAG_WARPED = 1, 2
+FLAG_VALID, FLAG_WARPED, FLAG_DEPTH_UNKNOWN = 1, 2, 4
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,8 @@ class Batch:
 
     rgb, color, backdrop f32[B,T,3,H,W] in [0,1]; depth, sparse_depth f32[B,T,1,H,W] metres; valid, warped bool[B,T,1,H,W];
     semantics i64[B,T,H,W]; reference f32[B,3,H,W]; ids, backdrop_ids u8[B,T,1,H,W] (255 = unknown); world_from_cam
-    f64[B,T,4,4]; intrinsics f64[B,T,4]; shift_m: lateral shift of each clip; point_color f32[B,T,3,H,W] or None.
+    f64[B,T,4,4]; intrinsics f64[B,T,4]; shift_m: lateral shift of each clip; point_color f32[B,T,3,H,W] or None;
+    depth_known bool[B,T,1,H,W]: where `depth` is true (all of it in generated cities).
     """
 
     rgb: Tensor
@@ -55,7 +57,13 @@ class Batch:
     world_from_cam: Tensor
     intrinsics: Tensor
     shift_m: tuple[float, ...]
+    depth_known: Tensor
     point_color: Tensor | None = None
+
+    def to(self, device: torch.device) -> Batch:
+        """The same batch on a device."""
+        moved = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Batch(**{k: v.to(device) if isinstance(v, Tensor) else v for k, v in moved.items()})
 
 
 def shard_path(folder: Path, city: int) -> Path:
@@ -64,22 +72,28 @@ def shard_path(folder: Path, city: int) -> Path:
 
 
 def pack_clips(
-    clips: Sequence[Clip], shifts_m: Sequence[float], point_color: Sequence[Tensor] | None = None
+    clips: Sequence[Clip], shifts_m: Sequence[float], point_color: Sequence[Tensor] | None = None, *, gaps: bool = False
 ) -> dict[str, NDArray[np.generic]]:
-    """Arrays of a shard from clips of one size; `point_color` f32[T,3,H,W] per clip is kept if given."""
+    """Arrays of a shard from clips of one size; `point_color` f32[T,3,H,W] per clip is kept if given.
+
+    Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is, and
+    marked as unknown.
+    """
 
     def u8(image: Tensor) -> NDArray[np.uint8]:
         return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
     def f16(depth: Tensor, known: Tensor | None = None) -> NDArray[np.float16]:
         far = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.full_like(depth, FAR_M))
-        far = far if known is None else torch.where(known, far, torch.full_like(far, FAR_M))
+        far = far if known is None or gaps else torch.where(known, far, torch.full_like(far, FAR_M))
         return far.clamp(max=FAR_M)[:, 0].numpy().astype(np.float16)
 
     def flags(clip: Clip) -> NDArray[np.uint8]:
         c = clip.condition
         warped = torch.zeros_like(c.valid) if c.warped is None else c.warped
-        return (c.valid * FLAG_VALID + warped * FLAG_WARPED)[:, 0].to(torch.uint8).numpy()
+        unknown = ~clip.depth_valid if gaps else torch.zeros_like(c.valid)
+        marks = c.valid * FLAG_VALID + warped * FLAG_WARPED + unknown * FLAG_DEPTH_UNKNOWN
+        return marks[:, 0].to(torch.uint8).numpy()
 
     def ids(clip: Clip, far: bool) -> NDArray[np.uint8]:
         c = clip.condition
@@ -165,8 +179,21 @@ def read_batch(folder: Path, picks: Sequence[tuple[int, int, Sequence[int]]]) ->
         world_from_cam=stacked["world_from_cam"],
         intrinsics=stacked["intrinsics"],
         shift_m=tuple(shifts),
+        depth_known=(flags & FLAG_DEPTH_UNKNOWN) == 0,
         point_color=stacked["point_color"].float() / 255 if len(columns.get("point_color", ())) == len(picks) else None,
     )
+
+
+def joined(batches: Sequence[Batch]) -> Batch:
+    """Several batches of the same size and number of frames as one."""
+    columns: dict[str, Any] = {}
+    for field in dataclasses.fields(Batch):
+        parts = [getattr(b, field.name) for b in batches]
+        if field.name == "shift_m":
+            columns[field.name] = tuple(s for part in parts for s in part)
+        else:
+            columns[field.name] = None if any(p is None for p in parts) else torch.cat(parts)
+    return Batch(**columns)
 
 
 def vary(batch: Batch, rng: np.random.Generator) -> Batch:
@@ -200,7 +227,7 @@ def vary(batch: Batch, rng: np.random.Generator) -> Batch:
         columns["ids"].append(ids)
         columns["backdrop_ids"].append(far_ids)
     turned = {name: torch.stack(parts) for name, parts in columns.items()}
-    for name in ("depth", "semantics", "sparse_depth", "valid", "warped"):
+    for name in ("depth", "semantics", "sparse_depth", "valid", "warped", "depth_known"):
         turned[name] = getattr(batch, name)
     if rng.random() >= 0.5:
         return dataclasses.replace(batch, **turned)  # type: ignore[arg-type]

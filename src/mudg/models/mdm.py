@@ -32,7 +32,7 @@ from mudg.core import noise
 from mudg.core.align import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
 from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares
-from mudg.models.unet import UNet
+from mudg.models.unet import TemporalAttention, UNet
 from mudg.models.vae import (
     CLASSES,
     MODALITIES,
@@ -347,6 +347,8 @@ class MDM(nn.Module):
         depth_known: Tensor | None = None,
         pixels: PixelTruth | None = None,
         window: tuple[slice, slice] | None = None,
+        first: int = 0,
+        whole: int = 0,
     ) -> Losses:
         """Denoising loss of a batch, steps and noise drawn from `generator`.
 
@@ -356,17 +358,20 @@ class MDM(nn.Module):
         depth_known  f32[B,T,1,h,w] share of the cell with true depth; None = everywhere
         pixels, window  truth at pixel resolution, and the rectangle of latent cells to train the refiner on (None = all);
                      its terms are added, and their gradient reaches the denoiser
+        first, whole  these clips are number `first` and following of a batch of `whole` clips (0 = of just these); what is
+                     drawn for a clip does not depend on how that batch is divided
 
         x0 head: squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a
         clip; cross-entropy for class shares. v head: squared error of v. Steps are stratified over the batch.
         """
-        batch = next(iter(truth.values())).shape[0]
-        t = noise.stratified_steps(batch, len(self.schedule), generator)
+        some = next(iter(truth.values()))
+        batch = len(some)
+        t = noise.stratified_steps(whole or batch, len(self.schedule), generator)[first : first + batch].to(some.device)
         weight = noise.loss_weight(self.schedule, t).view(-1, 1, 1, 1, 1)
         total: Tensor | float = 0.0
         terms: dict[str, float] = {}
         for names in self._drawn_passes(generator):
-            eps = {m: noise.video_noise(truth[m].shape, generator, self.config.shared_noise) for m in names}
+            eps = {m: self._clip_noise(truth[m], generator.initial_seed(), first, m) for m in names}
             x = {m: self.schedule.add_noise(truth[m], eps[m], t) for m in names}
             stated, log_shares = self.predict(x, encoded, t)
             for m in names:
@@ -376,7 +381,8 @@ class MDM(nn.Module):
                     weighted = shares if class_weights is None else shares * class_weights.view(-1, 1, 1)
                     part = -(weighted * log_shares).sum(2).mean()
                 elif self.config.head == "v":
-                    part = (stated[m] - self.schedule.velocity(truth[m], eps[m], t)).square().mean()
+                    error = (stated[m] - self.schedule.velocity(truth[m], eps[m], t)).square()
+                    part = (error if m != "depth" or depth_known is None else error * depth_known).mean()
                 elif m == "depth":
                     error = functional.huber_loss(stated[m], truth[m], reduction="none", delta=0.2) * 5.0
                     known = torch.ones_like(error[:, :, :1]) if depth_known is None else depth_known
@@ -392,6 +398,15 @@ class MDM(nn.Module):
         if not isinstance(total, Tensor):
             raise UsageError("nothing to train on", where="MDM.loss")
         return Losses(total, terms)
+
+    def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
+        """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""
+        shape = (1, *like.shape[1:])
+        draws = [
+            noise.video_noise(shape, seeds.torch_generator(seed, first + i, name), self.config.shared_noise)
+            for i in range(len(like))
+        ]
+        return torch.cat(draws).to(like.device)
 
     def _refiner_terms(
         self, stated: dict[Modality, Tensor], encoded: Encoded, truth: PixelTruth, window: tuple[slice, slice] | None,
@@ -411,10 +426,27 @@ class MDM(nn.Module):
             raise UsageError("this model has no refiner", where="MDM.refine")
         return self.refiner(self.codec, latents, given, frames)
 
-    def pixel_truth(self, rgb: Tensor, depth: Tensor, semantics: Tensor) -> PixelTruth:
-        """Truth for `loss`: rgb f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres, semantics i64[B,T,H,W]."""
+    def pixel_truth(
+        self, rgb: Tensor, depth: Tensor, semantics: Tensor, depth_known: Tensor | None = None
+    ) -> PixelTruth:
+        """Truth for `loss`: rgb f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres, semantics i64[B,T,H,W], and where the
+        depth is true, bool[B,T,1,H,W] (None = everywhere)."""
         code = self.codec.linear_depth_code(depth)
-        return PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), semantics.flatten(0, 1))
+        known = None if depth_known is None else depth_known.float().flatten(0, 1)
+        return PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), semantics.flatten(0, 1), known)
+
+    def trained_part(self) -> nn.ModuleDict:
+        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there is one, the refiner."""
+        return nn.ModuleDict({"net": self.net} | ({} if self.refiner is None else {"refiner": self.refiner}))
+
+    def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
+        """Names in `trained_part` of the parameters that mix frames: of the temporal attentions, or of `all` temporal layers.
+
+        This network has no temporal layers with parameters besides its attentions.
+        """
+        del which
+        kinds = {name for name, module in self.trained_part().named_modules() if isinstance(module, TemporalAttention)}
+        return {f"{owner}.{name}" for owner in kinds for name, _ in self.trained_part().get_submodule(owner).named_parameters()}
 
     def _drawn_passes(self, generator: torch.Generator) -> Sequence[tuple[Modality, ...]]:
         """Joint: the one pass. Separate: one modality per batch, colour half of the time, as published."""

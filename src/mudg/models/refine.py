@@ -163,16 +163,19 @@ class Refiner(nn.Module):
 
 @dataclass(frozen=True)
 class PixelTruth:
-    """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 = unlabelled)."""
+    """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 = unlabelled);
+    depth_known f32[N,1,H,W]: 1 where the depth is true, 0 where it only fills a gap (None = true everywhere)."""
 
     rgb: Tensor
     depth_code: Tensor
     ids: Tensor
+    depth_known: Tensor | None = None
 
     def crop(self, rows: slice, columns: slice) -> PixelTruth:
         """A rectangle of pixels."""
+        known = None if self.depth_known is None else self.depth_known[..., rows, columns]
         return PixelTruth(
-            self.rgb[..., rows, columns], self.depth_code[..., rows, columns], self.ids[..., rows, columns]
+            self.rgb[..., rows, columns], self.depth_code[..., rows, columns], self.ids[..., rows, columns], known
         )
 
 
@@ -181,21 +184,19 @@ def refine_loss(made: Refined, truth: PixelTruth, class_weights: Tensor | None =
 
     pixel_rgb        L1 + 2 x squared error + half of the L1 of gradients
     pixel_depth      10 x smooth L1 (beta 0.02) of the depth code
-    pixel_semantics  0.2 x cross-entropy, classes weighted
+    pixel_semantics  0.2 x cross-entropy, classes weighted, summed over labelled pixels and divided by the number of all
     pixel_error      0.05 x negative log-likelihood of the colour's absolute error under the stated scale (Laplace); it moves
                      the statement only, not the colour
+
+    Every term is a plain mean over pixels, so that the loss of a batch is the mean over its clips however it is divided.
     """
     error = made.rgb - truth.rgb
     across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
     rgb = error.abs().mean() + 2.0 * error.square().mean() + 0.5 * (across.abs().mean() + down.abs().mean())
-    depth = 10.0 * functional.smooth_l1_loss(made.depth_code, truth.depth_code, beta=0.02)
-    labelled = bool((truth.ids != UNKNOWN).any())
+    off = functional.smooth_l1_loss(made.depth_code, truth.depth_code, beta=0.02, reduction="none")
+    depth = 10.0 * (off if truth.depth_known is None else off * truth.depth_known).mean()
     weight = None if class_weights is None else class_weights.to(made.scores.dtype)
-    semantics = (
-        functional.cross_entropy(made.scores, truth.ids, weight, ignore_index=UNKNOWN)
-        if labelled
-        else made.scores.sum() * 0
-    )
+    semantics = functional.cross_entropy(made.scores, truth.ids, weight, ignore_index=UNKNOWN, reduction="none").mean()
     size = error.detach().abs().mean(1, keepdim=True)
     scale = made.log_error.clamp(-6.0, 1.0)
     likely = (size * torch.exp(-scale) + scale).mean()

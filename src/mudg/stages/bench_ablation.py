@@ -105,7 +105,7 @@ def _cities(config: BenchConfig) -> list[int]:
 def _learn_config(config: BenchConfig, folder: Path) -> LearnConfig:
     return LearnConfig(
         seed=config.seed, cities=config.ablation_cities, first_cities=config.ablation_cities, clips=str(folder), workers=0,
-        width=WIDTH, height=HEIGHT, steps=config.ablation_steps, lr=1e-3, full_window_share=0.2,
+        width=WIDTH, height=HEIGHT, steps=config.ablation_steps, lr=1e-3, full_window_share=0.2, reference_dropout=0.0,
     )  # fmt: skip
 
 

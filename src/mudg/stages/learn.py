@@ -1,79 +1,204 @@
-"""learn: train the small multi-modal diffusion model on generated cities.
+"""learn: train a multi-modal diffusion model on generated cities or recorded logs, on one process or many.
 
 Read from `run`: make the clips, fit and train the latent codec, train the denoising network, score, export. Both training
-loops are in full view in `_train_codec` and `_train_network`. Every draw is a function of (seed, step), so a run that was
-interrupted and continued equals one that was not, bit for bit at a fixed number of threads.
+loops are in full view in `_train_codec` and `_train_network`. Every draw is a function of (seed, step) and of a clip's place
+in the step's batch, so a run that was interrupted and continued equals one that was not: bit for bit at a fixed number of
+threads and processes, up to rounding if the number of processes or the layout changed meanwhile.
 
-OUT/clips/    one shard per city (or the folder `clips` of the configuration)
+OUT/clips/    one shard per city or clip of a log (or the folder `clips` of the configuration)
 OUT/codec/    checkpoints of the codec         OUT/steps/   checkpoints of the network, its moving average, the optimiser
-OUT/samples/  picture grids during training    OUT/loss.png, OUT/log.jsonl
+OUT/samples/  picture grids during training    OUT/loss.png, OUT/log.jsonl, OUT/metrics.json
 OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
+OUT/latents/  with `cache_latents`             OUT/tensorboard/  with `tensorboard`
+
+Clips are in `learn_clips`, processes and layouts in `learn_parallel`, checkpoints in `learn_state`.
 """
 
 from __future__ import annotations
 
-import concurrent.futures
+import contextlib
+import dataclasses
+import importlib.util
 import math
-import multiprocessing
 import time
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from mudg.base import checkpoint, log, seeds, store
 from mudg.base.config import to_dict
-from mudg.base.errors import NumericsError, ResourceError
-from mudg.data import city_clips, clip_shards
+from mudg.base.errors import ResourceError, UsageError
+from mudg.data import log_clips
 from mudg.data.clip_shards import Batch
+from mudg.data.log_clips import LogClipRules
 from mudg.models import mdm
-from mudg.models.mdm import MDM, MDMConfig
+from mudg.models.mdm import MDM, Losses, MDMConfig
 from mudg.models.vae import PatchCodec
-from mudg.stages import learn_score
+from mudg.stages import learn_clips, learn_parallel, learn_score
 from mudg.stages.config import LearnConfig
+from mudg.stages.learn_clips import class_weights, draw_batch
+from mudg.stages.learn_latents import cached_latents
+from mudg.stages.learn_parallel import Interruption, Ranks, Spread, agreed, joined
+from mudg.stages.learn_state import TrainingState, mean_of, newest
 from mudg.stages.precision import choose_bf16
 
-HELD_OUT = 1_000_000
-"""City numbers from here on are never trained on."""
+HOW = (
+    "parallel",
+    "accumulate",
+    "recompute",
+    "cache_latents",
+    "tensorboard",
+    "workers",
+    "device",
+    "checkpoint_every",
+    "log_every",
+)
+"""Settings that say how a run is computed and not what comes out; a run may be continued with other ones."""
 
 
 def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     """Train a model, from nothing or from an earlier one; returns the folder of the exported model (`OUT/model`).
 
+    Under `torchrun` every process calls this with the same arguments; `out` lies on a file system that all see.
+
     Raises:
-        NumericsError: a loss or gradient is not finite (names the term and the step; parameters are untouched).
-        ResourceError, UsageError: see `RunDir.open`.
+        NumericsError: a loss or gradient is not finite (names the term, the step and the process; parameters are untouched).
+        InputError: logs or clips that cannot be used. ResourceError, UsageError: see `RunDir.open`.
     """
-    before = mdm.load(config.start) if config.start else None
-    model = MDM(model_config(config)) if before is None else mdm.grown(before, model_config(config))
-    inputs = {"start": mdm.digest(config.start)} if config.start else {}
-    directory = store.RunDir.open(out, verb="learn", config=to_dict(config), inputs=inputs, overwrite=overwrite)
-    if directory.complete:
-        return directory.reused() / "model"
-    bf16 = choose_bf16(config.precision)
+    if config.cache_latents and config.augment:
+        raise UsageError("varied clips are never the same twice, so their latents cannot be kept", where="--cache-latents",
+                         remedy="add --no-augment")  # fmt: skip
+    if config.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        raise ResourceError("TensorBoard is not installed", where="--tensorboard",
+                            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
     torch.set_num_threads(config.threads)
+    with joined(config.device) as ranks:
+        model, fresh = starting_model(config)
+        directory = _open(config, out, overwrite, ranks)
+        if directory is None:
+            return out / "model"
+        try:
+            _run(model, fresh, config, directory, ranks)
+        except KeyboardInterrupt:
+            if ranks.leads:
+                directory.pause()
+            raise
+    return out / "model"
+
+
+def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> store.RunDir | None:
+    """The run's folder, locked by the leader; None if a finished result is there and was verified."""
+    opened: list[store.RunDir] = []
+    asked = {name: value for name, value in to_dict(config).items() if name not in HOW}
+
+    def open_it() -> bool:
+        inputs = {"start": mdm.digest(config.start)} if config.start else {}
+        for number, text in enumerate(config.scenes):
+            source = log_clips.log_source(text)
+            inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
+        opened.append(store.RunDir.open(out, verb="learn", config=asked, inputs=inputs, overwrite=overwrite))
+        if opened[0].complete:
+            opened[0].reused()
+        return opened[0].complete
+
+    if ranks.leader_does(open_it):
+        return None
+    return opened[0] if ranks.leads else store.RunDir(out, "learn", "", {}, complete=False)
+
+
+def _run(model: MDM, fresh: set[str], config: LearnConfig, directory: store.RunDir, ranks: Ranks) -> None:
+    out = directory.path
+    bf16 = choose_bf16(config.precision)
     clips = Path(config.clips) if config.clips else out / "clips"
-    with _making_clips(config, clips):
-        if before is None:
-            _train_codec(model, config, directory, clips, bf16)
+    rules: LogClipRules | None = None
+    asked = config
+    if config.scenes:
+        sources = [log_clips.log_source(text) for text in config.scenes]
+        rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple)
+        counts = ranks.leader_does(lambda: learn_clips.make_log_clips(asked, rules, clips))
+        config = learn_clips.for_logs(config, rules, *counts)
+    making = ranks.leads and not config.scenes
+    with learn_clips.MakingClips(config, clips) if making else contextlib.nullcontext():
+        if "codec" in fresh:
+            ranks.leader_does(lambda: _train_codec(model, config, directory, clips, bf16))
+            _take_codec(model, out, ranks)
             draw_weights(model.net, config.seed, "weights")
-        if model.refiner is not None and (before is None or before.refiner is None):
+        if model.refiner is not None and "refiner" in fresh:
             draw_weights(model.refiner, config.seed, "refiner weights")
             model.refiner.reset()
         model.codec.requires_grad_(False)
-        _train_network(model, config, directory, clips, bf16)
-    scores = learn_score.score(model, held_out(config), clips, steps=config.score_steps, seed=config.seed, bf16=bf16)
-    store.write_json(out / "metrics.json", scores)
-    facts = {"recipe": to_dict(config), "held_out": scores}
+        with cached_latents(model.codec, out / "latents") if config.cache_latents else contextlib.nullcontext():
+            weights = _train_network(model, config, directory, clips, bf16, ranks)
+    ranks.leader_does(lambda: _finish(model, weights, config, asked, directory, clips, bf16, rules))
+
+
+def _finish(
+    model: MDM, weights: dict[str, Tensor], config: LearnConfig, asked: LearnConfig, directory: store.RunDir, clips: Path,
+    bf16: bool, rules: LogClipRules | None,
+) -> None:  # fmt: skip
+    """Score and export what was trained."""
+    made = with_weights(model, weights)
+    shards = learn_clips.scored_shards(config)
+    scores = learn_score.score(made, shards, clips, steps=config.score_steps, seed=config.seed, bf16=bf16)
+    store.write_json(directory.path / "metrics.json", scores)
+    facts: dict[str, Any] = {"recipe": to_dict(asked), "held_out": scores}
     if config.start:
         facts["continued_from"] = mdm.facts(config.start)
-    mdm.save(model, out / "model", learn_score.model_card(model, config, scores), facts)
+    words = learn_clips.data_words(config, rules)
+    mdm.save(made, directory.path / "model", learn_score.model_card(made, config, scores, words), facts)
     directory.finish({"held_out": scores["average"]})
     log.info(learn_score.table(scores))
-    return out / "model"
+
+
+def starting_model(config: LearnConfig) -> tuple[MDM, set[str]]:
+    """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
+
+    With `start` the network is that of the earlier model, grown by a refiner and given classes where the settings ask for
+    them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
+    size and length than before.
+
+    Raises:
+        UsageError: the settings ask for another network than the earlier model has.
+    """
+    wanted = model_config(config)
+    if not config.start:
+        return MDM(wanted), {"codec", "refiner"}
+    before = mdm.load(config.start)
+    if before.config.window != config.window:
+        log.info(f"learn: clips of {config.window} frames; the model to continue from had {before.config.window}")
+    now = {"window": config.window, "area_px": wanted.area_px}
+    resized = MDM(dataclasses.replace(before.config, **now))
+    resized.load_state_dict(before.state_dict())
+    if wanted != resized.config and not _is_kind_of(resized.config, wanted) and _says_nothing(config):
+        log.info("learn: the network is that of the model to continue from")
+        wanted = resized.config
+    if wanted == resized.config:
+        return resized, set()
+    grows_refiner = bool(wanted.refine_widths) and before.refiner is None
+    return mdm.grown(resized, wanted), {"refiner"} if grows_refiner else set()
+
+
+def _is_kind_of(one: MDMConfig, other: MDMConfig) -> bool:
+    """Whether two networks differ at most in what `mdm.grown` can add."""
+    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
+    return dataclasses.replace(one, **plain) == dataclasses.replace(other, **plain)
+
+
+def _says_nothing(config: LearnConfig) -> bool:
+    """Whether the settings leave the network as it is by default."""
+    default = LearnConfig(window=config.window, width=config.width, height=config.height)
+    return model_config(config) == model_config(default)
+
+
+def with_weights(model: MDM, weights: dict[str, Tensor]) -> MDM:
+    """A copy of a model on the CPU, ready for use, whose trained part has these weights."""
+    made = type(model)(model.config)
+    frozen = {name: value for name, value in model.state_dict().items() if name not in weights}
+    made.load_state_dict({**frozen, **weights})
+    return made.eval()
 
 
 def model_config(config: LearnConfig) -> MDMConfig:
@@ -89,93 +214,6 @@ def model_config(config: LearnConfig) -> MDMConfig:
         refine_widths=config.refine_widths,
         refine_blocks=config.refine_blocks if config.refine_widths else (),
     )
-
-
-# clips ----------------------------------------------------------------------------------------------------------------
-
-
-def held_out(config: LearnConfig) -> list[int]:
-    """City numbers used for scoring only."""
-    return [HELD_OUT + n for n in range(config.held_out)]
-
-
-def cities_at(config: LearnConfig, step: int) -> int:
-    """How many cities training may draw from at `step`: `first_cities`, then linearly up to `cities` at half time.
-
-    A function of the step alone, so that clips can still be in the making while training runs and the draw stays the
-    same in every run.
-    """
-    share = min(1.0, step / max(1.0, config.all_cities_at * config.steps))
-    return min(config.cities, config.first_cities + int((config.cities - config.first_cities) * share))
-
-
-def clip_rules(config: LearnConfig) -> city_clips.CityClipRules:
-    """What the generator is asked for."""
-    return city_clips.CityClipRules(
-        width=config.width, height=config.height, window=config.window, seed=config.seed, clips=config.clips_per_city
-    )
-
-
-class _making_clips:
-    """Processes that make the missing clips, held-out cities first, while the block runs."""
-
-    def __init__(self, config: LearnConfig, folder: Path) -> None:
-        self._rules, self._folder = clip_rules(config), folder
-        wanted = [*held_out(config), *range(config.cities)]
-        self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
-        self._workers = config.workers
-        self._pool: concurrent.futures.ProcessPoolExecutor | None = None
-        self._futures: list[concurrent.futures.Future[int]] = []
-
-    def __enter__(self) -> None:
-        if not self._missing or self._workers == 0:
-            return
-        log.info(f"learn: {len(self._missing)} cities to generate into {self._folder}, {self._workers} processes")
-        context = multiprocessing.get_context("spawn")
-        self._pool = concurrent.futures.ProcessPoolExecutor(self._workers, mp_context=context)
-        self._futures = [self._pool.submit(city_clips.write_city, self._rules, n, self._folder) for n in self._missing]
-        for future in self._futures:
-            future.add_done_callback(_stop_all_on_error(self._futures))
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-        for future in self._futures:
-            if not future.cancelled() and future.exception() is not None:
-                raise future.exception()  # type: ignore[misc]
-
-
-def _stop_all_on_error(futures: list[concurrent.futures.Future[int]]):
-    def stop(done: concurrent.futures.Future[int]) -> None:
-        if not done.cancelled() and done.exception() is not None:
-            for other in futures:
-                other.cancel()
-
-    return stop
-
-
-def _await_shard(folder: Path, city: int, patience_s: float = 900.0) -> None:
-    """Wait until a shard is there (it is being made by another process)."""
-    path = clip_shards.shard_path(folder, city)
-    started = time.monotonic()
-    while not path.is_file():
-        if time.monotonic() - started > patience_s:
-            raise ResourceError("training clips are not arriving", where=str(path), expected=f"within {patience_s:.0f} s",
-                                remedy="look for an error of the generating processes above")  # fmt: skip
-        time.sleep(0.5)
-
-
-def draw_batch(config: LearnConfig, folder: Path, step: int, count: int, frames: int, purpose: str) -> Batch:
-    """The batch of a step: random cities, clips and runs of consecutive frames, varied (see `clip_shards.vary`)."""
-    rng = seeds.numpy_rng(config.seed, step, purpose)
-    picks = []
-    for _ in range(count):
-        city = int(rng.integers(cities_at(config, step)))
-        _await_shard(folder, city)
-        clip = int(rng.integers(clip_shards.clips_in(folder, city)))
-        start = int(rng.integers(config.window - frames + 1))
-        picks.append((city, clip, range(start, start + frames)))
-    return clip_shards.vary(clip_shards.read_batch(folder, picks), rng)
 
 
 # codec ----------------------------------------------------------------------------------------------------------------
@@ -204,20 +242,32 @@ def _train_codec(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder:
             batch = draw_batch(config, folder, step, config.codec_batch, 1, "codec batch")
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
                 loss, terms = codec_loss(codec, batch, seeds.torch_generator(config.seed, step, "codec noise"))
-            _check_finite(terms, step, "codec")
+            terms, _ = agreed(_ALONE, terms, 1, step, "codec")
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(codec.parameters(), 1.0)
             optimizer.step()
             recent.append(terms)
-            bar.update(" ".join(f"{k} {v:.4f}" for k, v in _mean(recent[-20:]).items()))
+            bar.update(" ".join(f"{k} {v:.4f}" for k, v in mean_of(recent[-20:]).items()))
             bar.advance()
             done = step + 1
             if done % 50 == 0 or done == config.codec_steps:
-                run_dir.log(codec_step=done, **_mean(recent))
+                run_dir.log(codec_step=done, **mean_of(recent))
                 recent = []
             if done % 200 == 0 or done == config.codec_steps:
                 checkpoint.save(out, done, {"codec": codec.state_dict(), "optimizer": _moments(optimizer)}, {})
+
+
+def _take_codec(model: MDM, out: Path, ranks: Ranks) -> None:
+    """The codec that the leader trained, in every process."""
+    saved = newest(out / "codec", ranks)
+    if saved is None:
+        raise ResourceError("the trained codec is not where the leader wrote it", where=str(out / "codec"),
+                            remedy="give an --out on a file system that all processes see")  # fmt: skip
+    model.codec.load_state_dict(saved.tensors("codec"))
+
+
+_ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
 def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -242,7 +292,7 @@ def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> t
     error = (out_rgb - (rgb * 2 - 1)) * keep[0]
     gradient = (error[..., 1:] - error[..., :-1]).abs().mean() + (error[..., 1:, :] - error[..., :-1, :]).abs().mean()
     part_rgb = error.abs().mean() + 0.5 * error.square().mean() + 0.25 * gradient
-    part_depth = ((out_depth - target) * keep[1]).abs().mean()
+    part_depth = ((out_depth - target) * keep[1] * batch.depth_known.flatten(0, 1)).abs().mean()
     ids = torch.where(keep[2, :, 0] > 0, ids, torch.full_like(ids, 255))
     part_semantics = (
         functional.cross_entropy(scores, ids, ignore_index=255) if bool((ids < 255).any()) else scores.sum() * 0
@@ -256,10 +306,10 @@ def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> t
 
 
 def learning_rate(config: LearnConfig, step: int) -> float:
-    """Linear warm-up, constant, then a linear fall to 2 % over the last `decay_share` of the steps."""
+    """Linear warm-up, constant, then a linear fall to `last_lr_share` over the last `decay_share` of the steps."""
     warm = min(1.0, (step + 1) / max(1, config.warmup_steps))
     left = (config.steps - step) / max(1.0, config.decay_share * config.steps)
-    return config.lr * warm * max(0.02, min(1.0, left))
+    return config.lr * warm * max(config.last_lr_share, min(1.0, left))
 
 
 def frames_at(config: LearnConfig, step: int) -> int:
@@ -268,67 +318,131 @@ def frames_at(config: LearnConfig, step: int) -> int:
     return config.window if late else max(1, config.window // 2)
 
 
-def _train_network(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool) -> None:
-    """Train denoiser and refiner; on return the model holds the moving average of the weights."""
-    net, out = trained_part(model), run_dir.path / "steps"
-    average = {k: v.detach().clone() for k, v in net.state_dict().items()}
-    optimizer = torch.optim.AdamW(net.parameters(), lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
-    saved = checkpoint.latest(out)
-    start = 0
+def freeze(model: MDM, what: str) -> int:
+    """Let a part of the network keep its weights (see `LearnConfig.frozen`); returns the number of parameters it has.
+
+    Raises:
+        UsageError: nothing would be frozen: the network has no such layers.
+    """
+    if what == "nothing":
+        return 0
+    names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
+    count = 0
+    for name, parameter in model.trained_part().named_parameters():
+        if name in names:
+            parameter.requires_grad_(False)
+            count += parameter.numel()
+    if not count:
+        raise UsageError(
+            "there is nothing to freeze", where="--frozen", got=what, expected="a network with such layers"
+        )
+    log.info(f"learn: {what.replace('_', ' ')} keep their weights ({count:,} parameters)")
+    return count
+
+
+def _begin(model: MDM, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[TrainingState, Spread]:
+    """Freeze, spread over the processes, make the optimiser, and take up the newest checkpoint."""
+    freeze(model, config.frozen)
+    model.to(ranks.device)
+    trained = model.trained_part()
+    trained.train()
+    if config.recompute:
+        for part in trained.values():
+            learn_parallel.recompute(part)
+    spread = Spread(model, trained, ranks, config.parallel)
+    optimizer = torch.optim.AdamW(
+        [p for p in trained.parameters() if p.requires_grad], lr=config.lr, betas=(config.beta1, config.beta2),
+        weight_decay=config.weight_decay, fused=True,
+    )  # fmt: skip
+    average = None
+    if config.average_decay:
+        average = {k: learn_parallel.local(v).detach().clone() for k, v in trained.state_dict().items()}
+    state = TrainingState(trained, optimizer, average)
+    saved = newest(out, ranks)
     if saved is not None:
-        net.load_state_dict(saved.tensors("net"))
-        average = saved.tensors("average")
-        _load_moments(optimizer, saved.tensors("optimizer"))
-        start = saved.step
-        log.info(f"learn: continues at step {start}")
-    net.train()
-    weights = class_weights(folder, min(config.first_cities, 20), config.balance)
+        ranks.all_do(lambda: state.load(saved.path))
+        state.step = saved.step
+        log.info(f"learn: continues at step {saved.step}")
+    if ranks.size > 1:
+        log.info(f"learn: {ranks.size} processes, {config.parallel}")
+    return state, spread
+
+
+def _train_network(
+    model: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool, ranks: Ranks
+) -> dict[str, Tensor]:
+    """Train denoiser and refiner; returns the weights to use (the moving average), whole, in every process."""
+    out = run_dir.path / "steps"
+    state, spread = _begin(model, config, out, ranks)
+    weights = class_weights(folder, min(config.first_cities, 20), config.balance).to(ranks.device)
+    board = _Board(run_dir.path / "tensorboard") if config.tensorboard and ranks.leads else None
+    facts = {"seed": config.seed, "layout": config.parallel}
     recent: list[dict[str, float]] = []
-    clock = time.monotonic()
-    with log.task("network", config.steps, start) as bar:
-        for step in range(start, config.steps):
-            optimizer.param_groups[0]["lr"] = learning_rate(config, step)
+    begun, clock, saved_at = state.step, time.monotonic(), state.step
+    with log.task("network", config.steps, begun) as bar, Interruption() as interruption:
+        for step in range(begun, config.steps):
+            for group in state.optimizer.param_groups:
+                group["lr"] = learning_rate(config, step)
             frames = frames_at(config, step)
             count = max(1, config.batch_frames // frames)
-            batch = draw_batch(config, folder, step, count, frames, "batch")
-            with torch.no_grad():
-                truth = model.encode_truth(batch.rgb, batch.depth, batch.semantics)
-                shares = mdm.truth_shares(batch.semantics)
-                encoded = model.encode_planes(batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop,
-                                              batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
-                pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics)
-            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-                losses = model.loss(truth, encoded, seeds.torch_generator(config.seed, step, "noise"), shares=shares,
-                                    class_weights=weights, pixels=pixels, window=refined_window(config, model, step))  # fmt: skip
-            _check_finite(losses.terms, step, "network")
-            optimizer.zero_grad(set_to_none=True)
-            losses.total.backward()
-            norm = float(torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0))
-            _check_finite({"gradient norm": norm}, step, "network")
-            optimizer.step()
-            keep = min(config.average_decay, (step + 1) / (step + 10))
-            _blend(average, net.state_dict(), keep)
-            recent.append({**losses.terms, "total": float(losses.total.detach()), "gradient_norm": norm})
-            rate = (step + 1 - start) / (time.monotonic() - clock)
-            bar.update(f"loss {_mean(recent[-25:])['total']:.4f}  {rate:.2f} steps/s")
+            parts = ranks.share(count, config.accumulate)
+            terms: dict[str, float] = {}
+            state.optimizer.zero_grad(set_to_none=True)
+            for part in parts:
+                batch = draw_batch(config, folder, step, count, frames, "batch", part).to(ranks.device)
+                with spread.portion(last=part is parts[-1]):
+                    losses = _losses(spread, model, config, batch, step, part.start, count, weights, bf16)
+                    (losses.total / len(parts)).backward()
+                for name, value in {**losses.terms, "total": float(losses.total.detach())}.items():
+                    terms[name] = terms.get(name, 0.0) + value
+            terms, stop = agreed(ranks, terms, len(parts), step, "network", stop=interruption.asked)
+            norm = learn_parallel.clip_gradients(state.trained, config.clip_norm)
+            agreed(ranks, {"gradient norm": norm}, 1, step, "network")
+            state.optimizer.step()
+            state.step = done = step + 1
+            state.blend(config.average_decay)
+            recent.append({**terms, "gradient_norm": norm})
+            rate = (done - begun) / (time.monotonic() - clock)
+            bar.update(f"loss {mean_of(recent[-25:])['total']:.4f}  {rate:.2f} steps/s")
             bar.advance()
-            done = step + 1
-            if done % 50 == 0 or done == config.steps:
-                run_dir.log(step=done, frames=frames, rate=round(rate, 3), **_mean(recent))
+            last = done == config.steps
+            if done % config.log_every == 0 or last:
+                if ranks.leads:
+                    _write_down(run_dir, board, done, {"frames": frames, "rate": round(rate, 3), **mean_of(recent)})
                 recent = []
-                learn_score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
-            if done % config.checkpoint_every == 0 or done == config.steps:
-                groups = {"net": net.state_dict(), "average": average, "optimizer": _moments(optimizer)}
-                checkpoint.save(out, done, groups, {"seed": config.seed})
-            if done % config.sample_every == 0 or done == config.steps:
-                _look(model, average, config, run_dir, folder, done, bf16)
-    net.load_state_dict(average)
-    net.eval()
+            if done % config.checkpoint_every == 0 or last or stop:
+                state.save(out, ranks, facts)
+                saved_at = done
+            if done % config.sample_every == 0 or last:
+                shown = state.shown()
+                ranks.leader_does(lambda: _look(with_weights(model, shown), config, run_dir, folder, done, bf16))  # noqa: B023
+            if stop and not last:
+                log.info(f"learn: stopped after step {saved_at}, which is saved")
+                interruption.end()
+    if board is not None:
+        board.close()
+    return state.shown()
 
 
-def trained_part(model: MDM) -> torch.nn.ModuleDict:
-    """What the second part of training changes: the denoiser and, if there is one, the refiner."""
-    return torch.nn.ModuleDict({"net": model.net} | ({} if model.refiner is None else {"refiner": model.refiner}))
+def _losses(
+    spread: Spread, model: MDM, config: LearnConfig, batch: Batch, step: int, first: int, count: int, weights: Tensor,
+    bf16: bool,
+) -> Losses:  # fmt: skip
+    """Loss of clips `first` and following of the step's `count` clips."""
+    known = batch.depth_known
+    with torch.no_grad():
+        truth = model.encode_truth(batch.rgb, batch.depth, batch.semantics)
+        encoded = model.encode_planes(batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop,
+                                      batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
+        cells = functional.avg_pool2d(known.float().flatten(0, 1), model.codec.factor).unflatten(0, known.shape[:2])
+        pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics, known)
+        shares = mdm.truth_shares(batch.semantics)
+    generator = seeds.torch_generator(config.seed, step, "noise")
+    with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=bf16):
+        return spread(
+            truth, encoded, generator, shares=shares, class_weights=weights, depth_known=cells, pixels=pixels,
+            window=refined_window(config, model, step), first=first, whole=count,
+        )  # fmt: skip
 
 
 def refined_window(config: LearnConfig, model: MDM, step: int) -> tuple[slice, slice]:
@@ -343,39 +457,34 @@ def refined_window(config: LearnConfig, model: MDM, step: int) -> tuple[slice, s
     return spans[0], spans[1]
 
 
-def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
-    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over the first cities.
-
-    Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.
-    """
-    counts = torch.zeros(256, dtype=torch.float64)
-    for city in range(cities):
-        _await_shard(folder, city)
-        ids = clip_shards.read_batch(folder, [(city, 0, range(1))]).semantics
-        counts += torch.bincount(ids.flatten(), minlength=256)
-    share = counts[: mdm.CLASSES] / counts[: mdm.CLASSES].sum().clamp(min=1)
-    floor = max(float(share[share > 0].min()) if bool((share > 0).any()) else 1.0, 1e-3)
-    weight = share.clamp(min=floor) ** -balance
-    return (weight / (weight * share).sum().clamp(min=1e-9)).float()
+def _write_down(run_dir: store.RunDir, board: _Board | None, step: int, values: dict[str, float]) -> None:
+    run_dir.log(step=step, **values)
+    learn_score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
+    if board is not None:
+        board.add(step, values)
 
 
-def _look(
-    model: MDM,
-    average: dict[str, Tensor],
-    config: LearnConfig,
-    run_dir: store.RunDir,
-    folder: Path,
-    step: int,
-    bf16: bool,
-) -> None:
-    """Score the moving average on a few held-out clips and draw a grid of what it makes."""
-    shown = MDM(model.config)
-    shown.codec.load_state_dict(model.codec.state_dict())
-    trained_part(shown).load_state_dict(average)
-    shown.eval()
+class _Board:
+    """Losses for TensorBoard."""
+
+    def __init__(self, folder: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(folder))
+
+    def add(self, step: int, values: dict[str, float]) -> None:
+        for name, value in values.items():
+            self._writer.add_scalar(f"learn/{name}", value, step)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+def _look(shown: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool) -> None:
+    """Score a model on a few held-out clips and draw a grid of what it makes."""
     scores = learn_score.score(
-        shown, held_out(config)[: config.watched], folder, steps=config.sample_steps, seed=config.seed, bf16=bf16,
-        picture=run_dir.path / "samples" / f"{step:07d}.png",
+        shown, learn_clips.scored_shards(config)[: config.watched], folder, steps=config.sample_steps, seed=config.seed,
+        bf16=bf16, picture=run_dir.path / "samples" / f"{step:07d}.png",
     )  # fmt: skip
     run_dir.log(step=step, held_out=scores["average"])
     log.info(f"step {step}\n{learn_score.table(scores)}")
@@ -392,22 +501,6 @@ def draw_weights(net: torch.nn.Module, seed: int, purpose: str) -> None:
                 value.copy_(torch.randn(value.shape, generator=generator) * math.sqrt(gain / fan_in))
             elif value.ndim == 1 and name.endswith("bias"):
                 value.zero_()
-
-
-def _check_finite(terms: dict[str, float], step: int, what: str) -> None:
-    for name, value in terms.items():
-        if not math.isfinite(value):
-            raise NumericsError(
-                f"the {name} term of the {what} is not finite",
-                where=f"learn, step {step}",
-                got=str(value),
-                remedy="continue from the last checkpoint with a lower learning rate",
-            )
-
-
-def _blend(average: dict[str, Tensor], current: dict[str, Tensor], keep: float) -> None:
-    with torch.no_grad():
-        torch._foreach_lerp_(list(average.values()), [current[k] for k in average], 1.0 - keep)
 
 
 def _moments(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -431,13 +524,3 @@ def _load_moments(optimizer: torch.optim.Optimizer, moments: dict[str, Tensor]) 
 def _format_of(tensor: Tensor) -> torch.memory_format:
     channels_last = tensor.ndim == 4 and tensor.is_contiguous(memory_format=torch.channels_last)
     return torch.channels_last if channels_last else torch.contiguous_format
-
-
-def _mean(terms: list[dict[str, float]]) -> dict[str, float]:
-    return {k: round(float(np.mean([t[k] for t in terms])), 6) for k in terms[0]} if terms else {}
-
-
-def batches(config: LearnConfig, folder: Path, steps: range) -> Iterator[Batch]:
-    """The batches of some steps, for looking at the data."""
-    for step in steps:
-        yield draw_batch(config, folder, step, max(1, config.batch_frames // config.window), config.window, "batch")

@@ -108,6 +108,7 @@ def condition_of(batch: Batch, index: int = 0) -> Condition:
 def score_clip(batch: Batch, sample: Sample) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip (batch of one) and its class confusion i64[19,20]."""
     rgb, depth, ids = batch.rgb[0], batch.depth[0], batch.semantics[0]
+    depth = torch.where(batch.depth_known[0], depth, torch.full_like(depth, clip_shards.FAR_M))  # far depth does not count
     if sample.rgb is None or sample.depth is None or sample.semantics is None:
         raise ValueError("scoring needs all three modalities")
     seen = batch.valid[0] | batch.warped[0]
@@ -218,6 +219,8 @@ def _average(rows: Sequence[Mapping[str, float]], counts: Tensor) -> dict[str, f
         values = [r[name] for r in rows if math.isfinite(r[name])]
         if values:
             result[name] = round(float(np.mean(values)), 4)
+    if not bool(counts.any()):  # logs without labels
+        return result
     ious = metrics.iou_of(counts)
     frequent = {n: v for n, v in ious.items() if float(counts[palette.ID[n]].sum()) > 2e-4 * float(counts.sum())}
     result["miou"] = round(float(np.mean(list(frequent.values()))), 4)
@@ -290,7 +293,8 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
         entry = json.loads(line)
         if "total" in entry and "step" in entry:
             for name in ("total", "rgb", "depth", "semantics"):
-                points.setdefault(name, {})[int(entry["step"])] = float(entry.get(name, math.nan))
+                if name in entry:  # separate passes: a step has one modality
+                    points.setdefault(name, {})[int(entry["step"])] = float(entry[name])
     series = {n: sorted(p.items()) for n, p in points.items()}
     values = [v for p in series.values() for _, v in p if v > 0 and math.isfinite(v)]
     if not values:
@@ -322,8 +326,16 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
 # model card -----------------------------------------------------------------------------------------------------------
 
 
-def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any]) -> str:
-    """Text that travels with the weights: what it is, how it was made, what it can and cannot do."""
+def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
+    """Text that travels with the weights: what it is, how it was made, what it can and cannot do.
+
+    `data` says what it was trained on; empty = generated cities.
+    """
+    data = data or (
+        f"generated cities only (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of\n"
+        f"{config.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
+        "other model, was used."
+    )
     count = sum(p.numel() for p in model.parameters()) / 1e6
     samples = config.steps * config.batch_frames
     continued = f", continued from an earlier model ({config.start})" if config.start else ""
@@ -333,9 +345,7 @@ Turns a projected, coloured LiDAR cloud (and recorded images warped with it) int
 frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million parameters, stored in
 float16. All three modalities come from one pass.
 
-**Training data**: generated cities only (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of
-{config.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any
-other model, was used.
+**Training data**: {data}
 
 **Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`{continued}: {config.steps}
 steps of {config.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {config.average_decay}, x0

@@ -1,0 +1,394 @@
+"""Training on several processes: who they are, what they agree on, and how the network is spread over them.
+
+Started by `torchrun`, every process runs the same program. They meet in a process group (gloo on CPUs, nccl on CUDA
+devices) and differ only in their number, the rank. Rank 0 leads: it alone makes clips, writes logs and pictures, and scores.
+
+Three layouts give the same losses up to rounding: one process; `ddp`, a whole copy of the network per process; `fsdp`,
+parameters, moments and average cut into pieces along their first axis (`torch.distributed.fsdp.fully_shard`).
+
+What processes tell each other is numbers and JSON text. Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import functools
+import json
+import math
+import os
+import signal
+import threading
+import time
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint as recomputed
+
+from mudg.base import errors, log
+from mudg.base.errors import MudgError, NumericsError, ResourceError, UsageError
+
+PATIENCE = datetime.timedelta(hours=6)
+"""How long processes wait for each other: as long as the leader may need to make clips or to score."""
+Layout = Literal["ddp", "fsdp"]
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among its like: number `rank` of `size`, computing on `device`."""
+
+    rank: int
+    size: int
+    device: torch.device
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the process that writes."""
+        return self.rank == 0
+
+    def wait(self) -> None:
+        """Until all are here."""
+        self.total([0.0])
+
+    def total(self, values: Sequence[float]) -> list[float]:
+        """Sums over all processes, in float64 and in the same order for all."""
+        if self.size == 1:
+            return list(values)
+        kept = torch.tensor(values, dtype=torch.float64, device=self.device)
+        dist.all_reduce(kept)
+        return kept.tolist()
+
+    def told(self, value: Any) -> Any:
+        """The leader's `value` (anything JSON can say), in every process."""
+        if self.size == 1:
+            return value
+        text = json.dumps(value).encode() if self.leads else b""
+        length = torch.tensor([len(text)], device=self.device)
+        dist.broadcast(length, 0)
+        letters = torch.zeros(int(length), dtype=torch.uint8, device=self.device)
+        if self.leads:
+            letters.copy_(torch.frombuffer(bytearray(text), dtype=torch.uint8))
+        dist.broadcast(letters, 0)
+        return json.loads(bytes(letters.cpu().tolist()))
+
+    def leader_does(self, work: Callable[[], Any]) -> Any:
+        """Run `work` in the leader alone; all get its JSON result, or raise its error.
+
+        An error that is not one of ours, or an interruption, ends the leader at once; the launcher then ends the others.
+        """
+        if self.size == 1:
+            return work()
+        answer: dict[str, Any] = {}
+        if self.leads:
+            try:
+                answer = {"value": work()}
+            except MudgError as error:
+                fields = (error.what, error.where, error.expected, error.got, error.remedy)
+                self.told({"error": type(error).__name__, "fields": fields})
+                raise
+        answer = self.told(answer)
+        if "error" in answer:
+            what, where, expected, got, remedy = answer["fields"]
+            raise _ERRORS.get(answer["error"], MudgError)(what, where=where, expected=expected, got=got, remedy=remedy)
+        return answer["value"]
+
+    def all_do(self, work: Callable[[], None]) -> None:
+        """Run `work` in every process; if one fails, all raise.
+
+        Raises:
+            ResourceError: another process failed (its own error is shown by that process).
+        """
+        failure: MudgError | None = None
+        try:
+            work()
+        except MudgError as error:
+            failure = error
+        failed = self.total([float(failure is not None)])[0]
+        if failure is not None:
+            raise failure
+        if failed:
+            raise ResourceError("another process of this training failed", got=f"{failed:.0f} of {self.size}",
+                                remedy="see its own message above or in the launcher's logs")  # fmt: skip
+
+    def share(self, clips: int, parts: int) -> list[slice]:
+        """Which clips of a batch of `clips` this process takes, in `parts` portions one after another.
+
+        Raises:
+            UsageError: the clips cannot be divided evenly. Portions of different sizes would change the mean.
+        """
+        size, rest = divmod(clips, self.size * parts)
+        if rest or not size:
+            raise UsageError(
+                "a step's clips cannot be divided evenly", where="--batch-frames, --accumulate",
+                expected=f"a multiple of {self.size} processes x {parts} portions", got=f"{clips} clips",
+                remedy="make --batch-frames a multiple of window x processes x accumulate",
+            )  # fmt: skip
+        first = self.rank * parts * size
+        return [slice(first + n * size, first + (n + 1) * size) for n in range(parts)]
+
+
+_ERRORS: dict[str, type[MudgError]] = {
+    kind.__name__: kind
+    for kind in vars(errors).values()
+    if isinstance(kind, type) and issubclass(kind, MudgError)
+}  # fmt: skip
+
+
+@contextlib.contextmanager
+def joined(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
+    """This process's place among those that `torchrun` started; alone if it was not started by it.
+
+    A process group that exists already is used and left open. Only the leader's messages are shown.
+
+    Raises:
+        ResourceError: a CUDA device is asked for and there is none.
+        UsageError: the launcher's variables are not numbers.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ResourceError("no CUDA device here", where="--device cuda", remedy="leave the flag out")
+    if dist.is_available() and dist.is_initialized():
+        yield _place(dist.get_rank(), dist.get_world_size(), device)
+        return
+    try:
+        size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
+    except ValueError as error:
+        raise UsageError(
+            "the launcher's variables are not numbers", where="WORLD_SIZE, RANK", got=str(error)
+        ) from error
+    if size == 1:
+        yield _place(0, 1, device)
+        return
+    place = _place(rank, size, device)
+    dist.init_process_group("nccl" if device == "cuda" else "gloo", timeout=PATIENCE)
+    was_quiet = log.is_quiet()
+    log.set_quiet(was_quiet or rank > 0)
+    try:
+        yield place
+    finally:
+        log.set_quiet(was_quiet)
+        dist.destroy_process_group()
+
+
+def _place(rank: int, size: int, device: str) -> Ranks:
+    if device == "cuda":
+        chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+        torch.cuda.set_device(chosen)
+        return Ranks(rank, size, chosen)
+    return Ranks(rank, size, torch.device("cpu"))
+
+
+# the network over the processes ---------------------------------------------------------------------------------------
+
+
+class Objective(nn.Module):
+    """A model's loss as a module's forward, which is what gradient synchronisation hangs on."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, *args: Any, **options: Any) -> Any:
+        """Whatever the model's `loss` takes and returns."""
+        return self.model.loss(*args, **options)  # type: ignore[operator]
+
+
+class Spread:
+    """A model in one of the layouts: call it as `model.loss`, in `portion` for each portion of a step."""
+
+    def __init__(self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout) -> None:
+        self._objective: nn.Module = Objective(model)
+        self._sharded: list[nn.Module] = []
+        if ranks.size == 1:
+            return
+        if layout == "ddp":
+            self._objective = nn.parallel.DistributedDataParallel(self._objective, broadcast_buffers=False)
+            return
+        from torch.distributed.device_mesh import init_device_mesh
+        from torch.distributed.fsdp import fully_shard
+
+        mesh = init_device_mesh(ranks.device.type, (ranks.size,))
+        for part in trained.values():
+            _stored_plainly(part)
+            for block in blocks(part):
+                fully_shard(block, mesh=mesh)
+            fully_shard(part, mesh=mesh)
+            self._sharded.append(part)
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        """`model.loss` of the arguments."""
+        return self._objective(*args, **options)
+
+    @contextlib.contextmanager
+    def portion(self, last: bool) -> Iterator[None]:
+        """Around loss and backward of one portion: gradients are exchanged after the last one only."""
+        for part in self._sharded:
+            part.set_requires_gradient_sync(last)  # type: ignore[operator]
+        holds = isinstance(self._objective, nn.parallel.DistributedDataParallel) and not last
+        with self._objective.no_sync() if holds else contextlib.nullcontext():  # type: ignore[operator]
+            yield
+
+
+def blocks(part: nn.Module) -> list[nn.Module]:
+    """The repeated blocks of a network: the modules in its outermost lists, lists of lists taken apart, plain layers left out.
+
+    These are what is sharded, and recomputed, as a unit.
+    """
+    found: list[nn.Module] = []
+    for child in part.children():
+        if isinstance(child, nn.ModuleList):
+            found += [m for m in _members(child) if any(True for _ in m.children())]
+        else:
+            found += blocks(child)
+    return found
+
+
+def _members(modules: nn.ModuleList) -> list[nn.Module]:
+    return [inner for m in modules for inner in (_members(m) if isinstance(m, nn.ModuleList) else [m])]
+
+
+def recompute(part: nn.Module) -> int:
+    """Keep no activations inside the blocks of `part`: the backward pass computes them again. Returns how many there are."""
+    found = blocks(part)
+    for block in found:
+        block.forward = functools.partial(recomputed, block.forward, use_reentrant=False)  # type: ignore[method-assign]
+    return len(found)
+
+
+def _stored_plainly(part: nn.Module) -> None:
+    """Channels-last weights to row-major, which sharding asks for."""
+    with torch.no_grad():
+        for value in part.parameters():
+            value.data = value.data.contiguous()
+
+
+def local(value: Tensor) -> Tensor:
+    """This process's piece of a sharded tensor; any other tensor as it is. Shares memory."""
+    return value.to_local() if _is_sharded(value) else value  # type: ignore[attr-defined]
+
+
+def _is_sharded(value: Tensor) -> bool:
+    if not dist.is_available() or not dist.is_initialized():
+        return False
+    from torch.distributed.tensor import DTensor
+
+    return isinstance(value, DTensor)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Which rows of a whole tensor a piece holds: `start` to `start + len(piece)` of `shape`."""
+
+    shape: tuple[int, ...]
+    start: int
+
+
+def rows_of(value: Tensor) -> Rows:
+    """The rows that this process holds of `value`."""
+    if not _is_sharded(value):
+        return Rows(tuple(value.shape), 0)
+    from torch.distributed.tensor.placement_types import Shard
+
+    (placement,) = value.placements  # type: ignore[attr-defined]
+    if placement != Shard(0):
+        raise ResourceError(
+            "a tensor is cut in a way that checkpoints do not know", expected="Shard(0)", got=str(placement)
+        )
+    per_rank = -(-value.shape[0] // value.device_mesh.size())  # type: ignore[attr-defined]
+    start = min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]
+    return Rows(tuple(value.shape), start)
+
+
+def whole(piece: Tensor, like: Tensor) -> Tensor:
+    """The whole tensor on the CPU, in every process, of which `piece` is this process's part, cut as `like` is."""
+    if not _is_sharded(like):
+        return piece.detach().cpu()
+    from torch.distributed.tensor import DTensor
+
+    mesh, cut = like.device_mesh, like.placements  # type: ignore[attr-defined]
+    shape, stride = like.shape, like.stride()
+    return DTensor.from_local(piece, mesh, cut, run_check=False, shape=shape, stride=stride).full_tensor().cpu()
+
+
+def clip_gradients(part: nn.Module, limit: float) -> float:
+    """Norm of all gradients over all processes; they are scaled down to `limit` if that is not 0."""
+    norm = torch.nn.utils.clip_grad_norm_(part.parameters(), limit or float("inf"))
+    return float(norm.full_tensor() if _is_sharded(norm) else norm)  # type: ignore[attr-defined]
+
+
+# a step's end ---------------------------------------------------------------------------------------------------------
+
+
+class Interruption:
+    """Ctrl-C and SIGTERM wait for the end of the step, so that a checkpoint can be written; a second one does not wait.
+
+    Launchers pass on a signal that the terminal has sent already: a repetition within two seconds is the same one.
+    """
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._since = 0.0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Interruption:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+        self._before = {}
+
+    def _note(self, number: int, frame: types.FrameType | None) -> None:
+        now = time.monotonic()
+        if self._number and now - self._since > 2.0:
+            self.end(number, frame)
+        if not self._number:
+            self._number, self._since = number, now
+            log.info("stopping after this step; once more to stop at once")
+
+    @property
+    def asked(self) -> bool:
+        """Whether this process was asked to stop."""
+        return self._number != 0
+
+    def end(self, number: int = 0, frame: types.FrameType | None = None) -> None:
+        """Do what the signal would have done at once: raise KeyboardInterrupt, or what the program has set."""
+        before = self._before.get(number or self._number)
+        if callable(before):
+            before(number or self._number, frame)
+        raise KeyboardInterrupt
+
+
+def agreed(
+    ranks: Ranks, terms: Mapping[str, float], portions: int, step: int, what: str, *, stop: bool = False
+) -> tuple[dict[str, float], bool]:
+    """Mean of the loss terms over processes and portions, and whether anyone was asked to stop.
+
+    Raises:
+        NumericsError: in every process, if a term is not finite in any; names the terms, the step and the processes.
+    """
+    bad = [float(not all(map(_finite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)]
+    sums = ranks.total([*terms.values(), float(stop), *bad])
+    mean = {name: value / (ranks.size * portions) for name, value in zip(terms, sums)}
+    flags = sums[len(terms) + 1 :]
+    if any(flags) or not all(map(_finite, mean.values())):
+        names = [name for name, value in mean.items() if not _finite(value)] or list(terms)
+        where = f"learn, step {step}"
+        if ranks.size > 1:
+            where += f", process {', '.join(str(n) for n, flag in enumerate(flags) if flag)} of {ranks.size}"
+        raise NumericsError(
+            f"the {', '.join(names)} term of the {what} is not finite", where=where,
+            got=", ".join(str(mean[n]) for n in names),
+            remedy="continue from the last checkpoint with a lower learning rate",
+        )  # fmt: skip
+    return mean, sums[len(terms)] > 0
+
+
+def _finite(value: float) -> bool:
+    return math.isfinite(value)

@@ -1,0 +1,217 @@
+"""Training on several processes: whatever the layout, the same losses."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
+
+from mudg.base import checkpoint, store
+from mudg.base.errors import IntegrityError, NumericsError, UsageError
+from mudg.models import mdm
+from mudg.stages import learn, learn_clips, learn_parallel
+from mudg.stages.learn_parallel import Ranks
+from mudg.stages.learn_state import RowFiles, TrainingState
+
+SAME = 2e-6
+"""Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows it)."""
+ALONE = Ranks(0, 1, torch.device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return write_clips(tmp_path_factory.mktemp("clips"))
+
+
+def losses_of(out):
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return {row["step"]: row["total"] for row in rows if "total" in row}
+
+
+def environment():
+    here = Path(__file__).parent
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(here), *sys.path]), "GLOO_SOCKET_IFNAME": "lo"}
+
+
+def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
+    common = {"batch_frames": 8, "log_every": 1, "checkpoint_every": 100, "steps": 6}
+    learn.run(tiny(clips, **common), tmp_path / "whole")
+
+    stop = TrainingState.blend
+
+    def stop_after_two(state, decay):
+        stop(state, decay)
+        if state.step == 2:
+            state.save(tmp_path / "parts" / "steps", ALONE, {})
+            raise KeyboardInterrupt
+
+    TrainingState.blend = stop_after_two
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            learn.run(tiny(clips, **common), tmp_path / "parts")
+    finally:
+        TrainingState.blend = stop
+    arguments = [str(tmp_path / "store"), str(clips), str(tmp_path)]
+    script = str(Path(__file__).with_name("learn_together.py"))
+    both = [
+        subprocess.Popen(
+            [sys.executable, script, str(rank), *arguments], env=environment(), stderr=subprocess.PIPE, text=True
+        )
+        for rank in (0, 1)
+    ]
+    errors = [process.communicate(timeout=540)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], "\n".join(errors)
+    said = [json.loads((tmp_path / f"said_{rank}.json").read_text()) for rank in (0, 1)]
+    for words in said:  # one process was asked to stop, both did; one had numbers that are not finite, both say so
+        assert words["stopped under ddp"] and words["stopped under fsdp"]
+        assert "step" in words["numerics"] and "of 2" in words["numerics"]
+        assert "divided evenly" in words["uneven"]
+    saved = checkpoint.latest(tmp_path / "parts" / "steps")
+    assert saved is not None and saved.step == 5 and saved.state["sharded"] and saved.state["processes"] == 2
+    assert len(list(saved.path.glob("net.*.safetensors"))) == 2
+    parts = learn.run(tiny(clips, **common), tmp_path / "parts")
+
+    one, other = losses_of(tmp_path / "whole"), losses_of(tmp_path / "parts")
+    off = {step: abs(one[step] - other[step]) / one[step] for step in (3, 4, 5, 6)}
+    print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
+    assert max(off.values()) < SAME, off
+    first, second = (mdm.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
+    for name in first:  # stored in half precision
+        torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
+
+
+def torchrun(clips, out, **changes):
+    """The command that trains on two processes started by torch's launcher."""
+    flags = {
+        "clips": clips, "out": out, "cities": 3, "first-cities": 2, "held-out": 1, "workers": 0, "width": WIDTH,
+        "height": HEIGHT, "window": WINDOW, "codec-steps": 2, "codec-batch": 2, "codec-fit-batches": 1, "steps": 2,
+        "batch-frames": 8, "sample-steps": 1, "score-steps": 1, "log-every": 1, "parallel": "fsdp", **changes,
+    }  # fmt: skip
+    words = [word for name, value in flags.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    words += ["--widths", "16", "32", "--blocks", "1", "1", "--refine-widths", "8", "16", "--refine-blocks", "1", "1"]
+    words += ["--spatial-attention", "False", "True", "--temporal-attention", "False", "True"]
+    return [
+        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mudg", "learn", *words,
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_torchrun_trains(clips, tmp_path):
+    command = torchrun(clips, tmp_path / "out")
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    assert mdm.load(tmp_path / "out" / "model").config.widths == (16, 32)
+
+
+@pytest.mark.slow
+def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
+    """The terminal sends the signal to all processes, and the launcher sends it on once more."""
+    out = tmp_path / "out"
+    command = torchrun(clips, out, steps=5000, checkpoint_every=5000)
+    process = subprocess.Popen(command, env=environment(), start_new_session=True, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 500
+        while time.monotonic() < deadline and process.poll() is None:
+            if (out / "steps").is_dir() or len(losses_of(out) if (out / "log.jsonl").is_file() else {}) > 1:
+                break
+            time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)
+        said = process.communicate(timeout=120)[1]
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode not in (0, None)
+    saved = checkpoint.latest(out / "steps")
+    assert saved is not None, said
+    assert saved.step == max(losses_of(out)), said
+    assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
+
+
+def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
+    config = tiny(clips, reference_dropout=0.5)
+    whole = learn_clips.draw_batch(config, clips, 7, 4, 2, "batch")
+    for part in (slice(0, 1), slice(1, 3), slice(3, 4)):
+        own = learn_clips.draw_batch(config, clips, 7, 4, 2, "batch", part)
+        assert torch.equal(own.rgb, whole.rgb[part])
+        assert torch.equal(own.ids, whole.ids[part])
+        assert torch.equal(own.reference, whole.reference[part])
+        assert own.shift_m == whole.shift_m[part]
+
+
+@pytest.mark.parametrize("kind", ["joint", "separate"])
+def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips, kind):
+    config = learn.model_config(tiny(clips))
+    if kind == "separate":
+        codec = mdm.CodecConfig(semantics_code="palette")
+        config = mdm.MDMConfig(
+            codec=codec, joint=False, head="v", copy_condition=False, backdrop=False, given_classes=False, widths=(16, 32),
+            blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), refine_widths=(), refine_blocks=(),
+        )  # fmt: skip
+    model = mdm.MDM(config)
+    learn.draw_weights(model.net, 0, "weights")
+    settings = tiny(clips)
+    weights = learn_clips.class_weights(clips, 2, 0.5)
+
+    def loss(part, step):
+        batch = learn_clips.draw_batch(settings, clips, step, 4, 2, "batch", part)
+        first = part.start or 0
+        return float(learn._losses(model.loss, model, settings, batch, step, first, 4, weights, False).total.detach())
+
+    for step in range(3):
+        parts = [loss(slice(n, n + 1), step) for n in range(4)]
+        assert sum(parts) / 4 == pytest.approx(loss(slice(None), step), rel=2e-6)
+
+
+def test_portions_and_recomputing_change_nothing(clips, tmp_path):
+    common = {"batch_frames": 8, "log_every": 1, "steps": 3}
+    learn.run(tiny(clips, **common), tmp_path / "plain")
+    learn.run(tiny(clips, **common, accumulate=2, recompute=True), tmp_path / "portions")
+    plain, portions = losses_of(tmp_path / "plain"), losses_of(tmp_path / "portions")
+    assert all(portions[step] == pytest.approx(plain[step], rel=SAME) for step in (1, 2, 3))
+
+
+def test_clips_are_shared_evenly_or_not_at_all():
+    taken = [part for rank in range(4) for part in Ranks(rank, 4, torch.device("cpu")).share(24, 3)]
+    assert [n for part in taken for n in range(part.start, part.stop)] == list(range(24))
+    with pytest.raises(UsageError, match="divided evenly"):
+        Ranks(0, 4, torch.device("cpu")).share(6, 1)
+
+
+def test_rows_of_any_cut_are_put_together(tmp_path):
+    value = torch.arange(30.0).reshape(10, 3)
+    from safetensors.torch import save
+
+    for rank, (start, stop) in enumerate([(0, 4), (4, 8), (8, 10)]):
+        store.atomic_write(tmp_path / f"net.{rank:04d}.safetensors", save({"w": value[start:stop].contiguous()}))
+        store.write_json(tmp_path / f"net.{rank:04d}.json", {"w": {"shape": [10, 3], "start": start}})
+    got = torch.zeros(10, 3)
+    RowFiles(tmp_path, "net").read_into("w", got)
+    assert torch.equal(got, value)
+    with pytest.raises(IntegrityError, match="does not fit"):
+        RowFiles(tmp_path, "net").read_into("w", torch.zeros(9, 3))
+    with pytest.raises(IntegrityError, match="does not fit"):
+        RowFiles(tmp_path, "net").read_into("v", got)
+    (tmp_path / "net.0001.json").unlink()
+    with pytest.raises(IntegrityError, match="rows"):
+        RowFiles(tmp_path, "net").read_into("w", got)
+
+
+def test_a_term_that_is_not_finite_is_named():
+    with pytest.raises(NumericsError, match=r"depth term of the network(.|\n)*step 4"):
+        learn_parallel.agreed(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
+    assert learn_parallel.agreed(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)
+
+
+def test_blocks_are_what_repeats():
+    first, second, outer = (
+        nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.Sequential(nn.Linear(2, 2))])) for _ in range(3)
+    )
+    part = nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.ModuleList([first, second]), nn.Linear(2, 2), outer]))
+    assert [id(m) for m in learn_parallel.blocks(part)] == [id(first), id(second), id(outer)]

@@ -1,0 +1,164 @@
+"""Training clips of recorded logs: what is truth, what is given, what is held out."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_clips import tiny, write_clips
+from toy_scene import ToyStreet
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Source
+from mudg.data import clip_shards, log_clips
+from mudg.data.log_clips import LogClipRules, LogSource
+from mudg.data.scenefile import SceneWriter, read_image, read_label, read_points, read_scene
+from mudg.models import mdm
+from mudg.stages import fuse, learn
+from mudg.stages.config import FuseConfig
+from mudg.stages.learn_clips import HELD_OUT
+
+RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
+FRAMES = 16
+
+
+def rewritten(scene, folder, *, black="", labels=("semantics", "depth", "sky")):
+    """The scene again, one image black, some labels left out."""
+    with SceneWriter(folder, "again", Source("toy", "none")) as writer:
+        for camera in scene.cameras.values():
+            writer.add_camera(camera)
+        for frame in scene.frames:
+            image = read_image(scene, frame)
+            kept = {name: read_label(scene, frame, name) for name in frame.labels if name in labels}
+            writer.add_frame(frame.id, frame.view, image * 0 if frame.id == black else image, kept)
+        for sweep in scene.sweeps:
+            writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, read_points(scene, sweep))
+        for track in scene.tracks:
+            writer.add_track(track)
+        writer.set_ego(scene.ego)
+        writer.set_split(scene.split)
+        writer.finish()
+
+
+@pytest.fixture(scope="module")
+def measured(log, tmp_path_factory):
+    """The log without labels of depth: only its sweeps tell."""
+    root = tmp_path_factory.mktemp("measured")
+    rewritten(read_scene(log[1].scene), root / "scene", labels=("semantics",))
+    return log[0], LogSource(root / "scene", log[1].fused)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    root = tmp_path_factory.mktemp("log")
+    street = ToyStreet(car_start=(12.0, 3.0), car_velocity=(2.0, 0.0), times=[0.1 * n for n in range(FRAMES)])
+    street.write(root / "scene", width=120, height=60)
+    fuse.run(FuseConfig(min_object_points=1), root / "scene", root / "fuse")
+    return street, LogSource(root / "scene", root / "fuse")
+
+
+def test_windows_to_score_share_no_moment_with_those_to_train_on(log):
+    scene = read_scene(log[1].scene)
+    found = log_clips.log_windows(scene, RULES)
+    held = {name for w in found if w.held_out for name in w.frames}
+    trained = {name for w in found if not w.held_out for name in w.frames}
+    assert held and trained and not held & trained
+    assert "front/000004" not in held | trained  # the scene holds it out
+    assert all(len(w.frames) == 3 for w in found)
+    everything = log_clips.log_windows(scene, LogClipRules(48, 24, window=3, stride=2, held_out_every=0))
+    assert [w.frames[0] for w in everything] == [f"front/{n:06d}" for n in (0, 2, 5, 7, 9, 11, 13)]
+    with pytest.raises(InputError, match="too short"):
+        log_clips.log_windows(scene, LogClipRules(48, 24, window=30))
+    with pytest.raises(InputError, match="too short to hold out"):
+        log_clips.plan([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
+
+
+def test_truth_is_what_was_recorded(measured):
+    street, source = measured
+    opened = log_clips.OpenLog(source, replace(RULES, width=120, height=60))
+    window = next(w for w in log_clips.log_windows(opened.scene, RULES) if not w.held_out)
+    clip = log_clips.make_clip(opened, window, 0)
+    for number, view in enumerate(clip.condition.views):
+        _, ids, depth = street.image(view)  # exact, at the clip's size
+        known = clip.depth_valid[number, 0].numpy()
+        solid = known & np.isfinite(depth)
+        relative = np.abs(clip.depth[number, 0].numpy() - depth)[solid] / depth[solid]
+        assert np.median(relative) < 0.02  # a point anywhere in a pixel of the slanted ground
+        assert (relative < 0.1).mean() > 0.95
+        assert 0.1 < solid.mean() < 1.0
+        assert (clip.depth[number, 0].numpy()[known & ~np.isfinite(depth)] >= 100).mean() > 0.9
+        assert (clip.semantics[number].numpy() == ids).mean() > 0.97
+    arrays = clip_shards.pack_clips([clip], [0.0], gaps=True)
+    unknown = (arrays["flags"] & clip_shards.FLAG_DEPTH_UNKNOWN) > 0
+    assert np.array_equal(unknown[0], ~clip.depth_valid[:, 0].numpy())
+    assert float(arrays["depth"][0][unknown[0]].max()) <= 100  # filled, not far away
+
+
+def test_a_view_never_sees_its_own_image(log, tmp_path):
+    """Paint over one image: the condition of its own view stays as it was, its truth does not."""
+    _, source = log
+    scene = read_scene(source.scene)
+    rules = replace(RULES, farthest=1)  # neighbours' images are given
+    opened = log_clips.OpenLog(source, rules)
+    window = next(w for w in log_clips.log_windows(scene, rules) if not w.held_out)
+    painted = window.frames[1]
+    rewritten(scene, tmp_path / "scene", black=painted)
+    other = log_clips.OpenLog(LogSource(tmp_path / "scene", source.fused), rules)
+    clip, again = (log_clips.make_clip(x, window, 0) for x in (opened, other))
+    assert torch.equal(clip.condition.color[1], again.condition.color[1])
+    assert torch.equal(clip.condition.backdrop[1], again.condition.backdrop[1])
+    assert not torch.equal(clip.condition.color, again.condition.color)  # its neighbours do see it
+    assert float(again.rgb[1].max()) == 0.0 and torch.equal(clip.rgb[0], again.rgb[0])
+    assert bool(clip.condition.warped[1].any())
+
+
+def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
+    opened = log_clips.OpenLog(measured[1], replace(RULES, width=64, height=32))
+    window = log_clips.log_windows(opened.scene, RULES)[0]
+    clip_shards.write_shard(
+        tmp_path, 0, clip_shards.pack_clips([log_clips.make_clip(opened, window, 0)], [0.0], gaps=True)
+    )
+    model = mdm.MDM(learn.model_config(tiny(tmp_path, width=64, height=32, window=3)))
+    batch = clip_shards.read_batch(tmp_path, [(0, 0, range(3))])
+    assert not bool(batch.depth_known.all())
+
+    def terms(depth):
+        shown = replace(batch, depth=torch.where(batch.depth_known, batch.depth, depth))
+        truth = model.pixel_truth(shown.rgb, shown.depth, shown.semantics, shown.depth_known)
+        code = truth.depth_code.clone().requires_grad_()
+        made = mdm.Refined(truth.rgb, torch.zeros_like(code), torch.zeros(3, 19, 32, 64), torch.zeros_like(code))
+        return float(mdm.refine_loss(made, truth)["pixel_depth"])
+
+    assert terms(torch.tensor(3.0)) == terms(torch.tensor(90.0))
+    mirrored = clip_shards.vary(batch, np.random.Generator(np.random.PCG64(1)))
+    flipped = not torch.equal(mirrored.depth, batch.depth)
+    wanted = batch.depth_known.flip(-1) if flipped else batch.depth_known
+    assert torch.equal(mirrored.depth_known, wanted)
+
+
+def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
+    small = write_clips(tmp_path / "clips")
+    first = learn.run(tiny(small, steps=1), tmp_path / "first")
+    run = tmp_path / "run"
+    run.mkdir()
+    for name, folder in (("scene", log[1].scene), ("fuse", log[1].fused)):
+        (run / name).symlink_to(folder)
+    config = tiny(
+        "", start=str(first), scenes=(str(run),), steps=2, sample_every=1, log_every=1, stride=2, held_out_every=4, window=4,
+        width=64, height=32,
+    )  # fmt: skip
+    made = learn.run(config, tmp_path / "tuned")
+    index = json.loads((tmp_path / "tuned" / "clips" / "log_clips.json").read_text())
+    assert index["rules"]["width"] == 64 and index["rules"]["height"] == 32  # the camera's aspect of 2
+    card = (made / "MODEL_CARD.md").read_text()
+    assert "recorded log" in card and "generated cities only" not in card
+    scores = json.loads((made.parent / "metrics.json").read_text())
+    assert scores["clips"] >= 1 and scores["average"]["psnr"] > 5
+    assert (made.parent / "samples" / "0000001.png").is_file() and (made.parent / "loss.png").is_file()
+    facts = json.loads((made / "model.json").read_text())["facts"]
+    assert facts["recipe"]["scenes"] == [str(run)]
+    with pytest.raises(UsageError, match="other logs or settings"):
+        log_clips.claim(made.parent / "clips", RULES, [log[1]])
+    with pytest.raises(InputError, match="no scene with a fused cloud"):
+        learn.run(tiny("", start=str(first), scenes=(str(tmp_path),)), tmp_path / "none")

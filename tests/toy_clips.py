@@ -1,0 +1,57 @@
+"""Made-up training clips and a configuration small enough to train in a moment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mudg.base.types import Camera, Clip, Condition, View
+from mudg.data import clip_shards
+from mudg.stages.config import LearnConfig
+from mudg.stages.learn_clips import HELD_OUT
+
+WIDTH, HEIGHT, WINDOW = 48, 32, 4
+
+
+def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
+    """A clip with structure: a horizon, a box, a noisy half-seen condition."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.arange(height).view(1, 1, height, 1).expand(WINDOW, 1, height, width)
+    colour = torch.rand(2, 3, 1, 1, generator=generator)
+    rgb = torch.where(rows < 12, colour[0], colour[1])
+    depth = torch.where(rows < 12, torch.tensor(1000.0), 200.0 / (rows - 8).clamp(min=1).float())
+    ids = torch.where(rows < 12, 10, 0)[:, 0].clone()
+    box = int(torch.randint(4, width - 14, (), generator=generator))
+    rgb[:, :, 8:20, box : box + 10] = torch.rand(3, 1, 1, generator=generator)
+    depth[:, :, 8:20, box : box + 10] = 9.0
+    ids[:, 8:20, box : box + 10] = 13
+    valid = torch.rand(depth.shape, generator=generator) > 0.4
+    camera = Camera("front", width, height, 40.0, 40.0, width / 2, height / 2)
+    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(WINDOW))
+    seen = torch.where(valid, rgb, torch.rand(rgb.shape, generator=generator))
+    condition = Condition(views, seen, torch.where(valid, depth, 20.0).clamp(max=100), valid, rgb[0], valid, rgb)
+    return Clip(condition, rgb, depth, depth < 500, ids)
+
+
+def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
+    """Three shards to train on and one to score, two clips each."""
+    for number in [*range(3), HELD_OUT]:
+        made = [made_up_clip(number * 7 + k, width, height) for k in range(2)]
+        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0]))
+    return folder
+
+
+def tiny(clips: Path | str, **changes: Any) -> LearnConfig:
+    """A run of four steps of a network with a few thousand weights on the clips of `write_clips`."""
+    config = LearnConfig(
+        cities=3, first_cities=2, clips_per_city=2, held_out=1, watched=1, clips=str(clips), workers=0, precision="float32",
+        width=WIDTH, height=HEIGHT, window=WINDOW, widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True),
+        temporal_attention=(False, True), refine_widths=(8, 16), refine_blocks=(1, 1), codec_steps=3, codec_batch=2,
+        codec_fit_batches=1, steps=4, batch_frames=4, full_window_share=0.5, warmup_steps=1, checkpoint_every=2,
+        sample_every=100, sample_steps=1, score_steps=1,
+    )  # fmt: skip
+    return replace(config, **changes)
