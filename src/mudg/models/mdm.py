@@ -581,8 +581,7 @@ class MDM(nn.Module):
             raise UsageError("strength needs something to start from", got=str(strength), remedy="strength = 1")
 
         def denoise(x: Tensor, t: int) -> Tensor:
-            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-                stated, _ = self.predict(dict(zip(names, x.split(sizes, 2))), encoded, torch.full((lead[0],), t))
+            stated, _ = self.predict(dict(zip(names, x.split(sizes, 2))), encoded, torch.full((lead[0],), t))
             out = torch.cat([stated[m].float() for m in names], 2)
             if known and self.config.head == "x0":
                 kept = torch.cat([known[m] for m in names], 1)
@@ -593,9 +592,10 @@ class MDM(nn.Module):
             if 2 * number >= len(indices) - 1:
                 estimates.append(x0[:, :, : sizes[0]])
 
-        x = noise.SAMPLERS[sampler](
-            denoise, begin, self.schedule, indices, prediction=self.config.head, eta=eta, draw=draw, on_step=watch
-        )
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):  # around all steps: the weights are converted once
+            x = noise.SAMPLERS[sampler](
+                denoise, begin, self.schedule, indices, prediction=self.config.head, eta=eta, draw=draw, on_step=watch
+            )
         moved = torch.stack([(e - x[:, :, : sizes[0]]).abs().mean(2, keepdim=True) for e in estimates]).mean(0)
         return dict(zip(names, x.split(sizes, 2))), moved
 
