@@ -39,7 +39,8 @@ class Trainable(Protocol):
         """Loss of clips `first` and following of a batch of `whole` clips.
 
         The generator is in the same state for every part of the batch. Draws are made for the whole batch, or for each clip
-        from a seed of its own, and the loss is a mean over clips: then it does not matter how the batch is divided.
+        from a seed of its own, and the loss is a mean over clips: then it does not matter how the batch is divided. The
+        terms have the same names for every part.
         """
         ...
 
