@@ -8,9 +8,9 @@ that training frameworks leave in their files a short list is replaced by an ine
 
 from __future__ import annotations
 
-import functools
 import re
 import zipfile
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -150,23 +150,33 @@ UNUSED: frozenset[str] = frozenset(
 """Published names that may be there and are not read: tables that follow from the schedule, parts of the towers past the layers in use."""
 
 _NUMBER = {"{i}": r"(?P<i>\d+)", "{j}": r"(?P<j>\d+)"}
+_Index = dict[tuple[str, int, str], list[tuple[re.Pattern[str], str]]]
 
 
-def _pattern(template: str) -> re.Pattern[str]:
-    text = re.escape(template)
-    for mark, expression in _NUMBER.items():
-        text = text.replace(re.escape(mark), expression)
-    return re.compile(text)
+def _place(name: str) -> tuple[str, int, str]:
+    """What a name and its row share for certain: first and last component, and how many there are."""
+    parts = name.split(".")
+    return parts[0], len(parts), parts[-1]
 
 
-_TO_CLEAN = tuple((_pattern(published), clean) for published, clean in RULES)
-_TO_PUBLISHED = tuple((_pattern(clean), published) for published, clean in RULES)
+def _index(rows: Iterable[tuple[str, str]]) -> _Index:
+    """Rows (template, result) as patterns, found by `_place`; their order is kept."""
+    found: _Index = {}
+    for template, result in rows:
+        text = re.escape(template)
+        for mark, expression in _NUMBER.items():
+            text = text.replace(re.escape(mark), expression)
+        found.setdefault(_place(template), []).append((re.compile(text), result))
+    return found
 
 
-@functools.lru_cache(maxsize=20_000)
+_TO_CLEAN = _index(RULES)
+_TO_PUBLISHED = _index((clean, published) for published, clean in RULES)
+
+
 def clean_name(published: str) -> str | None:
     """Our name of a published tensor; None if it has none (unused or unknown)."""
-    for pattern, clean in _TO_CLEAN:
+    for pattern, clean in _TO_CLEAN.get(_place(published), ()):
         if found := pattern.fullmatch(published):
             return clean.format(**found.groupdict())
     return None
@@ -183,11 +193,11 @@ def published_names(clean: Iterable[str]) -> dict[str, str]:
     known = set(names)
     result = {}
     for name in names:
-        for pattern, published in _TO_PUBLISHED:
+        for pattern, published in _TO_PUBLISHED.get(_place(name), ()):
             found = pattern.fullmatch(name)
             if found is None:
                 continue
-            if published.endswith("3.conv." + name.rsplit(".", 1)[-1]) and f"net.up.{found['i']}.spatial.norm.weight" not in known:
+            if ".{i}.3.conv." in published and f"net.up.{found['i']}.spatial.norm.weight" not in known:
                 continue  # no transformers in this stage: the next row's number is the right one
             result[name] = published.format(**found.groupdict())
             break
@@ -209,26 +219,31 @@ class _Ignored:
 
     def __setstate__(self, _: object) -> None: ...
 
-    def __setitem__(self, _: object, __: object) -> None: ...
 
-    def append(self, _: object) -> None: ...
-
-    def extend(self, _: object) -> None: ...
+def _mapping(*_: object) -> OrderedDict[str, Any]:
+    """Stand-in for the making of a mapping whose entries follow."""
+    return OrderedDict()
 
 
 INERT = (
     "omegaconf.dictconfig.DictConfig", "omegaconf.listconfig.ListConfig", "omegaconf.base.ContainerMetadata",
     "omegaconf.base.Metadata", "omegaconf.nodes.AnyNode", "omegaconf.nodes.IntegerNode", "omegaconf.nodes.FloatNode",
-    "omegaconf.nodes.StringNode", "omegaconf.nodes.BooleanNode", "typing.Any", "collections.defaultdict", "builtins.dict",
-    "builtins.list", "builtins.tuple", "builtins.int", "builtins.float", "builtins.str", "builtins.bool",
-    "argparse.Namespace", "numpy.dtype", "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar",
+    "omegaconf.nodes.StringNode", "omegaconf.nodes.BooleanNode", "typing.Any", "builtins.dict", "builtins.list",
+    "builtins.tuple", "builtins.int", "builtins.float", "builtins.str", "builtins.bool", "argparse.Namespace",
+    "numpy.dtype", "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar",
     "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
-    "lightning.pytorch.callbacks.model_checkpoint.ModelCheckpoint",
-    "lightning_fabric.utilities.data.AttributeDict", "pytorch_lightning.utilities.parsing.AttributeDict",
-    "torch.optim.lr_scheduler.LambdaLR", "deepspeed.runtime.fp16.loss_scaler.LossScaler",
-    "deepspeed.runtime.fp16.loss_scaler.DynamicLossScaler", "deepspeed.runtime.zero.config.ZeroStageEnum",
+    "lightning.pytorch.callbacks.model_checkpoint.ModelCheckpoint", "torch.optim.lr_scheduler.LambdaLR",
+    "deepspeed.runtime.fp16.loss_scaler.LossScaler", "deepspeed.runtime.fp16.loss_scaler.DynamicLossScaler",
+    "deepspeed.runtime.zero.config.ZeroStageEnum",
 )  # fmt: skip
 """Names in pickles that are replaced by `_Ignored`. Not one of them is imported or called."""
+
+INERT_MAPPINGS: dict[str, Any] = {
+    "collections.defaultdict": _mapping,
+    "lightning_fabric.utilities.data.AttributeDict": OrderedDict,
+    "pytorch_lightning.utilities.parsing.AttributeDict": OrderedDict,
+}
+"""The same for kinds of mappings, which are filled entry by entry."""
 
 _PREFIXES = ("_forward_module.", "module.")
 
@@ -259,7 +274,8 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
 
 
 def _unpickle(path: Path) -> Any:
-    stand_ins: list[Any] = [(type("Ignored", (_Ignored,), {}), name) for name in INERT]
+    stand_ins: list[Any] = [(_Ignored, name) for name in INERT]
+    stand_ins += [(stand_in, name) for name, stand_in in INERT_MAPPINGS.items()]
     try:
         with torch.serialization.safe_globals(stand_ins):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
@@ -309,6 +325,16 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
             return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError("not a valid safetensors file", where=str(path), got=str(error)) from error
+
+
+def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A checkpoint completed by an OpenCLIP file (names without prefix) where it has no text or no image tower of its own."""
+    result = dict(found)
+    for prefix in (_TEXT, _IMAGE):
+        if not any(name.startswith(prefix) for name in found):
+            image = prefix == _IMAGE
+            result |= {prefix + name: value for name, value in towers.items() if name.startswith("visual.") == image}
+    return result
 
 
 # matching -------------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,9 @@ from mudg.data.observations import ObservationWriter
 from mudg.data.scenefile import read_image, read_scene
 from mudg.models import mdm
 from mudg.models.mdm import MDM, Sample
+from mudg.models.published import PublishedMDM
 from mudg.models.vae import Modality
+from mudg.stages import published_model
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.learn_score import class_image, depth_image, rgb_image
 from mudg.stages.precision import choose_bf16
@@ -69,7 +71,10 @@ def run(config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, overwr
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
-    mdm.load(config.model)  # fails now rather than in every process
+    if published_model.is_published(config.model):
+        config = replace(config, processes=config.processes or 1)  # one copy of a large model in memory
+    else:
+        mdm.load(config.model)  # fails now rather than in every process
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": mdm.digest(config.model)}
     directory = store.RunDir.open(out, "synthesize", to_dict(config), inputs, _VERSION, overwrite)
     if directory.complete:
@@ -203,16 +208,21 @@ def make_trajectory(job: Job) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one."""
     config = job.config
     scene, cloud = read_scene(job.scene), read_fused(job.fused)
-    model = mdm.load(config.model)
+    model = published_model.load_any(config)
     path = trajectory_of(scene, job)
     folder = job.out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
     camera = path.views[0].camera
-    area = TRAINED_AREA
-    width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
-    fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
-    rules = ConditionRules(width, height, *fine)
+    if isinstance(model, PublishedMDM):
+        model.check_frames(min(len(path), model.config.window))
+        width, height = published_model.model_size(model.config, config.width_px)
+        rules = ConditionRules(width, height, camera.width, camera.height, published=True)
+    else:
+        area = TRAINED_AREA
+        width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
+        fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
+        rules = ConditionRules(width, height, *fine)
     maker = ViewMaker(model, scene, cloud, recorded_images(scene, config.held_out_images), rules, config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
@@ -262,7 +272,7 @@ class ViewMaker:
 
     def __init__(
         self,
-        model: MDM,
+        model: MDM | PublishedMDM,
         scene: Scene,
         cloud: FusedCloud,
         recorded: Sequence[Recorded],
@@ -296,14 +306,18 @@ class ViewMaker:
             raise InputError("the model does not produce all modalities", where=config.model)
         sky = (sample.semantics == mdm.SKY).unsqueeze(1) & ~condition.valid
         depth = torch.where(sky, torch.nan, sample.depth)
-        rgb, ids, trust, shown = sample.rgb, sample.semantics, sample.confidence, condition
-        if config.full_size:
+        rgb, ids, trust = sample.rgb, sample.semantics, sample.confidence
+        shown_views = condition.views
+        if config.full_size and isinstance(self._model, PublishedMDM):
+            rgb, depth, ids, trust = published_model.at_camera_size(sample, depth, views[0])
+            shown_views = tuple(views)
+        elif config.full_size:
             rgb, depth, ids, trust = enlarge(sample, depth, condition, fine)
-            shown = fine
+            shown_views = fine.views
         everything = torch.ones_like(trust[0], dtype=torch.bool)
         made = [
             Observation(view, rgb[i], depth[i], ids[i], trust[i], everything, "virtual", SOURCE)
-            for i, view in enumerate(shown.views)
+            for i, view in enumerate(shown_views)
         ]
         return sample, condition, made
 
