@@ -17,7 +17,7 @@ from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.data.observations import read_observations
-from mudg.models import clip, published
+from mudg.models import clip, published, video_unet
 from mudg.models.clip import ImageTower, TextTower, TowerConfig
 from mudg.models.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
 from mudg.models.published import PublishedConfig, Sampling, choose_trainable
@@ -38,7 +38,7 @@ def error(made, wanted):
     return float((made - wanted).norm() / wanted.norm())
 
 
-def some_condition(frames=4, height=16, width=24, seed=0):
+def some_condition(frames=4, height=8, width=12, seed=0):
     generator = torch.Generator().manual_seed(seed)
     camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
@@ -142,7 +142,9 @@ def test_images_are_prepared_as_the_tower_wants_them():
     flat = torch.tensor([-1.0, 0.0, 1.0]).view(1, 3, 1, 1).expand(1, 3, 100, 300)
     made = clip.prepare_image(flat)
     assert made.shape == (1, 3, 224, 224)
-    wanted = (torch.tensor([0.0, 0.5, 1.0]) - torch.tensor([0.4815, 0.4578, 0.4082])) / torch.tensor([0.2686, 0.2613, 0.2758])
+    wanted = (torch.tensor([0.0, 0.5, 1.0]) - torch.tensor([0.4815, 0.4578, 0.4082])) / torch.tensor(
+        [0.2686, 0.2613, 0.2758]
+    )
     assert torch.allclose(made.amax((0, 2, 3)), wanted, atol=2e-3)
     assert torch.allclose(made.amin((0, 2, 3)), wanted, atol=2e-3)
     corner = torch.zeros(1, 3, 20, 20)
@@ -178,7 +180,9 @@ def test_modalities_have_no_eight_bit_step(model):
     made, margin = nearest_class(codec.semantic_image(ids))
     assert torch.equal(made, ids)
     assert torch.allclose(margin, torch.ones_like(margin), atol=1e-3)
-    between = (codec.semantic_image(torch.tensor([[[0]]])) + codec.semantic_image(torch.tensor([[[palette.ID["pole"]]]]))) / 2
+    between = (
+        codec.semantic_image(torch.tensor([[[0]]])) + codec.semantic_image(torch.tensor([[[palette.ID["pole"]]]]))
+    ) / 2
     assert float(nearest_class(between)[1].max()) < 1e-3
     assert torch.equal(codec.semantic_image(torch.tensor([[[255]]])), torch.full((1, 3, 1, 1), -1.0))
 
@@ -217,7 +221,7 @@ def test_missing_is_zero_and_the_reference_is_frame_zero():
     model.config = replace(config, missing_is_zero=False)
     filled = model.encode_condition(condition).planes
     assert torch.allclose(filled[0, 1, :4], encode(condition.color[1] * 2 - 1), atol=1e-5)
-    generated = torch.rand(2, 3, 16, 24, generator=torch.Generator().manual_seed(5))
+    generated = torch.rand(2, 3, 8, 12, generator=torch.Generator().manual_seed(5))
     continued = model.encode_condition(condition, known=generated).planes
     assert torch.allclose(continued[0, 0], filled[0, 0], atol=1e-5)
     assert torch.allclose(continued[0, 1, :4], encode(generated[1] * 2 - 1), atol=1e-5)
@@ -231,7 +235,9 @@ def test_cuts_of_the_work_do_not_change_the_sample(model):
     condition = some_condition()
     samples = []
     for together in (True, False):
-        model.sampling = Sampling(modalities_together=together, guidance_together=together, frames_at_once=4 if together else 1)
+        model.sampling = Sampling(
+            modalities_together=together, guidance_together=together, frames_at_once=4 if together else 1
+        )
         samples.append(model.sample(condition, steps=3, seed=5, index=1))
     model.sampling = Sampling()
     first, second = samples
@@ -239,9 +245,9 @@ def test_cuts_of_the_work_do_not_change_the_sample(model):
         assert torch.allclose(z, second.latents[name], rtol=1e-3, atol=1e-3), name
     assert torch.allclose(first.rgb, second.rgb, atol=1e-3)
     assert torch.allclose(first.depth, second.depth, atol=0.1)
-    assert first.rgb.shape == (4, 3, 16, 24)
-    assert first.depth.shape == (4, 1, 16, 24)
-    assert first.semantics.shape == (4, 16, 24)
+    assert first.rgb.shape == (4, 3, 8, 12)
+    assert first.depth.shape == (4, 1, 8, 12)
+    assert first.semantics.shape == (4, 8, 12)
     assert 0 <= float(first.confidence.min()) <= float(first.confidence.max()) <= 1
     again = model.sample(condition, steps=3, seed=5, index=1)
     assert torch.equal(again.rgb, first.rgb)
@@ -253,7 +259,7 @@ def test_guidance_is_that_of_the_schedule_module(model):
     with torch.no_grad():
         encoded = model.encode_condition(some_condition(), torch.Generator().manual_seed(0))
         tokens = model.image_tokens(torch.cat([encoded.features, encoded.grey]))
-        x = torch.randn(1, 4, 4, 8, 12, generator=torch.Generator().manual_seed(1))
+        x = torch.randn(1, 4, 4, 4, 6, generator=torch.Generator().manual_seed(1))
         made = model._guided(encoded, ("depth",), tokens)(x, 700)
         inputs, step = torch.cat([x, encoded.planes], 2), torch.tensor([700])
         fixed = (step, torch.tensor([500]), torch.tensor([10]))
@@ -281,14 +287,26 @@ def test_every_input_of_the_network_matters(model):
     assert int(moved.argmax()) == 3
 
 
+def test_many_sequences_are_attended_in_parts(monkeypatch):
+    q, k, v = torch.randn(3, 13, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
+    whole = video_unet.attend(q, k, v, 2)
+    monkeypatch.setattr(video_unet, "MAX_ATTENTION_BATCH", 4)
+    assert torch.allclose(video_unet.attend(q, k, v, 2), whole, atol=1e-6)
+
+
 def test_other_numbers_of_frames_are_refused(model):
     for frames in (1, 3, 5):
         with pytest.raises(UsageError, match="fixed number of frames"):
             model.sample(some_condition(frames=frames), steps=1)
     with pytest.raises(UsageError, match="another number of frames"):
-        model.net(torch.zeros(1, 3, 12, 8, 12), *[torch.zeros(1, dtype=torch.long)] * 3, torch.zeros(1, 77, 16), torch.zeros(1, 4, 2, 16))
+        model.net(
+            torch.zeros(1, 3, 12, 4, 6),
+            *[torch.zeros(1, dtype=torch.long)] * 3,
+            torch.zeros(1, 77, 16),
+            torch.zeros(1, 4, 2, 16),
+        )
     with pytest.raises(UsageError, match="multiples of 4"):
-        model.sample(some_condition(height=18), steps=1)
+        model.sample(some_condition(height=10), steps=1)
 
 
 # training -------------------------------------------------------------------------------------------------------------
@@ -299,7 +317,7 @@ def batch_of(model, count=6):
     encoded = model.encode_condition(conditions, torch.Generator().manual_seed(0))
     rgb = torch.stack([c.color for c in conditions])
     depth = torch.stack([c.depth for c in conditions])
-    ids = torch.randint(0, 19, (count, 4, 16, 24), generator=torch.Generator().manual_seed(1))
+    ids = torch.randint(0, 19, (count, 4, 8, 12), generator=torch.Generator().manual_seed(1))
     return model.encode_truth(rgb, depth, ids, torch.Generator().manual_seed(2)), encoded
 
 
@@ -320,7 +338,11 @@ def test_a_training_step_moves_what_its_stage_says(stage, temporal):
     of_other_temporal = {n for n in before if n.startswith("net.first.") or (".res" in n and ".temporal." in n)}
     assert of_transformers
     assert of_other_temporal
-    frozen = {(1, "transformers"): set(), (2, "transformers"): of_transformers, (2, "all"): of_transformers | of_other_temporal}
+    frozen = {
+        (1, "transformers"): set(),
+        (2, "transformers"): of_transformers,
+        (2, "all"): of_transformers | of_other_temporal,
+    }
     assert moved == {n for n in before if n.startswith(("net.", "image_tokens."))} - frozen[stage, temporal]
 
 
@@ -406,7 +428,9 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
     )
     with monkeypatch.context() as watched:
         watched.setattr(
-            VideoUNet, "forward", lambda net, x, t, label, *rest: (passes.append(label.tolist()), forward(net, x, t, label, *rest))[1]
+            VideoUNet,
+            "forward",
+            lambda net, x, t, label, *rest: (passes.append(label.tolist()), forward(net, x, t, label, *rest))[1],
         )
         out = synthesize.run(config, street / "scene", street / "fused", tmp_path / "out")
     found = read_observations(out / "front_shift+1.0")
@@ -421,11 +445,33 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
         synthesize.run(replace(config, memory_budget_gb=0.5), street / "scene", street / "fused", tmp_path / "none")
 
 
+def test_the_released_resizing(street):
+    """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
+    from mudg.data.clips import ConditionRules, build_conditions, project_sparse
+    from mudg.data.cloudfile import read_fused
+    from mudg.data.scenefile import read_scene
+
+    scene, cloud = read_scene(street / "scene"), read_fused(street / "fused")
+    view = scene.frames_of("front")[0].view
+    native = ConditionRules(48, 32, published=True)
+    sparse = project_sparse(cloud, scene.tracks, view.resized(48, 32), native)
+    recorded = synthesize.recorded_images(scene, held_out=False)
+    made, _ = build_conditions(cloud, scene.tracks, [view], recorded, ConditionRules(12, 8, 48, 32, published=True))
+    assert torch.equal(made.color[0], (sparse.rgb * sparse.valid)[:, ::4, ::4])
+    depth = sparse.depth * sparse.valid
+    middle = (depth[1::4, 1::4] + depth[2::4, 1::4] + depth[1::4, 2::4] + depth[2::4, 2::4]) / 4
+    assert torch.allclose(made.depth[0, 0], middle, atol=1e-4)
+    assert bool((made.depth == 0).any())
+    assert made.reference.shape == (3, 8, 12)
+
+
 def test_short_trajectories_are_refused_in_words(street, tmp_path):
     root = tmp_path
     ToyStreet(times=[0.1 * n for n in range(3)]).write(root / "scene", width=48, height=32)
     fuse.run(FuseConfig(), root / "scene", root / "fused")
-    config = SynthesizeConfig(cameras=("front",), shifts_m=(1.0,), model=str(street / "model"), steps=20, precision="float32")
+    config = SynthesizeConfig(
+        cameras=("front",), shifts_m=(1.0,), model=str(street / "model"), steps=20, precision="float32"
+    )
     with pytest.raises(UsageError, match="fixed number of frames"):
         synthesize.run(config, root / "scene", root / "fused", root / "out")
 

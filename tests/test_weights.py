@@ -14,6 +14,7 @@ import pytest
 import torch
 from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_checkpoint
 
+from mudg import cli
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.data import weights
 from mudg.models.published import PublishedConfig
@@ -93,7 +94,12 @@ def test_published_counts_of_parameters(published_keys):
 def containers(state):
     deep = {"_forward_module." + name: value for name, value in state.items()}
     return {
-        "lightning": {"state_dict": state, "epoch": 3, "global_step": 100, "hyper_parameters": {"lr": 1e-5, "names": ["a"]}},
+        "lightning": {
+            "state_dict": state,
+            "epoch": 3,
+            "global_step": 100,
+            "hyper_parameters": {"lr": 1e-5, "names": ["a"]},
+        },
         "deepspeed": {"module": deep, "dp_world_size": 8, "mp_world_size": 1, "global_steps": 5, "ds_version": "0.9"},
         "plain": dict(state),
     }
@@ -207,7 +213,9 @@ def test_the_files_rescale_wins(tmp_path):
 
 
 def test_rescale_stays_exact_in_half_precision(tmp_path, complete):
-    model = converted(tmp_path, {"state_dict": complete}, ConvertConfig(resolution="320x512", dtype="bfloat16", shard_mb=1))
+    model = converted(
+        tmp_path, {"state_dict": complete}, ConvertConfig(resolution="320x512", dtype="bfloat16", shard_mb=1)
+    )
     assert model.dtype == torch.bfloat16
     assert torch.equal(model.schedule.scale, scale_table()[:1000])
     assert len(list((tmp_path / "out").glob("weights_*.safetensors"))) > 1
@@ -304,6 +312,19 @@ def test_the_memory_limit_holds(tmp_path, complete):
     with pytest.raises(ResourceError, match="memory"):
         convert.run(ConvertConfig(memory_gb=0.1), path, tmp_path / "model", network=TINY)
     assert not (tmp_path / "model").exists()
+
+
+def test_the_command_says_what_is_wrong(tmp_path, capsys):
+    (tmp_path / "512.ckpt").write_bytes(b"x")
+    (tmp_path / "there").mkdir()
+    cases = (
+        (["nothing.ckpt", "--to", "m"], 3, "no such checkpoint"),
+        ([str(tmp_path / "512.ckpt"), "--to", str(tmp_path / "there")], 2, "the folder exists"),
+        ([str(tmp_path / "512.ckpt"), "--to", str(tmp_path / "there"), "--overwrite"], 2, "something else"),
+    )
+    for words, code, message in cases:
+        assert cli.main(["convert", *words]) == code
+        assert message in capsys.readouterr().err
 
 
 def test_resolution_is_told_by_the_name_or_asked_for(tmp_path):

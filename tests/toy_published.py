@@ -29,7 +29,11 @@ TINY = PublishedConfig(
 
 def value_for(name, shape):
     """Values that depend on a tensor's published name alone (see golden/published_networks.md)."""
-    draw = np.random.RandomState(zlib.crc32(name.encode()) & 0xFFFFFFFF).standard_normal(int(np.prod(shape))).reshape(shape)
+    draw = (
+        np.random.RandomState(zlib.crc32(name.encode()) & 0xFFFFFFFF)
+        .standard_normal(int(np.prod(shape)))
+        .reshape(shape)
+    )
     if len(shape) >= 2:
         draw = draw / np.sqrt(np.prod(shape[1:]))
     else:

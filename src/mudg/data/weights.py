@@ -281,7 +281,17 @@ def _unpickle(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except MemoryError:
         raise
-    except (EOFError, RuntimeError, ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, *_UNPICKLING) as error:
+    except (
+        EOFError,
+        RuntimeError,
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        AttributeError,
+        OSError,
+        *_UNPICKLING,
+    ) as error:
         text = str(error)
         refused = re.search(r"GLOBAL (\S+)", text)
         if refused is not None:
@@ -290,12 +300,17 @@ def _unpickle(path: Path) -> Any:
                 where=str(path), expected="tensors, numbers, text and plain containers", got=refused.group(1),
                 remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors",
             ) from error  # fmt: skip
-        if "DefaultCPUAllocator" in text or "not enough memory" in text or "Cannot allocate memory" in text:
+        if out_of_memory(error):
             raise MemoryError(text) from error
         raise InputError(
             "not a readable checkpoint", where=str(path), expected="a complete file written by torch.save, or safetensors",
             got=text.splitlines()[0][:200] if text else type(error).__name__, remedy="fetch the file again and compare its size",
         ) from error  # fmt: skip
+
+
+def out_of_memory(error: Exception) -> bool:
+    """Whether an error of torch says that memory ran out."""
+    return any(sign in str(error) for sign in ("DefaultCPUAllocator", "not enough memory", "Cannot allocate memory"))
 
 
 # torch raises the pickle module's error; named through torch, since this package imports no pickle
@@ -322,7 +337,7 @@ def _without_prefix(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     try:
         with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError) as error:
         raise InputError("not a valid safetensors file", where=str(path), got=str(error)) from error
 
@@ -375,7 +390,9 @@ def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], wher
 # safetensors folders --------------------------------------------------------------------------------------------------
 
 
-def write_shards(folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None) -> dict[str, str]:
+def write_shards(
+    folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None
+) -> dict[str, str]:
     """Write tensors as `weights_NN.safetensors` of at most about `shard_bytes` each; returns file name -> sha256.
 
     dtype   number format of floating-point tensors (None: as they are). `folder` is a tree under a temporary name.

@@ -67,7 +67,9 @@ class CellAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[N,C,h,w] -> the same."""
         normed = self.norm(x)
-        q, k, v = (layer(normed).flatten(2).transpose(1, 2).unsqueeze(1) for layer in (self.query, self.key, self.value))
+        q, k, v = (
+            layer(normed).flatten(2).transpose(1, 2).unsqueeze(1) for layer in (self.query, self.key, self.value)
+        )
         mixed = functional.scaled_dot_product_attention(q, k, v)[:, 0]
         return x + self.out(mixed.transpose(1, 2).unflatten(2, x.shape[2:]))
 

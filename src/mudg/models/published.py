@@ -64,8 +64,13 @@ class PublishedConfig:
                 got=f"{self.text.width}, {self.image_tokens.context_width}",
             )  # fmt: skip
         if self.image.width != self.image_tokens.image_width:
-            raise UsageError("image tower and resampler differ in width", got=f"{self.image.width}, {self.image_tokens.image_width}")
-        if self.net.channels_in != 3 * self.codec.latent_channels or self.net.channels_out != self.codec.latent_channels:
+            raise UsageError(
+                "image tower and resampler differ in width", got=f"{self.image.width}, {self.image_tokens.image_width}"
+            )
+        if (
+            self.net.channels_in != 3 * self.codec.latent_channels
+            or self.net.channels_out != self.codec.latent_channels
+        ):
             raise UsageError(
                 "the network must take three latents (noisy, colour, depth) and give one",
                 expected=f"{3 * self.codec.latent_channels} -> {self.codec.latent_channels}",
@@ -204,7 +209,9 @@ class PublishedMDM(nn.Module):
         multiple = self.config.pixel_multiple
         if height % multiple or width % multiple or height < multiple or width < multiple:
             raise UsageError(
-                "image size does not fit the diffusion model", expected=f"multiples of {multiple} pixels", got=f"{width}x{height}"
+                "image size does not fit the diffusion model",
+                expected=f"multiples of {multiple} pixels",
+                got=f"{width}x{height}",
             )
 
     def check_frames(self, frames: int) -> None:
@@ -217,7 +224,10 @@ class PublishedMDM(nn.Module):
             )  # fmt: skip
 
     def encode_condition(
-        self, condition: Condition | Sequence[Condition], generator: torch.Generator | None = None, known: Tensor | None = None
+        self,
+        condition: Condition | Sequence[Condition],
+        generator: torch.Generator | None = None,
+        known: Tensor | None = None,
     ) -> Encoded:
         """Latents of the conditions of clips of one shape, and image features of their references (see `Encoded`).
 
@@ -239,7 +249,9 @@ class PublishedMDM(nn.Module):
         color = torch.cat([reference[:, None], color[:, 1:]], 1)
         seen = torch.cat([torch.ones_like(seen[:, :1]), seen[:, 1:]], 1)
         generator = self._posterior(generator)
-        planes = torch.cat([self._encode(color * 2 - 1, generator), self._encode(self.codec.depth_image(depth), generator)], 2)
+        planes = torch.cat(
+            [self._encode(color * 2 - 1, generator), self._encode(self.codec.depth_image(depth), generator)], 2
+        )
         images = torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])])
         with torch.no_grad():
             features = self.image(images)
@@ -265,7 +277,9 @@ class PublishedMDM(nn.Module):
             return None
         if generator is None:
             raise UsageError(
-                "encoding draws from the posterior and needs a generator", where="PublishedMDM", remedy='or use posterior = "mean"'
+                "encoding draws from the posterior and needs a generator",
+                where="PublishedMDM",
+                remedy='or use posterior = "mean"',
             )
         return generator
 
@@ -309,7 +323,9 @@ class PublishedMDM(nn.Module):
         text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
         features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
         self._seed_dropout(generator)
-        stated = self.predict(self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features))
+        stated = self.predict(
+            self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
+        )
         errors = (stated - self.schedule.velocity(x0, eps, t)).square().flatten(1).mean(1)
         shown = dict.fromkeys(names)
         terms = {m: float(errors[[n == m for n in names]].detach().mean()) for m in shown}
@@ -399,7 +415,15 @@ class PublishedMDM(nn.Module):
                 estimates.append(x0[0])
 
         x = noise.SAMPLERS[sampler](
-            velocity, draw(), self.schedule, indices, prediction="v", eta=eta, draw=draw, last="first_alpha", on_step=watch
+            velocity,
+            draw(),
+            self.schedule,
+            indices,
+            prediction="v",
+            eta=eta,
+            draw=draw,
+            last="first_alpha",
+            on_step=watch,
         )
         moved = torch.stack([(e - x[0]).abs().mean(1, keepdim=True) for e in estimates]).mean(0)
         return {m: x[n] for n, m in enumerate(names)}, moved
@@ -446,7 +470,9 @@ def choose_trainable(
     which is what its text says. Autoencoder and image tower never move.
     """
     if stage not in (1, 2) or temporal not in ("transformers", "all"):
-        raise UsageError("unknown training stage", expected="stage 1 or 2, temporal transformers or all", got=f"{stage}, {temporal}")
+        raise UsageError(
+            "unknown training stage", expected="stage 1 or 2, temporal transformers or all", got=f"{stage}, {temporal}"
+        )
     model.requires_grad_(False)
     model.net.requires_grad_(True)
     model.image_tokens.requires_grad_(True)

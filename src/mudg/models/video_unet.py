@@ -46,9 +46,15 @@ class VideoUNetConfig:
 
     def __post_init__(self) -> None:
         if len(self.multipliers) != len(self.attention):
-            raise UsageError("multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}")
+            raise UsageError(
+                "multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}"
+            )
         if self.width % GROUPS:
-            raise UsageError("the width is no multiple of the normalisation groups", expected=f"multiple of {GROUPS}", got=str(self.width))
+            raise UsageError(
+                "the width is no multiple of the normalisation groups",
+                expected=f"multiple of {GROUPS}",
+                got=str(self.width),
+            )
 
 
 class SeededDropout(nn.Module):
@@ -64,7 +70,11 @@ class SeededDropout(nn.Module):
         if not self.training or self.share == 0:
             return x
         if self.generator is None:
-            raise UsageError("dropout needs a generator for its draws", where="SeededDropout", remedy="call PublishedMDM.loss, or eval()")
+            raise UsageError(
+                "dropout needs a generator for its draws",
+                where="SeededDropout",
+                remedy="call PublishedMDM.loss, or eval()",
+            )
         keep = torch.rand(x.shape, generator=self.generator, device=self.generator.device) >= self.share
         return x * keep.to(x) / (1 - self.share)
 
@@ -72,7 +82,7 @@ class SeededDropout(nn.Module):
 def attend(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
     """Softmax attention of `query` [N,L,C] over `key`, `value` [N,M,C] with C split into `heads` -> [N,L,C]."""
     q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (query, key, value))
-    if len(q) > MAX_ATTENTION_BATCH and q.is_cuda:
+    if len(q) > MAX_ATTENTION_BATCH:
         parts = zip(*(x.split(MAX_ATTENTION_BATCH) for x in (q, k, v)))
         mixed = torch.cat([functional.scaled_dot_product_attention(*part) for part in parts])
     else:
@@ -300,7 +310,9 @@ class VideoUNet(nn.Module):
             outside = config.multipliers[level] * width
             for number in range(config.blocks + 1):
                 grow = level > 0 and number == config.blocks
-                self.up.append(Stage(inside + skips.pop(), outside, config, attention=config.attention[level], grow=grow))
+                self.up.append(
+                    Stage(inside + skips.pop(), outside, config, attention=config.attention[level], grow=grow)
+                )
                 inside = outside
         self.norm = nn.GroupNorm(GROUPS, inside)
         self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import concurrent.futures
 import multiprocessing
+import sys
 import zipfile
 from collections.abc import Mapping
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,14 +41,19 @@ LICENCE = (
 
 
 def run(
-    config: ConvertConfig, checkpoint: Path, to: Path, *, overwrite: bool = False, network: PublishedConfig = PublishedConfig()
+    config: ConvertConfig,
+    checkpoint: Path,
+    to: Path,
+    *,
+    overwrite: bool = False,
+    network: PublishedConfig | None = None,
 ) -> Path:
     """Convert one checkpoint; returns `to`, which is whole or not there.
 
     Args:
         config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file.
         to: folder of the model; replaced only with `overwrite`.
-        network: sizes of the network the checkpoint should hold (the published ones).
+        network: sizes of the network the checkpoint should hold (None: the published ones).
 
     Raises:
         UsageError: the folder exists, or the resolution cannot be told. InputError: not such a checkpoint; nothing is written.
@@ -60,20 +67,23 @@ def run(
     if not checkpoint.is_file():
         raise InputError("no such checkpoint", where=str(checkpoint))
     height, width = resolution(config, checkpoint)
-    network = replace(network, height=height, width=width)
+    network = replace(network or PublishedConfig(), height=height, width=width)
     limit = memory_limit(config, checkpoint)
+    if sys.platform != "linux":
+        log.warn("convert: this system has no limit of address space; a hostile file may take all memory")
     context = multiprocessing.get_context("spawn")
     with log.task("convert", 1) as bar, concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
         try:
             peak = pool.submit(_in_process, config, checkpoint, to, network, limit).result()
-        except concurrent.futures.process.BrokenProcessPool as error:
+        except BrokenProcessPool as error:
             raise ResourceError(
                 "the converting process was ended from outside, most likely for want of memory", where=str(checkpoint),
                 expected=f"about {limit / GIB:.0f} GiB of address space, of which the file takes most",
                 remedy="close other programs, or convert on a machine with more memory",
             ) from error  # fmt: skip
         bar.advance()
-    log.info(f"convert: {to} is whole; peak memory {peak / GIB:.1f} GiB, pages of the mapped file included")
+    memory = f"; peak memory {peak / GIB:.1f} GiB, pages of the mapped file included" if peak else ""
+    log.info(f"convert: {to} is whole{memory}")
     return to
 
 
@@ -107,26 +117,24 @@ def memory_limit(config: ConvertConfig, checkpoint: Path) -> int:
 
 
 def _in_process(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig, limit: int) -> int:
-    """Convert under a limit of address space; returns the peak of resident memory in bytes."""
+    """Convert under a limit of address space (Linux only); returns the peak of resident memory in bytes, 0 if unknown."""
     log.set_quiet(True)
     torch.set_num_threads(1)
-    try:
-        import resource
-    except ImportError:  # Windows: no such limit
+    if sys.platform != "linux":
         convert_file(config, checkpoint, to, network)
         return 0
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-    except OSError:  # no such file system: the limit would count from an unknown start
-        pages = 0
-    if pages:
-        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + limit,) * 2)
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + limit,) * 2)
     try:
         convert_file(config, checkpoint, to, network)
-    except MemoryError as error:
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not weights.out_of_memory(error):
+            raise
         raise ResourceError(
             "conversion needs more memory than it may take", where=str(checkpoint), expected=f"<= {limit / 1e9:.1f} GB",
-            got=(str(error).splitlines() or [""])[0][:200], remedy="raise --memory-gb; a file that wants much more than its size is suspect",
+            got=(str(error).splitlines() or [""])[0][:200], remedy="raise --memory-gb, unless the file should be small",
         ) from error  # fmt: skip
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
@@ -149,7 +157,13 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
     }  # fmt: skip
     published_model.write(
-        to, network, tensors, facts, _card(network, facts), dtype=DTYPES[config.dtype], shard_bytes=config.shard_mb << 20
+        to,
+        network,
+        tensors,
+        facts,
+        _card(network, facts),
+        dtype=DTYPES[config.dtype],
+        shard_bytes=config.shard_mb << 20,
     )
 
 
@@ -180,7 +194,8 @@ def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     for name in list(tensors):
         if name.startswith(_UNET + "time_embed."):
             tensors[name.replace(".time_embed.", ".class_embed.")] = tensors[name].clone()
-    return tensors, f"{2 * latent} input channels widened to {3 * latent}; label embedding copied from that of the noise step; untrained as such"
+    done = f"{2 * latent} input channels widened to {3 * latent}, label embedding copied from that of the noise step"
+    return tensors, done + "; not trained since"
 
 
 def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
@@ -196,7 +211,9 @@ def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], wh
     """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0, 1]."""
     for name, value in tensors.items():
         if not value.is_floating_point():
-            raise InputError("a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype))
+            raise InputError(
+                "a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype)
+            )
         if not bool(torch.isfinite(value).all()):
             raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
     scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
@@ -228,5 +245,6 @@ def _card(network: PublishedConfig, facts: Mapping[str, Any]) -> str:
     return (
         f"# Diffusion model converted from {facts['source']['file']}\n\n"
         f"Trained at {network.width}x{network.height}, {network.window} frames. SHA-256 of the source: {facts['source']['sha256']}.\n"
-        f"Adapted: {adapted}. Dynamic rescale down to {facts['base_scale']:g}, as the checkpoint says.\n\n## Licence\n\n{facts['licence']}\n"
+        f"Adapted: {adapted}. Dynamic rescale down to {facts['base_scale']:g}, as the checkpoint says.\n\n"
+        f"## Licence\n\n{facts['licence']}\n"
     )

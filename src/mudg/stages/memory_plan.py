@@ -128,7 +128,9 @@ def autoencoder_bytes(model: PublishedMDM, height: int, width: int, frames: int)
     codec, dtype = model.codec, model.dtype
     with torch.device("meta"):
         image = torch.empty(frames, 3, height, width, dtype=dtype)
-        z = torch.empty(frames, model.config.codec.latent_channels, height // codec.factor, width // codec.factor, dtype=dtype)
+        z = torch.empty(
+            frames, model.config.codec.latent_channels, height // codec.factor, width // codec.factor, dtype=dtype
+        )
     return max(
         peak_activations(lambda: codec.moments(image)), peak_activations(lambda: codec.decoder(codec.from_latent(z)))
     )
@@ -163,4 +165,6 @@ def choose(needs: Needs, budget_bytes: int, *, guidance: bool = True) -> MemoryP
     batches = [(MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1) for cut in CUTS]
     chosen = next((n for n, batch in enumerate(batches) if needs.one_video * batch <= room), len(CUTS) - 1)
     frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= room), 1)
-    return MemoryPlan(*CUTS[chosen], frames, needs.parameters, needs.one_video * batches[chosen], needs.one_frame * frames)
+    return MemoryPlan(
+        *CUTS[chosen], frames, needs.parameters, needs.one_video * batches[chosen], needs.one_frame * frames
+    )

@@ -1,8 +1,8 @@
 """Folders that hold a published-type diffusion model: writing, reading, and choosing how `synthesize` runs it.
 
-    model.json                kind, configuration, sha256 of the weight files, facts (source, licence, what was adapted)
-    weights_NN.safetensors    tensors under our names
-    MODEL_CARD.md
+model.json                kind, configuration, sha256 of the weight files, facts (source, licence, what was adapted)
+weights_NN.safetensors    tensors under our names
+MODEL_CARD.md
 """
 
 from __future__ import annotations
@@ -77,7 +77,9 @@ def read(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None, *,
     where = Path(folder) / mdm.MODEL_FILE
     content = store.read_json(where)
     if not isinstance(content, dict) or content.get("schema") != 1 or content.get("kind") != KIND:
-        raise InputError("not a published-type model of this version", where=str(where), expected=f"schema 1, kind {KIND}")
+        raise InputError(
+            "not a published-type model of this version", where=str(where), expected=f"schema 1, kind {KIND}"
+        )
     if not isinstance(content.get("files"), dict):
         raise InputError("the model's description names no files", where=str(where))
     with torch.device("meta"):
@@ -101,7 +103,9 @@ def load_any(config: SynthesizeConfig) -> MDM | PublishedMDM:
     if not is_published(config.model):
         return mdm.load(config.model)
     if config.steps < FEW_STEPS:
-        log.warn(f"synthesize: the published model was made for 50 denoising steps, asked for {config.steps} (--steps 50)")
+        log.warn(
+            f"synthesize: the published model was made for 50 denoising steps, asked for {config.steps} (--steps 50)"
+        )
     on_gpu = torch.cuda.is_available()
     bf16 = (config.precision != "float32") if on_gpu else choose_bf16(config.precision)
     model = read(Path(config.model), "cuda" if on_gpu else "cpu", torch.bfloat16 if on_gpu and bf16 else None)
@@ -147,7 +151,9 @@ def model_size(config: PublishedConfig, width_px: int) -> tuple[int, int]:
 def at_camera_size(sample: Sample, depth: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colour (bicubic), depth and classes (nearest) and confidence (bilinear) of a sample at the size of `view`."""
     if sample.rgb is None or sample.semantics is None:
-        raise InputError("a sample without colour or classes cannot be enlarged", where="published_model.at_camera_size")
+        raise InputError(
+            "a sample without colour or classes cannot be enlarged", where="published_model.at_camera_size"
+        )
     size = (view.camera.height, view.camera.width)
     rgb = functional.interpolate(sample.rgb, size=size, mode="bicubic", align_corners=False).clamp(0, 1)
     depth = functional.interpolate(depth, size=size, mode="nearest-exact")
