@@ -346,6 +346,25 @@ def test_a_training_step_moves_what_its_stage_says(stage, temporal):
     assert moved == {n for n in before if n.startswith(("net.", "image_tokens."))} - frozen[stage, temporal]
 
 
+def test_checkpointing_gives_the_same_gradients():
+    """Also where dropout draws: the second computation of a stage draws what the first one drew."""
+    gradients = []
+    for checkpointing in (False, True):
+        model = tiny_model()
+        truth, encoded = batch_of(model, 2)
+        moving = choose_trainable(model, 1)
+        model.net.train()
+        model.net.checkpointing = checkpointing
+        model.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+        gradients.append(torch.cat([p.grad.flatten() for p in moving]))
+    assert error(gradients[1], gradients[0]) < 1e-5
+    other = tiny_model()
+    choose_trainable(other, 1)
+    other.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+    undropped = torch.cat([p.grad.flatten() for p in other.parameters() if p.requires_grad])
+    assert error(undropped, gradients[0]) > 1e-2
+
+
 def test_loss_is_the_velocity_error_and_repeats(model):
     """Against the same numbers computed here, from the same draws, with the network's passes replaced by a known function."""
     truth, encoded = batch_of(model)

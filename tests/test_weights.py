@@ -218,6 +218,9 @@ def test_rescale_stays_exact_in_half_precision(tmp_path, complete):
     )
     assert model.dtype == torch.bfloat16
     assert torch.equal(model.schedule.scale, scale_table()[:1000])
+    again = published_model.read(tmp_path / "out", dtype=torch.float16)
+    assert again.dtype == torch.float16
+    assert torch.equal(again.scale, scale_table())
     assert len(list((tmp_path / "out").glob("weights_*.safetensors"))) > 1
 
 

@@ -13,11 +13,13 @@ Source: paper of MuDG, section on the multi-modal diffusion model; architecture 
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from mudg.base.errors import UsageError
 from mudg.models.mdm import sinusoid
@@ -289,6 +291,8 @@ class VideoUNet(nn.Module):
     def __init__(self, config: VideoUNetConfig) -> None:
         super().__init__()
         self.config = config
+        self.checkpointing = False
+        """Training: keep only what passes between stages, and compute the rest again in the backward pass."""
         width, top = config.width, len(config.multipliers) - 1
         self.time, self.label, self.fps = _embedding(width), _embedding(width), _embedding(width)
         _zero(self.fps[2])
@@ -343,14 +347,42 @@ class VideoUNet(nn.Module):
         h = x.flatten(0, 1)
         skips = []
         for number, stage in enumerate(self.down):
-            h = stage(h, embedding, text, image, frames)
+            h = self._run(stage, h, embedding, text, image, frames)
             if number == 0:
                 h = self.first(h, frames)
             skips.append(h)
-        h = self.middle(h, embedding, text, image, frames)
+        h = self._run(self.middle, h, embedding, text, image, frames)
         for stage in self.up:
-            h = stage(torch.cat([h, skips.pop()], 1), embedding, text, image, frames)
+            h = self._run(stage, torch.cat([h, skips.pop()], 1), embedding, text, image, frames)
         return self.leave(functional.silu(self.norm(h))).unflatten(0, (batch, frames))
+
+    def _run(self, stage: nn.Module, *inputs: Tensor | int) -> Tensor:
+        """A stage, kept for the backward pass or not. Dropout draws the same numbers when it is computed again."""
+        if not (self.checkpointing and self.training and torch.is_grad_enabled()):
+            return stage(*inputs)
+        generator = next((m.generator for m in stage.modules() if isinstance(m, SeededDropout)), None)
+        again = contextlib.nullcontext() if generator is None else _Replay(generator)
+        return checkpoint(
+            stage,
+            *inputs,
+            use_reentrant=False,
+            preserve_rng_state=False,
+            context_fn=lambda: (contextlib.nullcontext(), again),
+        )  # type: ignore[return-value]
+
+
+class _Replay:
+    """While it is entered, a generator draws again what it drew after this object was made."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self._generator, self._then = generator, generator.get_state()
+
+    def __enter__(self) -> None:
+        self._now = self._generator.get_state()
+        self._generator.set_state(self._then)
+
+    def __exit__(self, *_: object) -> None:
+        self._generator.set_state(self._now)
 
 
 def temporal_layers(net: VideoUNet, *, all_layers: bool) -> list[nn.Module]:

@@ -91,7 +91,10 @@ def read(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None, *,
         raise InputError("weights do not fit the configuration", where=str(folder), got=", ".join(wrong[:6]))
     model.load_state_dict(state, assign=True)
     model.adopt_scale()
-    return model.to(device=device, dtype=dtype).eval()
+    table = model.scale
+    model = model.to(device=device, dtype=dtype).eval()
+    model.scale = table.to(device)  # exact in any number format: it is part of the schedule
+    return model
 
 
 def load_any(config: SynthesizeConfig) -> MDM | PublishedMDM:
