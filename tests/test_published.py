@@ -460,6 +460,7 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
         assert bool(torch.isfinite(found[n].rgb).all())
         depth = found[n].depth[torch.isfinite(found[n].depth)]
         assert bool(((depth >= 0) & (depth <= 100)).all())
+        assert bool(found[n].mask.all()) == (n > 0)  # frame 0 shows the recorded place, not the shifted one
     with pytest.raises(ResourceError, match="memory budget"):
         synthesize.run(replace(config, memory_budget_gb=0.5), street / "scene", street / "fused", tmp_path / "none")
 
@@ -482,6 +483,19 @@ def test_the_released_resizing(street):
     assert torch.allclose(made.depth[0, 0], middle, atol=1e-4)
     assert bool((made.depth == 0).any())
     assert made.reference.shape == (3, 8, 12)
+
+
+def test_the_reference_fits_only_where_it_was_taken(street):
+    from mudg.data.scenefile import read_scene
+
+    scene = read_scene(street / "scene")
+    recorded = synthesize.recorded_images(scene, held_out=True)
+    view = scene.frames_of("front")[1].view
+    moved = view.world_from_cam.copy()
+    moved[:3, 3] += [0.0, 1.0, 0.0]
+    assert published_model.reference_fits(view, recorded)
+    assert not published_model.reference_fits(View(view.camera, moved, view.time_s), recorded)
+    assert not published_model.reference_fits(view, [])
 
 
 def test_short_trajectories_are_refused_in_words(street, tmp_path):

@@ -7,11 +7,12 @@ MODEL_CARD.md
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -20,6 +21,7 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.types import View
 from mudg.data import weights
+from mudg.data.clips import Recorded
 from mudg.models import mdm, published
 from mudg.models.mdm import MDM, Sample
 from mudg.models.published import PublishedConfig, PublishedMDM, Sampling
@@ -149,6 +151,19 @@ def model_size(config: PublishedConfig, width_px: int) -> tuple[int, int]:
     multiple = config.pixel_multiple
     width = max(multiple, round(width_px / multiple) * multiple)
     return width, max(multiple, round(width * config.height / config.width / multiple) * multiple)
+
+
+def reference_fits(view: View, recorded: Sequence[Recorded]) -> bool:
+    """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
+
+    The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a
+    picture from another place, and must not be used as if it were one from there.
+    """
+    for image in recorded:
+        moved = image.view.cam_from_world @ view.world_from_cam
+        if np.linalg.norm(moved[:3, 3]) < 0.05 and np.abs(moved[:3, :3] - np.eye(3)).max() < 0.01:
+            return True
+    return False
 
 
 def at_camera_size(sample: Sample, depth: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -208,11 +208,11 @@ def make_trajectory(job: Job) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one."""
     config = job.config
     scene, cloud = read_scene(job.scene), read_fused(job.fused)
-    model = published_model.load_any(config)
     path = trajectory_of(scene, job)
     folder = job.out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
+    model = published_model.load_any(config)
     camera = path.views[0].camera
     if isinstance(model, PublishedMDM):
         model.check_frames(min(len(path), model.config.window))
@@ -314,9 +314,11 @@ class ViewMaker:
         elif config.full_size:
             rgb, depth, ids, trust = enlarge(sample, depth, condition, fine)
             shown_views = fine.views
-        everything = torch.ones_like(trust[0], dtype=torch.bool)
+        usable = torch.ones_like(trust, dtype=torch.bool)
+        if isinstance(self._model, PublishedMDM) and not published_model.reference_fits(views[0], self._recorded):
+            usable[0] = False
         made = [
-            Observation(view, rgb[i], depth[i], ids[i], trust[i], everything, "virtual", SOURCE)
+            Observation(view, rgb[i], depth[i], ids[i], trust[i] * usable[i], usable[i], "virtual", SOURCE)
             for i, view in enumerate(shown_views)
         ]
         return sample, condition, made
