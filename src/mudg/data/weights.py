@@ -314,7 +314,7 @@ def out_of_memory(error: Exception) -> bool:
 
 
 # torch raises the pickle module's error; named through torch, since this package imports no pickle
-_UNPICKLING: tuple[type[Exception], ...] = (torch._weights_only_unpickler.UnpicklingError,)
+_UNPICKLING: tuple[type[Exception], ...] = (torch.serialization.pickle.UnpicklingError,)  # type: ignore[attr-defined]
 
 
 def _named_tensors(content: Any) -> dict[str, Tensor]:

@@ -144,7 +144,7 @@ class Decoder(nn.Module):
     def forward(self, z: Tensor) -> Tensor:
         h = self.middle(self.enter(z))
         for level in reversed(self.up):  # type: ignore[call-overload]
-            for block in level.blocks:
+            for block in level.blocks:  # type: ignore[union-attr]
                 h = block(h)
             if level.scale is not None:
                 h = level.scale(functional.interpolate(h, scale_factor=2.0, mode="nearest"))

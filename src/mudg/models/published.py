@@ -373,7 +373,10 @@ class PublishedMDM(nn.Module):
                 before = self.codec.decode({"rgb": before.to(self.device)}, self.sampling.frames_at_once).rgb
             encoded = self.encode_condition(condition, seeds.torch_generator(seed, index, "posterior"), before)
             tokens = self.image_tokens(torch.cat([encoded.features, encoded.grey]).to(self.image_tokens.queries.dtype))
-            groups = [tuple(modalities)] if self.sampling.modalities_together else [(m,) for m in modalities]
+            together: tuple[Modality, ...] = tuple(modalities)
+            groups = (
+                [together] if self.sampling.modalities_together else [together[n : n + 1] for n in range(len(together))]
+            )
             latents: dict[Modality, Tensor] = {}
             change: Tensor | None = None
             for names in groups:

@@ -126,7 +126,8 @@ def _in_process(config: ConvertConfig, checkpoint: Path, to: Path, network: Publ
     import resource
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + limit,) * 2)
+    most = pages * resource.getpagesize() + limit
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
     try:
         convert_file(config, checkpoint, to, network)
     except (MemoryError, RuntimeError) as error:
