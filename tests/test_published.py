@@ -475,7 +475,7 @@ def test_the_released_resizing(street):
     view = scene.frames_of("front")[0].view
     native = ConditionRules(48, 32, published=True)
     sparse = project_sparse(cloud, scene.tracks, view.resized(48, 32), native)
-    recorded = synthesize.recorded_images(scene, held_out=False)
+    recorded = synthesize.recorded_images(scene, held_out=False, classes=False)
     made, _ = build_conditions(cloud, scene.tracks, [view], recorded, ConditionRules(12, 8, 48, 32, published=True))
     assert torch.equal(made.color[0], (sparse.rgb * sparse.valid)[:, ::4, ::4])
     depth = sparse.depth * sparse.valid
@@ -489,7 +489,7 @@ def test_the_reference_fits_only_where_it_was_taken(street):
     from mudg.data.scenefile import read_scene
 
     scene = read_scene(street / "scene")
-    recorded = synthesize.recorded_images(scene, held_out=True)
+    recorded = synthesize.recorded_images(scene, held_out=True, classes=False)
     view = scene.frames_of("front")[1].view
     moved = view.world_from_cam.copy()
     moved[:3, 3] += [0.0, 1.0, 0.0]
