@@ -56,6 +56,12 @@ def _learn(args: f.Learn) -> dict[str, Any]:
     return {"model": learn.run(args.settings, args.out, overwrite=args.overwrite)}
 
 
+def _convert(args: f.Convert) -> dict[str, Any]:
+    from mudg.stages import convert
+
+    return {"model": convert.run(args.settings, args.checkpoint, args.to, overwrite=args.overwrite)}
+
+
 def _synthesize(args: f.Synthesize) -> dict[str, Any]:
     from mudg.stages import synthesize
 
@@ -163,6 +169,12 @@ VERBS: dict[str, Verb] = {
          "torchrun --nproc-per-node 8 -m mudg learn --parallel fsdp --config recipe.yaml --out runs/mdm"),
         _learn,
     ),
+    "convert": Verb(
+        "Published checkpoint -> model folder for synthesize.",
+        ("mudg convert 1024-mdm-checkpoint.ckpt --to models/mudg_1024",
+         "mudg convert model.ckpt --to models/dc_512 --resolution 320x512 --dtype bfloat16"),
+        _convert,
+    ),
     "synthesize": Verb(
         "Dense RGB, depth and semantics on trajectories nobody drove.",
         ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",),
@@ -195,6 +207,7 @@ SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("the steps, one by one", ("ingest", "annotate", "fuse", "learn", "synthesize", "fit", "render", "score")),
     ("measure", ("bench",)),
+    ("models from elsewhere", ("convert",)),
 )
 
 

@@ -78,6 +78,19 @@ class Learn(Output):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Convert(Common):
+    """Flags of ``mudg convert``."""
+
+    checkpoint: Annotated[Path, tyro.conf.Positional, arg(metavar="CKPT")]
+    """Checkpoint of MuDG, or of DynamiCrafter-512 or -1024: .ckpt, .pt or .safetensors."""
+    to: Annotated[Path, arg(metavar="FOLDER")]
+    """Model folder to write."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace a model that is there already."""
+    settings: Annotated[stage_config.ConvertConfig, arg(name="")] = stage_config.ConvertConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Synthesize(Output):
     """Flags of ``mudg synthesize``."""
 
@@ -176,8 +189,7 @@ class Doctor(Common):
 
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
-    "synthesize": Synthesize, "fit": Fit, "render": Render, "score": Score,
-    "bench": Bench,
+    "convert": Convert, "synthesize": Synthesize, "fit": Fit, "render": Render, "score": Score, "bench": Bench,
 }  # fmt: skip
 
 

@@ -60,5 +60,5 @@ def test_help_lists_only_what_exists() -> None:
     overview = cli.overview()
     for name in cli.VERBS:
         assert f"\n  {name}" in overview
-    for later in ("view", "export", "convert", "bench"):
+    for later in ("view", "export"):
         assert f"\n  {later}" not in overview

@@ -61,7 +61,11 @@ class ConditionRules:
     occluder_m: float = 0.2
     """Side of the square with which points hide what lies behind them."""
     published: bool = False
-    """The published system's condition: points only, 0 where nothing was seen, no filling, no warping."""
+    """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
+
+    With a fine size it is projected at that size (the camera's) and brought down as the published training did: colour by
+    the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,10 +300,18 @@ def _filled(sparse: Sparse, rules: ConditionRules) -> tuple[Tensor, Tensor, Tens
 def _published_condition(
     cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules
 ) -> Condition:
-    sparse = [project_sparse(cloud, tracks, view, rules) for view in views]
+    own = (rules.width, rules.height)
+    native = (rules.fine_width or rules.width, rules.fine_height or rules.height)
+    seen = views if native == own else [view.resized(*native) for view in views]
+    sparse = [project_sparse(cloud, tracks, view, rules) for view in seen]
     valid = torch.stack([s.valid for s in sparse])[:, None]
     color = torch.stack([s.rgb for s in sparse]) * valid
-    return Condition(tuple(views), color, torch.stack([s.depth for s in sparse])[:, None] * valid, valid, reference)
+    depth = torch.stack([s.depth for s in sparse])[:, None] * valid
+    if native != own:
+        color = functional.interpolate(color, size=own[::-1], mode="nearest")
+        depth = functional.interpolate(depth, size=own[::-1], mode="bilinear", align_corners=False)
+        valid = (color > 0).any(1, keepdim=True) | (depth > 0)
+    return Condition(tuple(views), color, depth, valid, reference)
 
 
 def _reference(view: View, recorded: Sequence[Recorded], rules: ConditionRules) -> Tensor:
@@ -307,6 +319,9 @@ def _reference(view: View, recorded: Sequence[Recorded], rules: ConditionRules) 
     if not own:
         return torch.zeros(3, rules.height, rules.width)
     nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
+    if rules.published and rules.fine_width:
+        size = (rules.height, rules.width)
+        return functional.interpolate(_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
     return _tensor(resize_image(nearest.rgb, rules.width, rules.height))
 
 

@@ -20,20 +20,13 @@ from mudg.models.vae import ChannelNorm
 class UNetShape(Protocol):
     """What the network reads of a model's configuration (see `MDMConfig`)."""
 
-    @property
-    def patch(self) -> int: ...
-    @property
-    def widths(self) -> tuple[int, ...]: ...
-    @property
-    def blocks(self) -> tuple[int, ...]: ...
-    @property
-    def spatial_attention(self) -> tuple[bool, ...]: ...
-    @property
-    def temporal_attention(self) -> tuple[bool, ...]: ...
-    @property
-    def head_width(self) -> int: ...
-    @property
-    def embed_width(self) -> int: ...
+    patch: int
+    widths: tuple[int, ...]
+    blocks: tuple[int, ...]
+    spatial_attention: tuple[bool, ...]
+    temporal_attention: tuple[bool, ...]
+    head_width: int
+    embed_width: int
 
 
 def sinusoid(t: Tensor, width: int) -> Tensor:

@@ -238,8 +238,30 @@ class SynthesizeConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     processes: int = Field(default=0, ge=0)
-    """Trajectories made at the same time, one thread each (0 = one per core)."""
+    """Trajectories made at the same time, one thread each (0 = one per core; one for a published-type model)."""
+    guidance: float = Field(default=7.5, ge=1)
+    """Published-type models: weight of the guided prediction; 1 = none, at half the work."""
+    guidance_rescale: float = Field(default=0.7, ge=0, le=1)
+    """Published-type models: how far the spread of the guided prediction is pulled back."""
+    memory_budget_gb: float = Field(default=0.0, ge=0)
+    """Published-type models: cut the work so that it fits into this memory (0 = do not cut)."""
     seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ConvertConfig:
+    """Turn a published checkpoint into a model folder."""
+
+    resolution: Literal["auto", "320x512", "576x1024"] = "auto"
+    """Height and width that the checkpoint was trained at (auto = 512 or 1024 in the file's name)."""
+    dtype: Literal["keep", "float32", "float16", "bfloat16"] = "keep"
+    """Number format of the weights that are written."""
+    towers: str = ""
+    """OpenCLIP ViT-H/14 weights for a checkpoint that lacks them (empty = the checkpoint has its own)."""
+    shard_mb: int = Field(default=1024, ge=1)
+    """Weight files are at most about this large."""
+    memory_gb: float = Field(default=0.0, ge=0)
+    """Address space that reading the checkpoint may take beyond the program's own (0 = from the file's size)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

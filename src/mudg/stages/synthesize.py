@@ -37,7 +37,9 @@ from mudg.data.observations import ObservationWriter
 from mudg.data.scenefile import read_image, read_label, read_scene
 from mudg.models import mdm
 from mudg.models.mdm import MDM, Sample
+from mudg.models.published import PublishedMDM
 from mudg.models.vae import Modality
+from mudg.stages import published_model
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.learn_score import class_image, depth_image, rgb_image
 from mudg.stages.precision import choose_bf16
@@ -69,7 +71,10 @@ def run(config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, overwr
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
-    mdm.load(config.model)  # fails now rather than in every process
+    if published_model.is_published(config.model):
+        config = replace(config, processes=config.processes or 1)  # one copy of a large model in memory
+    else:
+        mdm.load(config.model)  # fails now rather than in every process
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": mdm.digest(config.model)}
     directory = store.RunDir.open(out, "synthesize", to_dict(config), inputs, _VERSION, overwrite)
     if directory.complete:
@@ -217,16 +222,21 @@ def make_trajectory(job: Job) -> int:
     config = job.config
     scene, cloud = read_scene(job.scene), read_fused(job.fused)
     cloud = cloud if config.given_classes else without_classes(cloud)
-    model = mdm.load(config.model)
     path = trajectory_of(scene, job)
     folder = job.out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
+    model = published_model.load_any(config)
     camera = path.views[0].camera
-    area = model.config.area_px
-    width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
-    fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
-    rules = ConditionRules(width, height, *fine)
+    if isinstance(model, PublishedMDM):
+        model.check_frames(min(len(path), model.config.window))
+        width, height = published_model.model_size(model.config, config.width_px)
+        rules = ConditionRules(width, height, camera.width, camera.height, published=True)
+    else:
+        area = model.config.area_px
+        width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
+        fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
+        rules = ConditionRules(width, height, *fine)
     recorded = recorded_images(scene, config.held_out_images, config.given_classes)
     maker = ViewMaker(model, scene, cloud, recorded, rules, config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
@@ -285,7 +295,7 @@ class ViewMaker:
 
     def __init__(
         self,
-        model: MDM,
+        model: MDM | PublishedMDM,
         scene: Scene,
         cloud: FusedCloud,
         recorded: Sequence[Recorded],
@@ -322,14 +332,20 @@ class ViewMaker:
             raise InputError("the model does not produce all modalities", where=config.model)
         sky = (sample.semantics == mdm.SKY).unsqueeze(1) & ~condition.valid
         depth = torch.where(sky, torch.nan, sample.depth)
-        rgb, ids, trust, shown = sample.rgb, sample.semantics, sample.confidence, condition
-        if config.full_size:
+        rgb, ids, trust = sample.rgb, sample.semantics, sample.confidence
+        shown_views = condition.views
+        if config.full_size and isinstance(self._model, PublishedMDM):
+            rgb, depth, ids, trust = published_model.at_camera_size(sample, depth, views[0])
+            shown_views = tuple(views)
+        elif config.full_size:
             rgb, depth, ids, trust = enlarge(sample, depth, condition, fine)
-            shown = fine
-        everything = torch.ones_like(trust[0], dtype=torch.bool)
+            shown_views = fine.views
+        usable = torch.ones_like(trust, dtype=torch.bool)
+        if isinstance(self._model, PublishedMDM) and not published_model.reference_fits(views[0], self._recorded):
+            usable[0] = False
         made = [
-            Observation(view, rgb[i], depth[i], ids[i], trust[i], everything, "virtual", SOURCE)
-            for i, view in enumerate(shown.views)
+            Observation(view, rgb[i], depth[i], ids[i], trust[i] * usable[i], usable[i], "virtual", SOURCE)
+            for i, view in enumerate(shown_views)
         ]
         return sample, condition, made
 

@@ -1,0 +1,251 @@
+"""convert: a published checkpoint -> a model folder that `synthesize` and training read.
+
+The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's restricted
+unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so that the
+text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no modality label) are widened as the paper says.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import multiprocessing
+import sys
+import zipfile
+from collections.abc import Mapping
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.data import weights
+from mudg.models import clip
+from mudg.models.clip import TextTower
+from mudg.models.published import SCALE_ENTRIES, PublishedConfig, PublishedMDM
+from mudg.stages import published_model
+from mudg.stages.config import ConvertConfig
+
+GIB = 1 << 30
+_UNET = "model.diffusion_model."
+_ENTER = _UNET + "input_blocks.0.0.weight"
+DTYPES = {"keep": None, "float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+LICENCE = (
+    "Weights keep the terms of those who published them; read the page they came from before any use. The code of MuDG and of "
+    "DynamiCrafter is Apache-2.0; the data they were trained on have licences of their own (the Waymo Open Dataset is for "
+    "non-commercial use)."
+)
+
+
+def run(
+    config: ConvertConfig,
+    checkpoint: Path,
+    to: Path,
+    *,
+    overwrite: bool = False,
+    network: PublishedConfig | None = None,
+) -> Path:
+    """Convert one checkpoint; returns `to`, which is whole or not there.
+
+    Args:
+        config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file.
+        to: folder of the model; replaced only with `overwrite`.
+        network: sizes of the network the checkpoint should hold (None: the published ones).
+
+    Raises:
+        UsageError: the folder exists, or the resolution cannot be told. InputError: not such a checkpoint; nothing is written.
+        ResourceError: memory limit or disk.
+    """
+    checkpoint, to = Path(checkpoint), Path(to)
+    if to.exists() and not overwrite:
+        raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
+    if to.exists() and not (to / "model.json").is_file():
+        raise UsageError("the folder holds something else than a model", where=str(to), remedy="choose another --to")
+    if not checkpoint.is_file():
+        raise InputError("no such checkpoint", where=str(checkpoint))
+    height, width = resolution(config, checkpoint)
+    network = replace(network or PublishedConfig(), height=height, width=width)
+    limit = memory_limit(config, checkpoint)
+    if sys.platform != "linux":
+        log.warn("convert: this system has no limit of address space; a hostile file may take all memory")
+    context = multiprocessing.get_context("spawn")
+    with log.task("convert", 1) as bar, concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        try:
+            peak = pool.submit(_in_process, config, checkpoint, to, network, limit).result()
+        except BrokenProcessPool as error:
+            raise ResourceError(
+                "the converting process was ended from outside, most likely for want of memory", where=str(checkpoint),
+                expected=f"about {limit / GIB:.0f} GiB of address space, of which the file takes most",
+                remedy="close other programs, or convert on a machine with more memory",
+            ) from error  # fmt: skip
+        bar.advance()
+    memory = f"; peak memory {peak / GIB:.1f} GiB, pages of the mapped file included" if peak else ""
+    log.info(f"convert: {to} is whole{memory}")
+    return to
+
+
+def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
+    """Height and width that the checkpoint was trained at: as configured, else told by the file's name."""
+    if config.resolution != "auto":
+        height, width = config.resolution.split("x")
+        return int(height), int(width)
+    for part in (checkpoint.name, checkpoint.parent.name):
+        for mark, size in (("1024", (576, 1024)), ("512", (320, 512))):
+            if mark in part:
+                return size
+    raise UsageError(
+        "the file's name does not tell which resolution the model was trained at", where=str(checkpoint), expected="512 or 1024 in it",
+        remedy="add --resolution 320x512 or --resolution 576x1024",
+    )  # fmt: skip
+
+
+def memory_limit(config: ConvertConfig, checkpoint: Path) -> int:
+    """Address space in bytes that conversion may add to what a process with torch has.
+
+    The file, mapped (or read, and then copied once, where its format cannot be mapped), twice the largest weight file
+    written, 3 GiB for working.
+    """
+    if config.memory_gb:
+        return int(config.memory_gb * 1e9)
+    size = checkpoint.stat().st_size
+    towers = Path(config.towers).stat().st_size if config.towers and Path(config.towers).is_file() else 0
+    copies = 1 if zipfile.is_zipfile(checkpoint) else 2
+    return copies * (size + towers) + 2 * config.shard_mb * (1 << 20) + 3 * GIB
+
+
+def _in_process(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig, limit: int) -> int:
+    """Convert under a limit of address space (Linux only); returns the peak of resident memory in bytes, 0 if unknown."""
+    log.set_quiet(True)
+    torch.set_num_threads(1)
+    if sys.platform != "linux":
+        convert_file(config, checkpoint, to, network)
+        return 0
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + limit
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    try:
+        convert_file(config, checkpoint, to, network)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not weights.out_of_memory(error):
+            raise
+        raise ResourceError(
+            "conversion needs more memory than it may take", where=str(checkpoint), expected=f"<= {limit / 1e9:.1f} GB",
+            got=(str(error).splitlines() or [""])[0][:200], remedy="raise --memory-gb, unless the file should be small",
+        ) from error  # fmt: skip
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig) -> None:
+    """The conversion itself, in this process (see `run` for errors)."""
+    found = weights.read_checkpoint(checkpoint)
+    if config.towers:
+        found = weights.with_towers(found, weights.read_checkpoint(Path(config.towers)))
+    refuse_relatives(found, checkpoint)
+    found, adapted = widen(found)
+    tensors = weights.match(found, wanted_shapes(network), str(checkpoint))
+    _check_values(found, tensors, checkpoint)
+    base_scale = float(tensors["scale"][-1])
+    network = replace(network, schedule=replace(network.schedule, base_scale=base_scale))
+    text = {name.removeprefix("text."): tensors.pop(name) for name in list(tensors) if name.startswith("text.")}
+    tensors["text"] = embed_captions(network, text)
+    facts = {
+        "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
+        "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
+    }  # fmt: skip
+    published_model.write(
+        to,
+        network,
+        tensors,
+        facts,
+        _card(network, facts),
+        dtype=DTYPES[config.dtype],
+        shard_bytes=config.shard_mb << 20,
+    )
+
+
+def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
+    """InputError for DynamiCrafter-256, which looks alike and is another model."""
+    marks = [name for name in found if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
+    if marks:
+        raise InputError(
+            "this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where), got=", ".join(marks[:3]),
+            expected="MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule that never "
+            "reaches pure noise and no dynamic rescale, and weighs its image attention by learnt factors",
+            remedy="take the 512 or 1024 checkpoint",
+        )  # fmt: skip
+
+
+def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+    """A checkpoint with 8 input channels made one with 12 and a modality label; others unchanged. Also says what was done.
+
+    The condition's four input channels are used twice, for colour and for depth, and the whole kernel, noise channels
+    included, is halved; the label's embedding starts as a copy of that of the noise step. Both as in the published training.
+    """
+    tensors = dict(found)
+    kernel = tensors.get(_ENTER)
+    if kernel is None or kernel.ndim != 4 or kernel.shape[1] % 2 or any(".class_embed." in name for name in tensors):
+        return tensors, ""
+    latent = kernel.shape[1] // 2
+    tensors[_ENTER] = torch.cat([kernel, kernel[:, latent:]], 1) * 0.5
+    for name in list(tensors):
+        if name.startswith(_UNET + "time_embed."):
+            tensors[name.replace(".time_embed.", ".class_embed.")] = tensors[name].clone()
+    done = f"{2 * latent} input channels widened to {3 * latent}, label embedding copied from that of the noise step"
+    return tensors, done + "; not trained since"
+
+
+def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
+    """Our name -> shape of everything that a checkpoint must hold: the model, the text tower, the table of the dynamic rescale."""
+    with torch.device("meta"):
+        model, tower = PublishedMDM(network), TextTower(network.text, network.vocabulary)
+    shapes = {name: tuple(value.shape) for name, value in model.state_dict().items() if name != "text"}
+    shapes |= {f"text.{name}": tuple(value.shape) for name, value in tower.state_dict().items()}
+    return shapes | {"scale": (SCALE_ENTRIES,)}
+
+
+def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: Path) -> None:
+    """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0, 1]."""
+    for name, value in tensors.items():
+        if not value.is_floating_point():
+            raise InputError(
+                "a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype)
+            )
+        if not bool(torch.isfinite(value).all()):
+            raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
+    scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
+    if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
+        raise InputError(
+            "the table of the dynamic rescale is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
+            got=f"{float(scale.min())} .. {float(scale.max())}",
+        )  # fmt: skip
+    if alpha_bar is not None and abs(float(alpha_bar.flatten()[-1])) > 1e-6:
+        raise InputError(
+            "the checkpoint's noise schedule keeps signal at its last step", where=f"{where}: alphas_cumprod[-1]", expected="0",
+            got=str(float(alpha_bar.flatten()[-1])), remedy="this is another model, though its tensors have the same names",
+        )  # fmt: skip
+
+
+@torch.no_grad()
+def embed_captions(network: PublishedConfig, tower_weights: Mapping[str, Tensor]) -> Tensor:
+    """Token vectors f32[2,77,D] of the published caption and of the empty one, by the checkpoint's own text tower."""
+    with torch.device("meta"):
+        tower = TextTower(network.text, network.vocabulary)
+    tower.load_state_dict({n: t if n == "tokens.weight" else t.float() for n, t in tower_weights.items()}, assign=True)
+    ids = torch.stack([clip.caption_tokens(clip.CAPTION), clip.caption_tokens("")])
+    tower.tokens = torch.nn.Embedding.from_pretrained(tower.tokens.weight[ids.flatten()].float())
+    return tower.eval()(torch.arange(ids.numel()).view_as(ids)).float()
+
+
+def _card(network: PublishedConfig, facts: Mapping[str, Any]) -> str:
+    adapted = facts["adapted"] or "nothing"
+    return (
+        f"# Diffusion model converted from {facts['source']['file']}\n\n"
+        f"Trained at {network.width}x{network.height}, {network.window} frames. SHA-256 of the source: {facts['source']['sha256']}.\n"
+        f"Adapted: {adapted}. Dynamic rescale down to {facts['base_scale']:g}, as the checkpoint says.\n\n"
+        f"## Licence\n\n{facts['licence']}\n"
+    )

@@ -1,0 +1,557 @@
+"""The published networks against golden values, and a tiny model of that kind from condition to observation."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_published import TINY, fill, tiny_checkpoint, tiny_model
+from toy_scene import ToyStreet
+
+from mudg.base import palette
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.store import read_safetensors
+from mudg.base.types import Camera, Condition, View
+from mudg.core import noise
+from mudg.data.observations import read_observations
+from mudg.models import clip, published, video_unet
+from mudg.models.clip import ImageTower, TextTower, TowerConfig
+from mudg.models.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
+from mudg.models.published import PublishedConfig, Sampling, choose_trainable
+from mudg.models.resampler import Resampler, ResamplerConfig
+from mudg.models.video_unet import VideoUNet, VideoUNetConfig
+from mudg.stages import convert, fuse, memory_plan, published_model, synthesize
+from mudg.stages.config import ConvertConfig, FuseConfig, SynthesizeConfig
+
+GOLDEN = Path(__file__).parent / "golden"
+TOLERANCE = 1e-4
+
+
+def golden(name):
+    return {k: torch.from_numpy(v.copy()) for k, v in read_safetensors(GOLDEN / f"{name}.safetensors").items()}
+
+
+def error(made, wanted):
+    return float((made - wanted).norm() / wanted.norm())
+
+
+def some_condition(frames=4, height=8, width=12, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
+    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
+    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    return Condition(
+        views, draw(frames, 3, height, width), 3 + 60 * draw(frames, 1, height, width), draw(frames, 1, height, width) > 0.5,
+        draw(3, height, width),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_model()
+
+
+# golden values --------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def test_denoising_network_equals_the_reference():
+    values, theirs = golden("published_unet"), json.loads((GOLDEN / "published_unet.json").read_text())
+    config = VideoUNetConfig(
+        channels_in=theirs["in_channels"], channels_out=theirs["out_channels"], width=theirs["model_channels"],
+        multipliers=tuple(theirs["channel_mult"]), blocks=theirs["num_res_blocks"],
+        attention=tuple(2**level in theirs["attention_resolutions"] for level in range(len(theirs["channel_mult"]))),
+        head_width=theirs["num_head_channels"], context_width=theirs["context_dim"], dropout=theirs["dropout"],
+    )  # fmt: skip
+    net = fill(VideoUNet(config), "net.", "model.diffusion_model.")
+    text, image = values["context"][:, :77], values["context"][:, 77:].unflatten(1, (16, 16))
+    made = net(values["x"].transpose(1, 2), values["timesteps"], values["labels"], values["fps"], text, image)
+    assert error(made.transpose(1, 2), values["y"]) < TOLERANCE
+
+
+@torch.no_grad()
+def test_autoencoder_equals_the_reference():
+    values = golden("published_vae")
+    codec = fill(Autoencoder(AutoencoderConfig(width=32)), "codec.", "first_stage_model.")
+    mean, log_variance = codec.moments(values["x"])
+    assert error(torch.cat([mean, log_variance], 1), values["moments"]) < TOLERANCE
+    assert error(codec.encode(values["x"]), values["z"] * LATENT_SCALE) < TOLERANCE
+    assert error(codec.decode_image(values["z"] * LATENT_SCALE), values["decoded"]) < TOLERANCE
+
+
+@torch.no_grad()
+def test_resampler_equals_the_reference():
+    values = golden("published_resampler")
+    config = ResamplerConfig(64, 2, 16, 3, 4, 16, 80, 48, 4)
+    made = fill(Resampler(config), "image_tokens.", "image_proj_model.")(values["x"])
+    assert made.shape == (len(values["x"]), 16, 4, 48)
+    assert error(made.flatten(1, 2), values["y"]) < TOLERANCE
+
+
+# towers ---------------------------------------------------------------------------------------------------------------
+
+
+def twin_block(x, block, mask):
+    """A pre-norm block by torch's own multi-head attention."""
+    width = x.shape[-1]
+    attention = torch.nn.MultiheadAttention(width, block.heads, batch_first=True).double()
+    with torch.no_grad():
+        attention.in_proj_weight.copy_(block.query_key_value.weight)
+        attention.in_proj_bias.copy_(block.query_key_value.bias)
+        attention.out_proj.weight.copy_(block.out.weight)
+        attention.out_proj.bias.copy_(block.out.bias)
+    normed = torch.nn.functional.layer_norm(x, (width,), block.norm1.weight.double(), block.norm1.bias.double())
+    x = x + attention(normed, normed, normed, attn_mask=mask, need_weights=False)[0]
+    normed = torch.nn.functional.layer_norm(x, (width,), block.norm2.weight.double(), block.norm2.bias.double())
+    h = normed @ block.feed_in.weight.double().T + block.feed_in.bias.double()
+    h = h * 0.5 * (1 + torch.erf(h / math.sqrt(2)))
+    return x + h @ block.feed_out.weight.double().T + block.feed_out.bias.double()
+
+
+@torch.no_grad()
+def test_text_tower_equals_its_float64_twin():
+    tower = fill(TextTower(TowerConfig(32, 3, 4)), "text.", "cond_stage_model.model.")
+    ids = torch.stack([clip.caption_tokens(clip.CAPTION), clip.caption_tokens("")])
+    x = tower.tokens.weight.double()[ids] + tower.places.double()
+    mask = torch.full((77, 77), float("-inf"), dtype=torch.float64).triu(1)
+    for block in list(tower.blocks)[:-1]:  # the last block is not run
+        x = twin_block(x, block, mask)
+    x = torch.nn.functional.layer_norm(x, (32,), tower.norm.weight.double(), tower.norm.bias.double())
+    assert error(tower(ids).double(), x) < 1e-5
+
+
+@torch.no_grad()
+def test_image_tower_equals_its_float64_twin():
+    tower = fill(ImageTower(TowerConfig(32, 2, 4), side=42), "image.", "embedder.model.")
+    image = torch.rand(2, 3, 50, 90, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    cells = clip.prepare_image(image, 42).double().unfold(2, 14, 14).unfold(3, 14, 14)
+    cells = cells.permute(0, 2, 3, 1, 4, 5).reshape(2, 9, -1) @ tower.patches.weight.double().flatten(1).T
+    x = torch.cat([tower.whole.double().expand(2, 1, -1), cells], 1) + tower.places.double()
+    x = torch.nn.functional.layer_norm(x, (32,), tower.norm.weight.double(), tower.norm.bias.double())
+    for block in tower.blocks:
+        x = twin_block(x, block, None)
+    made = tower(image)
+    assert made.shape == (2, 10, 32)
+    assert error(made.double(), x) < 1e-5
+
+
+def test_images_are_prepared_as_the_tower_wants_them():
+    flat = torch.tensor([-1.0, 0.0, 1.0]).view(1, 3, 1, 1).expand(1, 3, 100, 300)
+    made = clip.prepare_image(flat)
+    assert made.shape == (1, 3, 224, 224)
+    wanted = (torch.tensor([0.0, 0.5, 1.0]) - torch.tensor([0.4815, 0.4578, 0.4082])) / torch.tensor(
+        [0.2686, 0.2613, 0.2758]
+    )
+    assert torch.allclose(made.amax((0, 2, 3)), wanted, atol=2e-3)
+    assert torch.allclose(made.amin((0, 2, 3)), wanted, atol=2e-3)
+    corner = torch.zeros(1, 3, 20, 20)
+    corner[..., 0, 0] = 1.0  # where the image grows, corner pixels keep their values
+    assert float(clip.prepare_image(corner)[0, 0, 0, 0]) == pytest.approx((1.0 - 0.48145466) / 0.26862954, abs=1e-4)
+    stripes = torch.ones(1, 3, 900, 224)
+    stripes[..., ::2, :] = -1  # finer than can be shown: grey after the blur, not an alias of it
+    grey = (0.5 - 0.48145466) / 0.26862954
+    assert torch.allclose(clip.prepare_image(stripes)[0, 0, 4:-4], torch.tensor(grey), atol=0.05)
+
+
+def test_only_the_published_captions_are_known():
+    ids = clip.caption_tokens(clip.CAPTION)
+    assert ids[:9].tolist() == [49406, 320, 1125, 320, 539, 4161, 3562, 269, 49407]
+    assert int(ids[9:].abs().sum()) == 0
+    with pytest.raises(UsageError, match="captions"):
+        clip.caption_tokens("A photo of a driving scene.")
+
+
+# modalities -----------------------------------------------------------------------------------------------------------
+
+
+def test_modalities_have_no_eight_bit_step(model):
+    codec = model.codec
+    depth = torch.linspace(-5, 130, 4000).view(1, 1, 40, 100)
+    image = codec.depth_image(depth)
+    assert image.shape == (1, 3, 40, 100)
+    assert float(image.min()) == -1
+    assert float(image.max()) == 1
+    back = (image.mean(1, keepdim=True) + 1) * 50
+    assert torch.allclose(back, depth.clamp(0, 100), atol=1e-4)
+    ids = torch.arange(19).repeat(2).view(1, 2, 19)
+    made, margin = nearest_class(codec.semantic_image(ids))
+    assert torch.equal(made, ids)
+    assert torch.allclose(margin, torch.ones_like(margin), atol=1e-3)
+    between = (
+        codec.semantic_image(torch.tensor([[[0]]])) + codec.semantic_image(torch.tensor([[[palette.ID["pole"]]]]))
+    ) / 2
+    assert float(nearest_class(between)[1].max()) < 1e-3
+    assert torch.equal(codec.semantic_image(torch.tensor([[[255]]])), torch.full((1, 3, 1, 1), -1.0))
+
+
+def test_posterior_is_sampled_or_not_as_asked():
+    image = torch.rand(40, 3, 16, 16, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    codec = fill(Autoencoder(AutoencoderConfig(width=32, multipliers=(1, 2), blocks=1)), "codec.", "first_stage_model.")
+    with torch.no_grad():
+        mean, log_variance = codec.moments(image)
+        drawn = codec.encode(image, torch.Generator().manual_seed(3))
+        again = codec.encode(image, torch.Generator().manual_seed(3))
+    assert torch.equal(drawn, again)
+    standard = (drawn / LATENT_SCALE - mean) / (0.5 * log_variance).exp()
+    assert abs(float(standard.mean())) < 0.05
+    assert float(standard.std()) == pytest.approx(1.0, abs=0.03)
+
+
+def test_slices_of_frames_change_nothing(model):
+    z = torch.randn(5, 4, 8, 12, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        assert torch.allclose(model.codec.decode_image(z, 2), model.codec.decode_image(z, 5), atol=1e-5)
+
+
+def test_missing_is_zero_and_the_reference_is_frame_zero():
+    config = replace(TINY, codec=replace(TINY.codec, posterior="mean"))
+    model = tiny_model()
+    model.config = config
+    condition = some_condition()
+    planes = model.encode_condition(condition).planes
+    encode = lambda image: model.codec.encode(image).detach()  # noqa: E731
+    color = condition.color * condition.valid
+    assert torch.allclose(planes[0, 0, :4], encode(condition.reference * 2 - 1), atol=1e-5)
+    assert torch.allclose(planes[0, 1, :4], encode(color[1] * 2 - 1), atol=1e-5)
+    depth = condition.depth * condition.valid
+    assert torch.allclose(planes[0, 0, 4:], encode(model.codec.depth_image(depth[0])), atol=1e-5)
+    model.config = replace(config, missing_is_zero=False)
+    filled = model.encode_condition(condition).planes
+    assert torch.allclose(filled[0, 1, :4], encode(condition.color[1] * 2 - 1), atol=1e-5)
+    generated = torch.rand(2, 3, 8, 12, generator=torch.Generator().manual_seed(5))
+    continued = model.encode_condition(condition, known=generated).planes
+    assert torch.allclose(continued[0, 0], filled[0, 0], atol=1e-5)
+    assert torch.allclose(continued[0, 1, :4], encode(generated[1] * 2 - 1), atol=1e-5)
+    assert torch.allclose(continued[0, 2], filled[0, 2], atol=1e-5)
+
+
+# sampling -------------------------------------------------------------------------------------------------------------
+
+
+def test_cuts_of_the_work_do_not_change_the_sample(model):
+    condition = some_condition()
+    samples = []
+    for together in (True, False):
+        model.sampling = Sampling(
+            modalities_together=together, guidance_together=together, frames_at_once=4 if together else 1
+        )
+        samples.append(model.sample(condition, steps=3, seed=5, index=1))
+    model.sampling = Sampling()
+    first, second = samples
+    for name, z in first.latents.items():
+        assert torch.allclose(z, second.latents[name], rtol=1e-3, atol=1e-3), name
+    assert torch.allclose(first.rgb, second.rgb, atol=1e-3)
+    assert torch.allclose(first.depth, second.depth, atol=0.1)
+    assert first.rgb.shape == (4, 3, 8, 12)
+    assert first.depth.shape == (4, 1, 8, 12)
+    assert first.semantics.shape == (4, 8, 12)
+    assert 0 <= float(first.confidence.min()) <= float(first.confidence.max()) <= 1
+    again = model.sample(condition, steps=3, seed=5, index=1)
+    assert torch.equal(again.rgb, first.rgb)
+    assert not torch.equal(model.sample(condition, steps=3, seed=5, index=2).rgb, first.rgb)
+
+
+def test_guidance_is_that_of_the_schedule_module(model):
+    """The guided velocity equals `noise.guide` of two plain passes with the contexts written out here."""
+    with torch.no_grad():
+        encoded = model.encode_condition(some_condition(), torch.Generator().manual_seed(0))
+        tokens = model.image_tokens(torch.cat([encoded.features, encoded.grey]))
+        x = torch.randn(1, 4, 4, 4, 6, generator=torch.Generator().manual_seed(1))
+        made = model._guided(encoded, ("depth",), tokens)(x, 700)
+        inputs, step = torch.cat([x, encoded.planes], 2), torch.tensor([700])
+        fixed = (step, torch.tensor([500]), torch.tensor([10]))
+        with_context = model.net(inputs, *fixed, model.text[:1], tokens[:1])
+        without = model.net(inputs, *fixed, model.text[1:], tokens[1:])
+    assert torch.allclose(made, noise.guide(with_context, without, 7.5, 0.7), atol=1e-4)
+    assert not torch.allclose(with_context, without, atol=1e-3)
+
+
+def test_every_input_of_the_network_matters(model):
+    generator = torch.Generator().manual_seed(0)
+    given = {
+        "x": torch.randn(1, 4, 12, 8, 12, generator=generator), "t": torch.tensor([300]), "label": torch.tensor([0]),
+        "fps": torch.tensor([10]), "text": torch.randn(1, 77, 16, generator=generator),
+        "image": torch.randn(1, 4, 2, 16, generator=generator),
+    }  # fmt: skip
+    with torch.no_grad():
+        before = model.net(**given)
+        for name, value in given.items():
+            changed = model.net(**{**given, name: value + 1})
+            assert error(changed, before) > 1e-4, name
+        later = given["image"].clone()
+        later[:, 3] += 1  # tokens belong to their frame: the change is greatest there
+        moved = (model.net(**{**given, "image": later}) - before).abs().mean((0, 2, 3, 4))
+    assert int(moved.argmax()) == 3
+
+
+def test_many_sequences_are_attended_in_parts(monkeypatch):
+    q, k, v = torch.randn(3, 13, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
+    whole = video_unet.attend(q, k, v, 2)
+    monkeypatch.setattr(video_unet, "MAX_ATTENTION_BATCH", 4)
+    assert torch.allclose(video_unet.attend(q, k, v, 2), whole, atol=1e-6)
+
+
+def test_other_numbers_of_frames_are_refused(model):
+    for frames in (1, 3, 5):
+        with pytest.raises(UsageError, match="fixed number of frames"):
+            model.sample(some_condition(frames=frames), steps=1)
+    with pytest.raises(UsageError, match="another number of frames"):
+        model.net(
+            torch.zeros(1, 3, 12, 4, 6),
+            *[torch.zeros(1, dtype=torch.long)] * 3,
+            torch.zeros(1, 77, 16),
+            torch.zeros(1, 4, 2, 16),
+        )
+    with pytest.raises(UsageError, match="multiples of 4"):
+        model.sample(some_condition(height=10), steps=1)
+
+
+# training -------------------------------------------------------------------------------------------------------------
+
+
+def batch_of(model, count=6):
+    conditions = [some_condition(seed=n) for n in range(count)]
+    encoded = model.encode_condition(conditions, torch.Generator().manual_seed(0))
+    rgb = torch.stack([c.color for c in conditions])
+    depth = torch.stack([c.depth for c in conditions])
+    ids = torch.randint(0, 19, (count, 4, 8, 12), generator=torch.Generator().manual_seed(1))
+    return model.encode_truth(rgb, depth, ids, torch.Generator().manual_seed(2)), encoded
+
+
+@pytest.mark.parametrize(("stage", "temporal"), [(1, "transformers"), (2, "transformers"), (2, "all")])
+def test_a_training_step_moves_what_its_stage_says(stage, temporal):
+    model = tiny_model()
+    truth, encoded = batch_of(model, 3)
+    moving = choose_trainable(model, stage, temporal)
+    model.net.train()
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
+    losses = model.loss(truth, encoded, torch.Generator().manual_seed(4))
+    losses.total.backward()
+    torch.optim.AdamW(moving, lr=1e-3).step()
+    moved = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
+    assert set(losses.terms) <= {"rgb", "depth", "semantics"}
+    assert not any(name.startswith(("codec.", "image.")) for name in moved)
+    of_transformers = {n for n in before if n.startswith("net.") and ".temporal." in n and ".res" not in n}
+    of_other_temporal = {n for n in before if n.startswith("net.first.") or (".res" in n and ".temporal." in n)}
+    assert of_transformers
+    assert of_other_temporal
+    frozen = {
+        (1, "transformers"): set(),
+        (2, "transformers"): of_transformers,
+        (2, "all"): of_transformers | of_other_temporal,
+    }
+    assert moved == {n for n in before if n.startswith(("net.", "image_tokens."))} - frozen[stage, temporal]
+
+
+def test_checkpointing_gives_the_same_gradients():
+    """Also where dropout draws: the second computation of a stage draws what the first one drew."""
+    gradients = []
+    for checkpointing in (False, True):
+        model = tiny_model()
+        truth, encoded = batch_of(model, 2)
+        moving = choose_trainable(model, 1)
+        model.net.train()
+        model.net.checkpointing = checkpointing
+        model.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+        gradients.append(torch.cat([p.grad.flatten() for p in moving]))
+    assert error(gradients[1], gradients[0]) < 1e-5
+    other = tiny_model()
+    choose_trainable(other, 1)
+    other.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+    undropped = torch.cat([p.grad.flatten() for p in other.parameters() if p.requires_grad])
+    assert error(undropped, gradients[0]) > 1e-2
+
+
+def test_loss_is_the_velocity_error_and_repeats(model):
+    """Against the same numbers computed here, from the same draws, with the network's passes replaced by a known function."""
+    truth, encoded = batch_of(model)
+    seen = {}
+
+    def stand_in(x, planes, t, names, text, tokens):
+        seen.update(x=x, t=t, names=names, text=text, tokens=tokens)
+        return torch.zeros_like(x)
+
+    original, model.predict = model.predict, stand_in
+    losses = model.loss(truth, encoded, torch.Generator().manual_seed(0))
+    model.predict = original
+    x0 = torch.stack([truth[m][n] for n, m in enumerate(seen["names"])])
+    alpha, sigma = model.schedule.at(seen["t"], 5)
+    scale = model.schedule.scale[seen["t"]].view(-1, 1, 1, 1, 1)
+    eps = (seen["x"] - alpha * scale * x0) / sigma
+    wanted = (alpha * eps - sigma * scale * x0).square().mean()
+    assert float(losses.total.detach()) == pytest.approx(float(wanted), rel=1e-4)
+    one, two = (float(model.loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2))
+    assert one == two
+
+
+def test_shares_of_modalities_and_missing_context(model):
+    truth, encoded = batch_of(model, 1)
+    many = published.Encoded(
+        encoded.planes.expand(4000, -1, -1, -1, -1), encoded.features.expand(4000, -1, -1), encoded.grey, encoded.seen
+    )
+    small = {m: z[:, :1, :1, :1, :1].expand(4000, -1, -1, -1, -1) for m, z in truth.items()}
+    seen = {}
+
+    def stand_in(x, planes, t, names, text, tokens):
+        seen.update(names=names, text=text, tokens=tokens)
+        return torch.zeros_like(x)
+
+    original, model.predict = model.predict, stand_in
+    tower, model.image_tokens = model.image_tokens, torch.nn.Identity()
+    model.loss(small, many, torch.Generator().manual_seed(0))
+    model.predict, model.image_tokens = original, tower
+    share = lambda flags: float(torch.tensor(flags).float().mean())  # noqa: E731
+    for name, wanted in (("rgb", 0.5), ("semantics", 0.25), ("depth", 0.25)):
+        assert share([n == name for n in seen["names"]]) == pytest.approx(wanted, abs=0.03)
+    no_text = (seen["text"] == model.text[1]).flatten(1).all(1)
+    no_reference = (seen["tokens"] == encoded.grey).flatten(1).all(1)
+    assert float(no_reference.float().mean()) == pytest.approx(0.20, abs=0.02)
+    assert float(no_text.float().mean()) == pytest.approx(0.10, abs=0.02)
+    assert float((no_text & no_reference).float().mean()) == pytest.approx(0.05, abs=0.015)
+
+
+# files, command, memory -----------------------------------------------------------------------------------------------
+
+
+def test_configuration_is_strict():
+    values = json.loads(json.dumps(published.config_to_dict(TINY)))
+    assert published.config_from_dict(values) == TINY
+    with pytest.raises(InputError, match="unknown lens"):
+        published.config_from_dict({**values, "lens": 3})
+    with pytest.raises(InputError, match="wrong type"):
+        published.config_from_dict({**values, "fps": "ten"})
+    with pytest.raises(UsageError, match="context"):
+        replace(TINY, text=TowerConfig(32, 2, 2))
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    """A made-up street as a scene, its fused cloud, and a converted tiny model."""
+    root = tmp_path_factory.mktemp("street")
+    ToyStreet(times=[0.1 * n for n in range(6)]).write(root / "scene", width=48, height=32)
+    fuse.run(FuseConfig(), root / "scene", root / "fused")
+    torch.save({"state_dict": tiny_checkpoint()}, root / "512.ckpt")
+    convert.convert_file(ConvertConfig(), root / "512.ckpt", root / "model", TINY)
+    return root
+
+
+def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
+    """50 steps, guidance 7.5, rescale 0.7, three modalities: every frame of the trajectory becomes an observation."""
+    passes = []
+    forward = VideoUNet.forward
+    config = SynthesizeConfig(
+        cameras=("front",), shifts_m=(1.0,), model=str(street / "model"), steps=50, overlap=2, precision="float32"
+    )
+    with monkeypatch.context() as watched:
+        watched.setattr(
+            VideoUNet,
+            "forward",
+            lambda net, x, t, label, *rest: (passes.append(label.tolist()), forward(net, x, t, label, *rest))[1],
+        )
+        out = synthesize.run(config, street / "scene", street / "fused", tmp_path / "out")
+    found = read_observations(out / "front_shift+1.0")
+    assert len(found) == 6
+    assert passes == [[0, 500, 1] * 2] * 100
+    for n in range(6):
+        assert found[n].rgb.shape == (3, 32, 48)
+        assert bool(torch.isfinite(found[n].rgb).all())
+        depth = found[n].depth[torch.isfinite(found[n].depth)]
+        assert bool(((depth >= 0) & (depth <= 100)).all())
+        assert bool(found[n].mask.all()) == (n > 0)  # frame 0 shows the recorded place, not the shifted one
+    with pytest.raises(ResourceError, match="memory budget"):
+        synthesize.run(replace(config, memory_budget_gb=0.5), street / "scene", street / "fused", tmp_path / "none")
+
+
+def test_the_released_resizing(street):
+    """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
+    from mudg.data.clips import ConditionRules, build_conditions, project_sparse
+    from mudg.data.cloudfile import read_fused
+    from mudg.data.scenefile import read_scene
+
+    scene, cloud = read_scene(street / "scene"), read_fused(street / "fused")
+    view = scene.frames_of("front")[0].view
+    native = ConditionRules(48, 32, published=True)
+    sparse = project_sparse(cloud, scene.tracks, view.resized(48, 32), native)
+    recorded = synthesize.recorded_images(scene, held_out=False, classes=False)
+    made, _ = build_conditions(cloud, scene.tracks, [view], recorded, ConditionRules(12, 8, 48, 32, published=True))
+    assert torch.equal(made.color[0], (sparse.rgb * sparse.valid)[:, ::4, ::4])
+    depth = sparse.depth * sparse.valid
+    middle = (depth[1::4, 1::4] + depth[2::4, 1::4] + depth[1::4, 2::4] + depth[2::4, 2::4]) / 4
+    assert torch.allclose(made.depth[0, 0], middle, atol=1e-4)
+    assert bool((made.depth == 0).any())
+    assert made.reference.shape == (3, 8, 12)
+
+
+def test_the_reference_fits_only_where_it_was_taken(street):
+    from mudg.data.scenefile import read_scene
+
+    scene = read_scene(street / "scene")
+    recorded = synthesize.recorded_images(scene, held_out=True, classes=False)
+    view = scene.frames_of("front")[1].view
+    moved = view.world_from_cam.copy()
+    moved[:3, 3] += [0.0, 1.0, 0.0]
+    assert published_model.reference_fits(view, recorded)
+    assert not published_model.reference_fits(View(view.camera, moved, view.time_s), recorded)
+    assert not published_model.reference_fits(view, [])
+
+
+def test_short_trajectories_are_refused_in_words(street, tmp_path):
+    root = tmp_path
+    ToyStreet(times=[0.1 * n for n in range(3)]).write(root / "scene", width=48, height=32)
+    fuse.run(FuseConfig(), root / "scene", root / "fused")
+    config = SynthesizeConfig(
+        cameras=("front",), shifts_m=(1.0,), model=str(street / "model"), steps=20, precision="float32"
+    )
+    with pytest.raises(UsageError, match="fixed number of frames"):
+        synthesize.run(config, root / "scene", root / "fused", root / "out")
+
+
+def test_models_come_back_as_they_were(street, model):
+    loaded = published_model.read(street / "model")
+    condition = some_condition()
+    loaded.text.copy_(model.text)
+    assert torch.equal(loaded.sample(condition, steps=2).rgb, model.sample(condition, steps=2).rgb)
+
+
+def test_full_size_fits_ten_gigabytes():
+    """Counted, not run: see docs/published.md for the table."""
+    needs = memory_plan.needs_of(PublishedConfig(), 2)
+    assert needs.parameters == pytest.approx(4.41e9, rel=0.01)
+    plan = memory_plan.choose(needs, 10_000_000_000)
+    assert plan.peak_bytes <= 10_000_000_000
+    assert (plan.modalities_together, plan.guidance_together) == (False, False)
+    unguided = memory_plan.choose(needs, 15_000_000_000, guidance=False)
+    assert (unguided.modalities_together, unguided.denoise_bytes) == (True, 3 * needs.one_video)
+    roomy = memory_plan.choose(needs, 80_000_000_000)
+    assert (roomy.modalities_together, roomy.guidance_together, roomy.frames_at_once) == (True, True, 16)
+
+
+def test_memory_is_counted_right():
+    """A chain whose live set is known, and the proportion to the batch that the plan relies on."""
+    x = torch.empty(1000, device="meta")
+
+    def chain():
+        a = x + 1  # 4000
+        b = a * 2  # 8000
+        del a
+        c = torch.cat([b, b])  # 4000 + 8000
+        return c.view(2, 1000)[0].clone()  # + 4000
+
+    assert memory_plan.peak_activations(chain) == 16000
+    model = memory_plan.meta_model(TINY, torch.float32)
+    one, three = (memory_plan.denoise_bytes(model, 16, 24, n) for n in (1, 3))
+    assert three == pytest.approx(3 * one, rel=0.02)
+    one, three = (memory_plan.autoencoder_bytes(model, 16, 24, n) for n in (1, 3))
+    assert three == pytest.approx(3 * one, rel=0.02)
+
+
+def test_stage_two_freezes_the_published_number_of_weights():
+    model = memory_plan.meta_model(PublishedConfig(), torch.float32)
+    count = lambda parameters: sum(p.numel() for p in parameters)  # noqa: E731
+    assert count(choose_trainable(model, 1)) == 1_440_917_060 + 48_787_456
+    assert count(choose_trainable(model, 2)) == 1_440_917_060 - 272_850_880 + 48_787_456
+    fewer = 272_850_880 + 266_891_520 + 5_580_736
+    assert count(choose_trainable(model, 2, "all")) == 1_440_917_060 - fewer + 48_787_456
