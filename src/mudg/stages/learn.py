@@ -11,7 +11,8 @@ OUT/samples/  picture grids during training    OUT/loss.png, OUT/log.jsonl, OUT/
 OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
 OUT/latents/  with `cache_latents`             OUT/tensorboard/  with `tensorboard`
 
-Clips are in `learn_clips`, processes and layouts in `learn_parallel`, checkpoints in `learn_state`.
+Clips are in `learn_clips`, processes and layouts in `learn_parallel`, checkpoints in `learn_state`, what is asked of a
+model in `learn_models`.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from mudg.stages import learn_clips, learn_parallel, learn_score
 from mudg.stages.config import LearnConfig
 from mudg.stages.learn_clips import class_weights, draw_batch
 from mudg.stages.learn_latents import cached_latents
+from mudg.stages.learn_models import Part, kind_of
 from mudg.stages.learn_parallel import Interruption, Ranks, Spread, agreed, joined
 from mudg.stages.learn_state import TrainingState, mean_of, newest
 from mudg.stages.precision import choose_bf16
@@ -148,7 +150,7 @@ def _finish(
     if config.start:
         facts["continued_from"] = mdm.facts(config.start)
     words = learn_clips.data_words(config, rules)
-    mdm.save(made, directory.path / "model", learn_score.model_card(made, config, scores, words), facts)
+    kind_of(made).save(made, directory.path / "model", learn_score.model_card(made, config, scores, words), facts)
     directory.finish({"held_out": scores["average"]})
     log.info(learn_score.table(scores))
 
@@ -371,7 +373,7 @@ def _begin(model: MDM, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[Tr
 def _train_network(
     model: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool, ranks: Ranks
 ) -> dict[str, Tensor]:
-    """Train denoiser and refiner; returns the weights to use (the moving average), whole, in every process."""
+    """Train denoiser and refiner; returns the weights to use (the moving average), whole, in the leader."""
     out = run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
     weights = class_weights(folder, min(config.first_cities, 20), config.balance).to(ranks.device)
@@ -414,47 +416,24 @@ def _train_network(
                 state.save(out, ranks, facts)
                 saved_at = done
             if done % config.sample_every == 0 or last:
-                shown = state.shown()
+                shown = state.shown(ranks)
                 ranks.leader_does(lambda: _look(with_weights(model, shown), config, run_dir, folder, done, bf16))  # noqa: B023
             if stop and not last:
                 log.info(f"learn: stopped after step {saved_at}, which is saved")
                 interruption.end()
     if board is not None:
         board.close()
-    return state.shown()
+    return state.shown(ranks)
 
 
 def _losses(
-    spread: Spread, model: MDM, config: LearnConfig, batch: Batch, step: int, first: int, count: int, weights: Tensor,
+    objective: Any, model: MDM, config: LearnConfig, batch: Batch, step: int, first: int, count: int, weights: Tensor,
     bf16: bool,
 ) -> Losses:  # fmt: skip
     """Loss of clips `first` and following of the step's `count` clips."""
-    known = batch.depth_known
-    with torch.no_grad():
-        truth = model.encode_truth(batch.rgb, batch.depth, batch.semantics)
-        encoded = model.encode_planes(batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop,
-                                      batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
-        cells = functional.avg_pool2d(known.float().flatten(0, 1), model.codec.factor).unflatten(0, known.shape[:2])
-        pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics, known)
-        shares = mdm.truth_shares(batch.semantics)
-    generator = seeds.torch_generator(config.seed, step, "noise")
+    part = Part(batch, step, first, count)
     with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=bf16):
-        return spread(
-            truth, encoded, generator, shares=shares, class_weights=weights, depth_known=cells, pixels=pixels,
-            window=refined_window(config, model, step), first=first, whole=count,
-        )  # fmt: skip
-
-
-def refined_window(config: LearnConfig, model: MDM, step: int) -> tuple[slice, slice]:
-    """Rectangle of latent cells on which the refiner is trained at `step`: a share of each side, anywhere."""
-    rng = seeds.numpy_rng(config.seed, step, "refined window")
-    spans = []
-    for side in (config.height, config.width):
-        cells = side // model.codec.factor
-        size = min(cells, max(8, round(cells * config.refined_share / 8) * 8))
-        start = 2 * int(rng.integers((cells - size) // 2 + 1))
-        spans.append(slice(start, start + size))
-    return spans[0], spans[1]
+        return kind_of(model).loss(objective, model, config, part, weights)
 
 
 def _write_down(run_dir: store.RunDir, board: _Board | None, step: int, values: dict[str, float]) -> None:

@@ -108,7 +108,9 @@ def condition_of(batch: Batch, index: int = 0) -> Condition:
 def score_clip(batch: Batch, sample: Sample) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip (batch of one) and its class confusion i64[19,20]."""
     rgb, depth, ids = batch.rgb[0], batch.depth[0], batch.semantics[0]
-    depth = torch.where(batch.depth_known[0], depth, torch.full_like(depth, clip_shards.FAR_M))  # far depth does not count
+    depth = torch.where(
+        batch.depth_known[0], depth, torch.full_like(depth, clip_shards.FAR_M)
+    )  # far depth does not count
     if sample.rgb is None or sample.depth is None or sample.semantics is None:
         raise ValueError("scoring needs all three modalities")
     seen = batch.valid[0] | batch.warped[0]
@@ -177,7 +179,9 @@ def changes(
         pose = (torch.linalg.inv(world_from_cam[t + 1]) @ world_from_cam[t]).float()
         x, y, ahead, _ = torch.einsum("ij,jhw->ihw", pose, points)
         fx, fy, cx, cy = intrinsics[t + 1].float()
-        there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[None]
+        there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[
+            None
+        ]
         look = lambda image, mode, grid=there: torch.nn.functional.grid_sample(  # noqa: E731
             image[None], grid, mode=mode, align_corners=False)[0]  # fmt: skip
         within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)

@@ -53,11 +53,19 @@ class TrainingState:
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.values()), [local(current[k]) for k in self.average], 1.0 - keep)
 
-    def shown(self) -> dict[str, Tensor]:
-        """The weights to use: the average, or the weights themselves; whole, on the CPU. All processes must ask together."""
+    def shown(self, ranks: Ranks) -> dict[str, Tensor]:
+        """The weights to use: the average, or the weights themselves; whole, on the CPU, in the leader (others get none).
+
+        All processes must ask together.
+        """
         current = self.trained.state_dict()
         pieces = self.average or {name: local(value) for name, value in current.items()}
-        return {name: whole(pieces[name], current[name]) for name in current}
+        found = {}
+        for name, value in current.items():
+            put_together = whole(pieces[name], value)
+            if ranks.leads:
+                found[name] = put_together
+        return found
 
     def _moments(self) -> dict[str, dict[str, Tensor]]:
         names = {id(p): name for name, p in self.trained.named_parameters()}
