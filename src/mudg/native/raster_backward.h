@@ -9,8 +9,6 @@
 namespace mudg::MUDG_ISA_NAMESPACE {
 namespace {
 
-constexpr int round_up(int value, int step) { return (value + step - 1) / step * step; }
-
 // For every pixel of a tile, block by block: 1, x, y, x^2, x y, y^2 about the tile's centre, padded to 8.
 constexpr int kMomentColumns = 8;
 struct MomentBasis {
@@ -65,6 +63,8 @@ struct BackwardTile {
   alignas(64) float behind[kBlocksPerTile][kPixelsPerBlock];          // light from behind, times the image gradient
   int block_last[kBlocksPerTile];
   alignas(64) float records[kChunk * kRecord];
+  alignas(64) float alphas[kChunk + kGroup][kPixelsPerBlock];  // of one block's entries, and what follows from them
+  alignas(64) float products[kChunk + kGroup][kPixelsPerBlock];
   alignas(64) float weights[kChunk][kPixelsPerBlock];
   alignas(64) float sigma_gradient[kChunk][kPixelsPerBlock];
   Chunk<kChannels> chunk;
@@ -125,46 +125,62 @@ struct BackwardTile {
     return tile_last;
   }
 
+  // products[j] = colour of the entry . image gradient, for every pixel of the block.
+  MUDG_INLINE void image_products(int b, const std::uint8_t* entries, int count) {
+    const float (*image)[kPixelsPerBlock] = upstream[b];
+    for (int j = 0; j < count; j += kGroup) {
+      const float* channel[kGroup];
+      Floats even[kGroup], odd[kGroup];
+      for (int k = 0; k < kGroup; ++k) channel[k] = chunk.row(entries[j + k]) + kFirstChannel;
+      for (int k = 0; k < kGroup; ++k) even[k] = splat(channel[k][0]) * load(image[0]);
+      for (int k = 0; k < kGroup; ++k) odd[k] = splat(channel[k][1]) * load(image[1]);
+      for (int c = 2; c < kChannels; c += 2) {
+        for (int k = 0; k < kGroup; ++k) even[k] = mul_add(splat(channel[k][c]), load(image[c]), even[k]);
+        for (int k = 0; k < kGroup; ++k) odd[k] = mul_add(splat(channel[k][c + 1]), load(image[c + 1]), odd[k]);
+      }
+      for (int k = 0; k < kGroup; ++k) store(products[j + k], even[k] + odd[k]);
+    }
+  }
+
+  // Sums of the absolute values of every pixel's part of the gradient of the projected mean.
+  MUDG_INLINE void add_absolute(const std::uint8_t* entries, int count, Floats pixel_x, Floats pixel_y) {
+    for (int j = 0; j < count; ++j) {
+      const float* row = chunk.row(entries[j]);
+      const Floats dx = splat(row[kMeanX]) - pixel_x, dy = splat(row[kMeanY]) - pixel_y;
+      const Floats of_sigma = load(sigma_gradient[j]);
+      const float a = row[kStretch] * (2.0f * kLn2), bb = row[kShear] * a;
+      const float c = row[kHeight] * (2.0f * kLn2) + row[kShear] * bb;
+      float* record = records + entries[j] * kRecord;
+      record[kAbsX] += sum(abs_of(of_sigma * mul_add(splat(a), dx, splat(bb) * dy)));
+      record[kAbsY] += sum(abs_of(of_sigma * mul_add(splat(bb), dx, splat(c) * dy)));
+    }
+  }
+
   MUDG_INLINE void undo_block(int b, int base, const TilePlace& place, const std::int32_t* last, Floats cap) {
-    int count = chunk.counts[b];
-    const std::uint8_t* entries = chunk.entries[b];
+    int count = chunk.lists.counts[b];
+    const std::uint8_t* entries = chunk.lists.entries[b];
     while (count > 0 && base + entries[count - 1] > block_last[b]) --count;
     if (count == 0) return;
     const Floats pixel_x = place.pixel_x(b), pixel_y = place.pixel_y(b), one = splat(1.0f);
     const Floats of_alpha = load(upstream_alpha[b]);
     const Ints last_position = load_int(last + b * kPixelsPerBlock);
-    const float (*image)[kPixelsPerBlock] = upstream[b];
+    raw_alphas(chunk.rows, chunk.kRow, entries, count, pixel_x, pixel_y, alphas);
+    image_products(b, entries, count);
     Floats before = load(transmittance[b]), light = load(behind[b]);
     for (int j = count - 1; j >= 0; --j) {
-      const int entry = entries[j];
-      const float* row = chunk.row(entry);
-      const float* channel = row + kFirstChannel;
-      const Alpha alpha = alpha_of(row, pixel_x, pixel_y, cap);
-      const Mask touched = alpha.counts & at_least(last_position, splat_int(base + entry));
-      const Floats effective = keep(touched, alpha.value);
-      const Floats inv_pass = reciprocal(one - effective);
+      const Mask touched = at_least(last_position, splat_int(base + entries[j]));
+      const Floats raw = keep(touched, load(alphas[j])), own = load(products[j]);
+      const Floats alpha = min_of(raw, cap);
+      const Floats inv_pass = reciprocal(one - alpha);
       before = before * inv_pass;
-      const Floats weight = effective * before;
-      Floats even = splat(channel[0]) * load(image[0]), odd = splat(channel[1]) * load(image[1]);
-      for (int c = 2; c < kChannels; c += 2) {
-        even = mul_add(splat(channel[c]), load(image[c]), even);
-        odd = mul_add(splat(channel[c + 1]), load(image[c + 1]), odd);
-      }
-      const Floats own = even + odd;  // colour . image gradient
+      const Floats weight = alpha * before;
       // d loss / d alpha = T own - (light - of_alpha) / (1 - alpha); sigma lowers alpha, hence the opposite sign.
       const Floats minus_alpha_gradient = neg_mul_add(before, own, inv_pass * (light - of_alpha));
       light = mul_add(weight, own, light);
-      const Floats of_sigma = keep(touched & (alpha.raw <= cap), alpha.raw * minus_alpha_gradient);
       store(weights[j], weight);
-      store(sigma_gradient[j], of_sigma);
-      if (kAbsolute) {
-        const float a = row[kStretch] * (2.0f * kLn2), bb = row[kShear] * a;
-        const float c = row[kHeight] * (2.0f * kLn2) + row[kShear] * bb;
-        float* record = records + entry * kRecord;
-        record[kAbsX] += sum(abs_of(of_sigma * mul_add(splat(a), alpha.dx, splat(bb) * alpha.dy)));
-        record[kAbsY] += sum(abs_of(of_sigma * mul_add(splat(bb), alpha.dx, splat(c) * alpha.dy)));
-      }
+      store(sigma_gradient[j], keep(raw <= cap, raw * minus_alpha_gradient));
     }
+    if (kAbsolute) add_absolute(entries, count, pixel_x, pixel_y);
     store(transmittance[b], before);
     store(behind[b], light);
     accumulate_rows<WideRow, kColumns>(upstream_rows[b], weights, entries, count, records + kRecordChannels, kRecord);
