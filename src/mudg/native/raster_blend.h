@@ -8,7 +8,7 @@
 namespace mudg::MUDG_ISA_NAMESPACE {
 namespace {
 
-constexpr int kChunk = 128;  // list entries worked on at a time; their parameters then fit into the first-level cache
+constexpr int kChunk = 64;  // list entries worked on at a time; their parameters then fit into the first-level cache
 alignas(64) constexpr float kPixelX[kPixelsPerBlock] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 alignas(64) constexpr float kPixelY[kPixelsPerBlock] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 
@@ -74,6 +74,77 @@ struct BlockLists {
 #endif
 };
 
+// Position of a tile and of its blocks in the image.
+struct TilePlace {
+  int x, y;           // first pixel
+  int width, height;  // of the image
+  MUDG_INLINE TilePlace(const RasterState& state, int tile)
+      : x(tile % state.tiles_x * kTileSize),
+        y(tile / state.tiles_x * kTileSize),
+        width(state.scene.width),
+        height(state.scene.height) {}
+  MUDG_INLINE int block_x(int block) const { return x + (block & 3) * kBlockSize; }
+  MUDG_INLINE int block_y(int block) const { return y + (block >> 2) * kBlockSize; }
+  MUDG_INLINE bool whole() const { return x + kTileSize <= width && y + kTileSize <= height; }
+  MUDG_INLINE Floats pixel_x(int block) const {
+    return load(kPixelX) + splat(static_cast<float>(block_x(block)) + 0.5f);
+  }
+  MUDG_INLINE Floats pixel_y(int block) const {
+    return load(kPixelY) + splat(static_cast<float>(block_y(block)) + 0.5f);
+  }
+};
+
+// Memory that will be needed soon. The requests are issued a few at a time, one helping per block of computation: all at
+// once they would only wait for each other.
+class Lookahead {
+ public:
+  // Splat rows of the list entries [begin, end).
+  MUDG_INLINE void splats_of(const TileItem* begin, const TileItem* end) {
+    splat_item_ = begin;
+    splat_step_ = (end - begin + kBlocksPerTile - 1) / kBlocksPerTile;
+    splat_end_ = end;
+  }
+  // Gradient records of the list entries [begin, end), to be written.
+  MUDG_INLINE void records_of(const TileItem* begin, const TileItem* end) {
+    record_item_ = begin;
+    record_step_ = (end - begin + kBlocksPerTile - 1) / kBlocksPerTile;
+    record_end_ = end;
+  }
+  // Pixels of a tile, one row per helping.
+  MUDG_INLINE void pixels_of(const TilePlace& place) {
+    offset_ = static_cast<std::size_t>(place.y) * place.width + place.x;
+    rows_ = smaller(kTileSize, place.height - place.y);
+    width_ = static_cast<std::size_t>(place.width);
+  }
+
+  template <bool kWrite, class Pointer>
+  MUDG_INLINE void helping(const RasterState& state, const Pointer* planes, const float* alpha) {
+    for (const TileItem* stop = smaller(splat_item_ + splat_step_, splat_end_); splat_item_ < stop; ++splat_item_) {
+      const float* row = state.splats + static_cast<std::size_t>(splat_item_->gaussian) * state.splat_stride;
+      for (int at = 0; at < state.splat_stride; at += 16) __builtin_prefetch(row + at, 0, 2);
+    }
+    for (const TileItem* stop = smaller(record_item_ + record_step_, record_end_); record_item_ < stop; ++record_item_) {
+      const float* row = state.records + static_cast<std::size_t>(record_item_->record) * state.record_stride;
+      __builtin_prefetch(row, 1, 2);
+      __builtin_prefetch(row + state.record_stride - 1, 1, 2);
+    }
+    if (rows_ > 0) {
+      for (int c = 0; c < state.channels; ++c) {
+        if (kWrite || planes[c] != nullptr) __builtin_prefetch(planes[c] + offset_, kWrite, 2);
+      }
+      if (kWrite || alpha != nullptr) __builtin_prefetch(alpha + offset_, kWrite, 2);
+      offset_ += width_;
+      --rows_;
+    }
+  }
+
+ private:
+  const TileItem *splat_item_ = nullptr, *splat_end_ = nullptr, *record_item_ = nullptr, *record_end_ = nullptr;
+  std::ptrdiff_t splat_step_ = 0, record_step_ = 0;
+  std::size_t offset_ = 0, width_ = 0;
+  int rows_ = 0;
+};
+
 // The splat rows of up to kChunk list entries side by side, and for every block the entries that touch it.
 template <int kChannels>
 struct Chunk {
@@ -86,11 +157,6 @@ struct Chunk {
 
   MUDG_INLINE void gather(const RasterState& state, const TileItem* items, int size, unsigned wanted_blocks) {
     for (int i = 0; i < size; ++i) {
-      if (i + 12 < size) {
-        const float* later = state.splats + static_cast<std::size_t>(items[i + 12].gaussian) * state.splat_stride;
-        __builtin_prefetch(later);
-        if (kRow > 16) __builtin_prefetch(later + 16);
-      }
       const float* from = state.splats + static_cast<std::size_t>(items[i].gaussian) * state.splat_stride;
       float* to = rows + i * kRow;
       for (int k = 0; k < kRow; k += 4) std::memcpy(to + k, from + k, 16);
@@ -126,26 +192,6 @@ MUDG_INLINE void raw_alphas(const float* rows, int row_stride, const std::uint8_
     for (int k = 0; k < kGroup; ++k) store(out[j + k], keep(power[k] >= cut, alpha[k]));
   }
 }
-
-// Position of a tile and of its blocks in the image.
-struct TilePlace {
-  int x, y;           // first pixel
-  int width, height;  // of the image
-  MUDG_INLINE TilePlace(const RasterState& state, int tile)
-      : x(tile % state.tiles_x * kTileSize),
-        y(tile / state.tiles_x * kTileSize),
-        width(state.scene.width),
-        height(state.scene.height) {}
-  MUDG_INLINE int block_x(int block) const { return x + (block & 3) * kBlockSize; }
-  MUDG_INLINE int block_y(int block) const { return y + (block >> 2) * kBlockSize; }
-  MUDG_INLINE bool whole() const { return x + kTileSize <= width && y + kTileSize <= height; }
-  MUDG_INLINE Floats pixel_x(int block) const {
-    return load(kPixelX) + splat(static_cast<float>(block_x(block)) + 0.5f);
-  }
-  MUDG_INLINE Floats pixel_y(int block) const {
-    return load(kPixelY) + splat(static_cast<float>(block_y(block)) + 0.5f);
-  }
-};
 
 // One address per channel: R, G, B, depth, features.
 template <class Pointer, class Image>

@@ -74,6 +74,16 @@ struct ForwardTile {
     }
   }
 
+  // Turns accumulated depth into expected depth, and keeps it for the backward pass (`kept`: [16 blocks][16 pixels]).
+  MUDG_INLINE void divide_depth(float* kept) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
+      const Floats alpha = splat(1.0f) - load(final[b]);
+      const Floats depth = keep(alpha > splat(kLeastAlpha), load(color[b][3]) / max_of(alpha, splat(kLeastAlpha)));
+      store(color[b][3], depth);
+      store(kept + b * kPixelsPerBlock, depth);
+    }
+  }
+
   MUDG_INLINE void write(const TilePlace& place, int channels, float* const* planes, float* alpha) const {
     const std::size_t stride = static_cast<std::size_t>(place.width);
     if (place.whole()) {  // rows of 64 bytes
@@ -105,21 +115,22 @@ void blend_tile(RasterState& state, int tile, float* const* planes, float* alpha
   const int count = state.tile_start[tile + 1] - state.tile_start[tile];
   ForwardTile<kChannels> work;
   unsigned blocks = work.start(place);
-  const int rows = smaller(kTileSize, place.height - place.y);
-  for (int y = 0; y < rows; ++y) {  // the output is written at the end: fetch its lines meanwhile
-    const std::size_t at = static_cast<std::size_t>(place.y + y) * place.width + place.x;
-    for (int c = 0; c < state.channels; ++c) __builtin_prefetch(planes[c] + at, 1, 2);
-    __builtin_prefetch(alpha + at, 1, 2);
-  }
+  Lookahead ahead;
+  ahead.pixels_of(place);  // the output is written at the end
   const Floats cap = splat(state.scene.alpha_max);
   for (int base = 0; base < count && blocks != 0; base += kChunk) {
     work.chunk.gather(state, items + base, smaller(kChunk, count - base), blocks);
+    // The lists of consecutive tiles lie side by side.
+    const TileItem *next = items + smaller(base + kChunk, count), *end = state.items + state.entry_count;
+    ahead.splats_of(next, next + smaller<std::ptrdiff_t>(kChunk, end - next));
     for (unsigned left = blocks; left != 0; left &= left - 1) {
       const int b = __builtin_ctz(left);
+      ahead.helping<true>(state, planes, alpha);
       if (work.chunk.lists.counts[b] > 0 && !work.blend_block(b, base, place, cap)) blocks &= ~(1u << b);
     }
   }
   work.add_background(state.scene.background);
+  work.divide_depth(state.expected_depth + static_cast<std::size_t>(tile) * kPixelsPerTile);
   std::memcpy(state.final_transmittance + static_cast<std::size_t>(tile) * kPixelsPerTile, work.final,
               sizeof work.final);
   std::memcpy(state.last_item + static_cast<std::size_t>(tile) * kPixelsPerTile, work.last, sizeof work.last);

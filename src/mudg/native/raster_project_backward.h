@@ -7,6 +7,8 @@
 namespace mudg::MUDG_ISA_NAMESPACE {
 namespace {
 
+constexpr int kPrefetchAhead = 6;  // Gaussians
+
 // Gradients of one group of sixteen splats, by lane.
 struct GroupGradient {
   alignas(64) float mean2d[2][kLanes];
@@ -29,14 +31,16 @@ MUDG_INLINE bool sum_records(const RasterState& state, int g, float mean_x, floa
   const TileEntry* entry = state.workers[state.entry_worker[g]].entries + state.entry_offset[g];
   const float* record = state.records + static_cast<std::size_t>(state.first_record[g]) * state.record_stride;
   bool any = false;
+  const double inv_tiles_x = 1.0 / state.tiles_x;
   for (int k = 0; k < state.entry_counts[g]; ++k, record += state.record_stride) {
     std::uint32_t first_word;
     std::memcpy(&first_word, record, sizeof first_word);
     if (first_word == kNoContribution) continue;
     any = true;
     const int tile = entry[k].tile;
-    const float x = mean_x - static_cast<float>(tile % state.tiles_x * kTileSize + kTileSize / 2);
-    const float y = mean_y - static_cast<float>(tile / state.tiles_x * kTileSize + kTileSize / 2);
+    const int tile_y = static_cast<int>((static_cast<double>(tile) + 0.5) * inv_tiles_x);  // tile / tiles_x, but faster
+    const float x = mean_x - static_cast<float>((tile - tile_y * state.tiles_x) * kTileSize + kTileSize / 2);
+    const float y = mean_y - static_cast<float>(tile_y * kTileSize + kTileSize / 2);
     const float m = record[0], mx = record[1], my = record[2];
     out.mass += m;
     out.x += x * m - mx;
@@ -95,6 +99,23 @@ MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& 
   }
 }
 
+// Brings closer what the gathering of Gaussian g will read and write.
+MUDG_INLINE void prefetch_gaussian(const RasterState& state, const RasterGradient& gradient, int g) {
+  const RasterScene& s = state.scene;
+  const std::size_t harmonics = static_cast<std::size_t>(s.sh_coefficients) * 3;
+  if (gradient.sh != nullptr) {
+    for (std::size_t at = 0; at < harmonics; at += 16) __builtin_prefetch(gradient.sh + g * harmonics + at, 1, 2);
+  }
+  if (state.entry_counts[g] == 0) return;
+  for (std::size_t at = 0; at < harmonics; at += 16) __builtin_prefetch(s.sh + g * harmonics + at, 0, 2);
+  __builtin_prefetch(state.splats + static_cast<std::size_t>(g) * state.splat_stride, 0, 2);
+  const std::size_t stride = static_cast<std::size_t>(state.record_stride);
+  const float* record = state.records + state.first_record[g] * stride;
+  const std::size_t bytes = smaller(state.entry_counts[g], 4) * stride;
+  for (std::size_t at = 0; at < bytes; at += 16) __builtin_prefetch(record + at, 0, 2);
+  __builtin_prefetch(state.workers[state.entry_worker[g]].entries + state.entry_offset[g], 0, 2);
+}
+
 // Reads the records of sixteen Gaussians. Returns whether any of them contributed to the image.
 MUDG_INLINE bool gather_group(const RasterState& state, const RasterGradient& gradient, int first,
                               GroupGradient& group) {
@@ -104,6 +125,7 @@ MUDG_INLINE bool gather_group(const RasterState& state, const RasterGradient& gr
   RecordSums sums;
   for (int l = 0; l < kLanes && first + l < s.count; ++l) {
     const int g = first + l;
+    if (g + kPrefetchAhead < s.count) prefetch_gaussian(state, gradient, g + kPrefetchAhead);
     const float* splat_row = state.splats + static_cast<std::size_t>(g) * state.splat_stride;
     if (state.entry_counts[g] == 0 || !sum_records(state, g, splat_row[kMeanX], splat_row[kMeanY], sums)) {
       zero_rows(s, gradient, g);

@@ -102,17 +102,5 @@ struct WideRow {
   MUDG_INLINE WideRow plus(WideRow other) const { return {_mm512_add_ps(v, other.v)}; }
 };
 
-struct NarrowRow {
-  static constexpr int kWidth = 8, kRows = 16;
-  __m256 v;
-  static MUDG_INLINE NarrowRow load_row(const float* p) { return {_mm256_loadu_ps(p)}; }
-  MUDG_INLINE void store_row(float* p) const { _mm256_storeu_ps(p, v); }
-  static MUDG_INLINE NarrowRow product(float weight, NarrowRow row) {
-    return {_mm256_mul_ps(_mm256_set1_ps(weight), row.v)};
-  }
-  MUDG_INLINE void add_product(float weight, NarrowRow row) { v = _mm256_fmadd_ps(_mm256_set1_ps(weight), row.v, v); }
-  MUDG_INLINE NarrowRow plus(NarrowRow other) const { return {_mm256_add_ps(v, other.v)}; }
-};
-
 }  // namespace
 }  // namespace mudg::isa_avx512
