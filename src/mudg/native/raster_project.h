@@ -52,7 +52,7 @@ MUDG_INLINE unsigned project_lanes(const RasterScene& s, int first, SplatLanes& 
       sqrt_of(mul_add(p.offset[0], p.offset[0],
                       mul_add(p.offset[1], p.offset[1], mul_add(p.offset[2], p.offset[2], splat(1e-24f)))));
   Floats basis[kMaxSh];
-  sh_basis<Floats>(s.sh_degree, p.offset[0] * inv_length, p.offset[1] * inv_length, p.offset[2] * inv_length, basis);
+  sh_basis(s.sh_degree, p.offset[0] * inv_length, p.offset[1] * inv_length, p.offset[2] * inv_length, basis);
   for (int k = 0; k < (s.sh_degree + 1) * (s.sh_degree + 1); ++k) store(out.basis[k], basis[k]);
   return bits((poison >= zero) & (poison <= zero));
 }
