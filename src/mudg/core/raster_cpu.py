@@ -74,9 +74,9 @@ class _Context:
 
 
 def _statistics(library: ctypes.CDLL, handle: int) -> dict[str, float]:
-    counts, phases = (ctypes.c_int64 * 5)(), (ctypes.c_double * 6)()
+    counts, phases = (ctypes.c_int64 * 6)(), (ctypes.c_double * 6)()
     library.mudg_raster_statistics(handle, counts, phases)
-    names = ("visible", "entries", "not_finite", "first_not_finite", "context_bytes", *PHASES)
+    names = ("visible", "entries", "not_finite", "first_not_finite", "context_bytes", "pairs", *PHASES)
     return {name: float(value) for name, value in zip(names, (*counts, *phases), strict=True)}
 
 

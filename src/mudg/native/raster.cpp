@@ -88,14 +88,22 @@ MUDG_API int mudg_raster_backward(mudg::RasterContext* context, const mudg::Rast
 }
 
 // After a forward pass: visible Gaussians, tile entries, Gaussians with non-finite input, index of the first of those,
-// and the bytes that the context holds; then seconds per phase of the last forward and backward pass.
-MUDG_API void mudg_raster_statistics(const mudg::RasterContext* context, std::int64_t counts[5], double phase_s[6]) {
+// the bytes that the context holds, and the pairs of a Gaussian and a 4x4 block in the tiles' lists; then seconds per phase of the last forward and backward pass.
+MUDG_API void mudg_raster_statistics(const mudg::RasterContext* context, std::int64_t counts[6], double phase_s[6]) {
   counts[0] = context->state.visible_count;
   counts[1] = context->state.entry_count;
   counts[2] = context->state.not_finite_count;
   counts[3] = context->state.first_not_finite;
   counts[4] = static_cast<std::int64_t>(context->bytes());
+  counts[5] = 0;
+  for (std::int64_t i = 0; i < context->state.entry_count; ++i)
+    counts[5] += __builtin_popcount(context->state.items[i].blocks);
   for (int phase = 0; phase < mudg::kPhases; ++phase) phase_s[phase] = context->phase_s[phase];
+}
+
+// Floating-point operations of `rounds` rounds of independent multiply-adds on one thread (see peak.h).
+MUDG_API double mudg_peak_multiply_add(std::int64_t rounds, float* sink) {
+  return mudg::kernels().peak_multiply_add(rounds, sink);
 }
 
 }  // extern "C"
