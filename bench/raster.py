@@ -7,8 +7,8 @@
     python bench/raster.py --first-call                 # import and first picture, in a fresh process
 
 Variants are interleaved within one run, so that a busy machine hits all of them alike. With one thread the processor
-time of this process is measured (it does not count what others take), else wall time. Medians; milliseconds. Phases are wall
-time by the library's own clock.
+time of this process is measured (it does not count what others take), else wall time; the library's own clock, which times
+the phases, does the same. Medians; milliseconds.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def bandwidth(megabytes: int = 256) -> float:
 
 
 def roofline(row: dict[str, Any], size: str, channels: int, flops: float, bytes_per_s: float) -> list[str]:
-    """What each phase does, counted by hand per (Gaussian, 4x4 block) pair or per Gaussian, beside what it took."""
+    """What each phase does, counted by hand per blended (Gaussian, 4x4 block) pair or per Gaussian, beside what it took."""
     count, width, height = int(size.split(":")[0]), *(int(side) for side in size.split(":")[1].split("x"))
     pairs, entries, visible = (row["counts"][name] for name in ("pairs", "entries", "visible"))
     planes, pixel_bytes = 4 + channels, 4 * width * height

@@ -4,7 +4,7 @@
 
 A step renders a view, forms the L1 + SSIM and LiDAR depth losses (with --class-loss also the semantic one), goes backward,
 updates the visible rows with Adam and gathers densification statistics, as `stages/fit.py` does; densification runs every 100
-steps, its share is amortised. Wall time; "rasteriser" is what the library's own clock counts in its six phases. torch's own
+steps, its share is amortised. Wall time; "rasteriser" is what the library's own clock counts in its six phases (processor time if --threads is 1). torch's own
 loops get --torch-threads: they are short, and on a busy machine a second thread costs more than it brings.
 """
 
