@@ -132,7 +132,8 @@ def measure(size: str, channels: int, repeats: int, with_torch: bool, clock: Cal
         started = clock()
         once(gaussians, view, RasterConfig(backend="torch"), upstream)
         taken = 1e3 * (clock() - started)
-        rows.append({"scene": size, "variant": "torch", "ms": round(taken, 1), "ratio": round(taken / best, 2), "phases_ms": {}, "counts": {}})
+        rows.append({"scene": size, "variant": "torch", "ms": round(taken, 1), "ratio": round(taken / best, 2),
+                     "phases_ms": {}, "counts": {}})  # fmt: skip
     return rows
 
 
@@ -182,7 +183,10 @@ def roofline(row: dict[str, Any], size: str, channels: int, flops: float, bytes_
         "project": (count * 330 + visible * 96, count * gaussian_bytes + visible * (192 + row_bytes) + 8 * entries),
         "blend": (16 * pairs * (24 + 5 + 2 * planes), entries * (12 + row_bytes) + (planes + 1) * pixel_bytes),
         "blend_backward": (16 * pairs * (24 + 18 + 4 * planes + 8), entries * (12 + row_bytes + record_bytes) + (planes + 1) * pixel_bytes),
-        "project_backward": (visible * 900 + entries * 40, entries * record_bytes + visible * (2 * 192 + row_bytes) + 2 * count * gaussian_bytes + 192 * count),
+        "project_backward": (
+            visible * 900 + entries * 40,
+            entries * record_bytes + visible * (2 * 192 + row_bytes) + 2 * count * gaussian_bytes + 192 * count,
+        ),
     }  # fmt: skip
     lines = []
     for name, (operations, moved) in work.items():

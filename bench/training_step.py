@@ -4,8 +4,9 @@
 
 A step renders a view, forms the L1 + SSIM and LiDAR depth losses (with --class-loss also the semantic one), goes backward,
 updates the visible rows with Adam and gathers densification statistics, as `stages/fit.py` does; densification runs every 100
-steps, its share is amortised. Wall time; "rasteriser" is what the library's own clock counts in its six phases (processor time if --threads is 1). torch's own
-loops get --torch-threads: they are short, and on a busy machine a second thread costs more than it brings.
+steps, its share is amortised. Wall time; "rasteriser" is what the library's own clock counts in its six phases (processor time
+if --threads is 1). torch's own loops get --torch-threads: they are short, and on a busy machine a second thread costs more than
+it brings.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mudg.core import fused, losses, raster_cpu
 from mudg.core.raster import RasterConfig, rasterize
 from mudg.core.table import Table
 from mudg.models.densify import DensifySettings, DensifyStats, densify
-from mudg.models.nodes import SceneModel, StaticNode, composite_semantics, compose
+from mudg.models.nodes import SceneModel, StaticNode, compose, composite_semantics
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

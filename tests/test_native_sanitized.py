@@ -18,7 +18,7 @@ import pytest
 from mudg import native
 native.LIBRARY_PATH = Path(sys.argv[1])
 assert native.library() is not None, native.status()
-sys.exit(pytest.main(["-q", "-x", "-p", "no:cacheprovider", "-m", "not slow", *sys.argv[2:]]))
+sys.exit(pytest.main(["-q", "-x", "-s", "-p", "no:cacheprovider", "-m", "not slow", *sys.argv[2:]]))
 """
 
 
@@ -38,8 +38,9 @@ def test_kernels_are_clean_under_the_sanitizers(tmp_path: Path, monkeypatch: pyt
     compiler, notes = mudg_compile.find_compiler(mudg_compile.system_candidates(os.environ))
     if compiler is None:
         pytest.skip(f"no system compiler works: {notes}")
-    runtime = _runtime(compiler.command, "libasan.so")
-    if not runtime:
+    # torch throws through the sanitizer's run time, which therefore needs the C++ run time beside it from the start.
+    runtime = [_runtime(compiler.command, name) for name in ("libasan.so", "libstdc++.so.6")]
+    if not all(runtime):
         pytest.skip("this compiler has no sanitizer run time")
     monkeypatch.setattr(mudg_compile, "COMMON_FLAGS", (*mudg_compile.COMMON_FLAGS, *FLAGS))
     monkeypatch.setattr(mudg_compile, "LINK_FLAGS", (*mudg_compile.LINK_FLAGS[:2], "-fsanitize=address,undefined"))
@@ -47,7 +48,7 @@ def test_kernels_are_clean_under_the_sanitizers(tmp_path: Path, monkeypatch: pyt
     library = tmp_path / mudg_compile.LIBRARY_NAME
     mudg_compile.compile_library(compiler, library, tmp_path / "objects")
     environment = {
-        **os.environ, "LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0", "OMP_NUM_THREADS": "1",
+        **os.environ, "LD_PRELOAD": " ".join(runtime), "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0", "OMP_NUM_THREADS": "1",
         "UBSAN_OPTIONS": "print_stacktrace=1", "MUDG_THREADS": "2",
     }  # fmt: skip
     tests = [str(ROOT / "tests" / name) for name in ("test_raster.py", "test_raster_proofs.py", "test_native.py")]
@@ -55,4 +56,4 @@ def test_kernels_are_clean_under_the_sanitizers(tmp_path: Path, monkeypatch: pyt
     skipped = "not library and not five_million and not forked and not environment and not version"
     done = subprocess.run([sys.executable, "-c", RUN, str(library), *tests, "-k", skipped], cwd=ROOT, env=environment,
                           capture_output=True, text=True, timeout=1800, check=False)  # fmt: skip
-    assert done.returncode == 0, (done.stdout + done.stderr)[-6000:]
+    assert done.returncode == 0, (done.stdout + done.stderr)[-20000:]

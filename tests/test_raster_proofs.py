@@ -91,9 +91,9 @@ def _dense(parts: dict[str, Tensor], view: View, blur: float = 0.3) -> dict[str,
             continue
         axes = geometry.matrix_from_quaternion(p["quats"][i] / np.linalg.norm(p["quats"][i]))
         covariance = axes @ np.diag(p["scales"][i] ** 2) @ axes.T
-        limit_x = ((-camera.cx / camera.fx - 0.15 * camera.width / camera.fx), ((camera.width - camera.cx) / camera.fx + 0.15 * camera.width / camera.fx))
-        limit_y = ((-camera.cy / camera.fy - 0.15 * camera.height / camera.fy), ((camera.height - camera.cy) / camera.fy + 0.15 * camera.height / camera.fy))
-        tx, ty = z * np.clip(x / z, *limit_x), z * np.clip(y / z, *limit_y)
+        slack_x, slack_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy  # 1.3 times the field of view
+        tx = z * np.clip(x / z, -camera.cx / camera.fx - slack_x, (camera.width - camera.cx) / camera.fx + slack_x)
+        ty = z * np.clip(y / z, -camera.cy / camera.fy - slack_y, (camera.height - camera.cy) / camera.fy + slack_y)
         jacobian = np.array([[camera.fx / z, 0, -camera.fx * tx / z**2], [0, camera.fy / z, -camera.fy * ty / z**2]])
         image = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + blur * np.eye(2)
         offset = np.stack([xs - (camera.fx * x / z + camera.cx), ys - (camera.fy * y / z + camera.cy)], -1)

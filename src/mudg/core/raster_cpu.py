@@ -110,7 +110,8 @@ def _recycled_like(tensor: Tensor) -> Tensor:
         _Loan.free.clear()  # blocks of a size that is no longer asked for
         block = torch.empty(count + count // 8)
     memory = (_F * count).from_address(block.data_ptr())
-    memory.loan = _Loan(block)  # the tensor keeps `memory` alive, and that the loan
+    # The tensor keeps `memory` alive, and that the loan.
+    memory.loan = _Loan(block)  # type: ignore[attr-defined]
     return torch.frombuffer(memory, dtype=torch.float32).view(tensor.shape)
 
 
