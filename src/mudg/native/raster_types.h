@@ -76,8 +76,9 @@ struct RasterGradient {
 
 enum class RasterStatus : int { kOk = 0, kOutOfMemory = 1, kTooManyEntries = 2, kNotFinite = 3 };
 
-// Tile entries that one worker made, in the order in which it met the Gaussians, and how many fell into each tile.
-struct WorkerEntries {
+// Tile entries that one worker made, in the order in which it met the Gaussians, and how many fell into each tile. A
+// cache line for each worker: `used` changes with every Gaussian.
+struct alignas(64) WorkerEntries {
   TileEntry* entries;
   std::size_t used, capacity;
   std::int32_t* tile_counts;
@@ -123,6 +124,6 @@ struct RasterState {
   std::int32_t out_of_memory;
 };
 constexpr std::uint32_t kHidden = 0xffffffffu;
-constexpr int kCameraChunk = 256;  // blocks of 16 Gaussians summed into one part of the camera gradient
+constexpr int kCameraChunk = 64;  // blocks of 16 Gaussians summed into one part of the camera gradient
 
 }  // namespace mudg
