@@ -259,6 +259,20 @@ def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: 
         assert mine[1][~visible].abs().sum() == 0
 
 
+def test_sparse_adam_leaves_invisible_rows_and_their_moments_alone(isa: str) -> None:
+    generator = torch.Generator().manual_seed(1)
+    tensors = [torch.rand(300, 7, generator=generator) for _ in range(3)]
+    before, visible = [t.clone() for t in tensors], torch.rand(300, generator=generator) > 0.5
+    gradient = torch.randn(300, 7, generator=generator)
+    gradient[~visible] = float("nan")  # never looked at
+    exact = [t.double() for t in tensors]
+    fused.adam(tensors[0], gradient, tensors[1], tensors[2], 1e-2, 7, visible)
+    torch_adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, 7, visible)
+    for now, old, want in zip(tensors, before, exact):
+        assert torch.equal(now[~visible], old[~visible])
+        torch.testing.assert_close(now[visible].double(), want[visible], rtol=2e-6, atol=2e-6)
+
+
 @needs_native
 def test_adam_moves_every_element_alike_wherever_it_lies(pool: Any) -> None:
     """Same history, same result: bit for bit, at any position, number of threads, dense or sparse."""

@@ -375,6 +375,74 @@ def test_no_gradient_is_recorded_where_none_is_wanted(config: RasterConfig) -> N
         assert not rasterize(_gaussians(_leaves(_parameters(50))), _view(), config).rgb.requires_grad
 
 
+# ---- several views at once -----------------------------------------------------------------------------------------
+
+
+def _three_views() -> tuple[View, ...]:
+    view = _view()
+    nearer, other = view.world_from_cam.copy(), Camera("left", view.camera.width, view.camera.height, 30.0, 31.0, 20.0, 22.0)
+    nearer[:3, 3] += [0.1, 0.05, 0.4]
+    return view, View(view.camera, nearer, 0.1), View(other, view.world_from_cam, 0.0)
+
+
+@pytest.mark.parametrize("background", ["none", "one", "each", "picture", "pictures"])
+def test_several_views_at_once_equal_the_single_ones(config: RasterConfig, background: str) -> None:
+    views, p = _three_views(), _parameters(150)
+    generator = torch.Generator().manual_seed(3)
+    shapes = {"one": (3,), "each": (3, 3), "picture": (3, 37, 50), "pictures": (3, 3, 37, 50)}
+    given = torch.rand(shapes[background], generator=generator) if background != "none" else None
+    poses = torch.stack([torch.tensor(view.world_from_cam, dtype=torch.float32) for view in views])
+    together, alone = _leaves(p), _leaves(p)
+    batch_poses, single_poses = poses.clone().requires_grad_(), poses.clone().requires_grad_()
+    batch = rasterize(_gaussians(together), views, config, background=given, world_from_cam=batch_poses, absgrad=True)
+    weights = {n: torch.randn(getattr(batch, n).shape, generator=generator) for n in ("rgb", "depth", "alpha", "extra")}
+    _weighted(batch, weights).backward()
+    for index, view in enumerate(views):
+        behind = given[index] if given is not None and background in ("each", "pictures") else given
+        single = rasterize(_gaussians(alone), view, config, background=behind, world_from_cam=single_poses[index], absgrad=True)
+        _weighted(single, {n: w[index] for n, w in weights.items()}).backward()
+        for name in weights:
+            assert torch.equal(getattr(batch, name)[index], getattr(single, name)), name
+        for name in ("means2d", "radii", "visible", "abs_grad2d"):
+            assert torch.equal(getattr(batch.trace, name)[index], getattr(single.trace, name)), name
+        assert torch.equal(batch.trace.means2d.grad[index], single.trace.means2d.grad)  # type: ignore[index,arg-type]
+    torch.testing.assert_close(batch_poses.grad, single_poses.grad, rtol=1e-6, atol=1e-6)
+    for name in GROUPS:  # sums over the views, in another order
+        mine, theirs = together[name].grad, alone[name].grad
+        assert mine is not None
+        assert theirs is not None
+        assert (mine - theirs).norm() <= 1e-6 * theirs.norm(), name
+
+
+def test_one_view_in_a_list_keeps_its_leading_dimension(config: RasterConfig) -> None:
+    out = rasterize(_gaussians(_parameters(20)), [_view()], config)
+    assert out.rgb.shape == (1, 3, 37, 50)
+    assert out.extra is not None
+    assert out.extra.shape == (1, 5, 37, 50)
+    assert out.trace.means2d.shape == (1, 20, 2)
+
+
+def test_views_that_do_not_fit_together_are_refused() -> None:
+    g = _gaussians(_parameters(5))
+    with pytest.raises(InputError, match="no view"):
+        rasterize(g, [], TORCH)
+    with pytest.raises(InputError, match="one image size"):
+        rasterize(g, [_view(), _view(40, 30)], TORCH)
+    with pytest.raises(InputError, match="world_from_cam"):
+        rasterize(g, [_view(), _view()], TORCH, world_from_cam=torch.eye(4))
+    with pytest.raises(InputError, match="background"):
+        rasterize(g, [_view(), _view()], TORCH, background=torch.zeros(3, 3))
+
+
+def test_a_rolling_shutter_is_named_and_old_lens_coefficients_change_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    plain, p = _view(), _parameters(20)
+    camera = replace(plain.camera, name="rolling test", distortion=(0.1, -0.2), readout_s=0.03)
+    out = rasterize(_gaussians(p), View(camera, plain.world_from_cam, 0.0), TORCH)
+    said = capsys.readouterr()
+    assert "rolling shutter of camera 'rolling test'" in said.err + said.out
+    assert torch.equal(out.rgb, rasterize(_gaussians(p), plain, TORCH).rgb)
+
+
 # ---- odd sizes and poison ------------------------------------------------------------------------------------------
 
 
@@ -519,19 +587,21 @@ class _FakeGsplat(SimpleNamespace):
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
         self.calls.append(("sh", degree, directions))
-        return coefficients[:, 0]
+        return coefficients[..., 0, :]
 
     def rasterization(self, **arguments: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         self.calls.append(("draw", arguments))
         colors, height, width = arguments["colors"], arguments["height"], arguments["width"]
-        means2d = arguments["means"][None, :, :2] * 1.0
+        views = len(arguments["viewmats"])
+        means2d = arguments["means"][None, :, :2].expand(views, -1, -1) * 1.0
         if means2d.requires_grad:
             means2d.retain_grad()
             means2d.register_hook(lambda g: setattr(means2d, "absgrad", 2 * g.abs()))
-        channels = torch.cat([colors.sum(0), means2d.sum()[None]])
-        image = channels.expand(1, height, width, -1)
-        alpha = torch.full((1, height, width, 1), 0.25)
-        return image, alpha, {"means2d": means2d, "radii": torch.ones(1, len(colors), 2, dtype=torch.int32)}
+        channels = torch.cat([colors.sum(1), means2d.sum((1, 2))[:, None]], 1)
+        image = channels[:, None, None].expand(views, height, width, -1)
+        alpha = torch.full((views, height, width, 1), 0.25)
+        radii = torch.ones(views, colors.shape[1], 2, dtype=torch.int32)
+        return image, alpha, {"means2d": means2d, "radii": radii}
 
 
 def test_the_gsplat_adapter_maps_every_argument() -> None:
@@ -539,11 +609,11 @@ def test_the_gsplat_adapter_maps_every_argument() -> None:
     p = _leaves(_parameters(7, degree=2, channels=3))
     config = RasterConfig(near_m=0.2, far_m=90.0, blur_px2=0.1, antialias=True)
     pose = torch.tensor(view.world_from_cam, dtype=torch.float32)
-    request = raster.Request(_gaussians(p), view, config, 2, torch.tensor([0.0, 0.0, 1.0]), pose, True)
+    request = raster.Request(_gaussians(p), (view,), False, config, 2, (torch.tensor([0.0, 0.0, 1.0]),), (pose,), True)
     out = raster_gsplat.render(request, module=fake)  # type: ignore[arg-type]
     (_, degree, directions), (_, draw) = fake.calls
     assert degree == 2
-    torch.testing.assert_close(directions, torch.nn.functional.normalize(p["means"] - pose[:3, 3], dim=1))
+    torch.testing.assert_close(directions[0], torch.nn.functional.normalize(p["means"] - pose[:3, 3], dim=1))
     assert draw["near_plane"] == 0.2
     assert draw["far_plane"] == 90.0
     assert draw["eps2d"] == 0.1
@@ -556,8 +626,8 @@ def test_the_gsplat_adapter_maps_every_argument() -> None:
     torch.testing.assert_close(draw["viewmats"][0], torch.tensor(view.cam_from_world, dtype=torch.float32))
     np.testing.assert_allclose(draw["Ks"][0].numpy(), view.camera.matrix, rtol=1e-6)
     torch.testing.assert_close(draw["opacities"], p["opacity"])
-    torch.testing.assert_close(draw["colors"][:, 3:], p["extra"])
-    torch.testing.assert_close(draw["colors"][:, :3], (p["sh"][:, 0] + 0.5).clamp_min(0))
+    torch.testing.assert_close(draw["colors"][0, :, 3:], p["extra"])
+    torch.testing.assert_close(draw["colors"][0, :, :3], (p["sh"][:, 0] + 0.5).clamp_min(0))
     assert out.extra is not None
     torch.testing.assert_close(out.extra[:, 0, 0], p["extra"].sum(0))
     torch.testing.assert_close(out.rgb[2, 0, 0], (p["sh"][:, 0, 2] + 0.5).clamp_min(0).sum() + 0.75)
@@ -568,6 +638,29 @@ def test_the_gsplat_adapter_maps_every_argument() -> None:
     assert out.trace.abs_grad2d is not None
     torch.testing.assert_close(out.trace.abs_grad2d, torch.full((7, 2), 8 * 24.0))
     assert out.trace.visible.all()
+
+
+def test_gsplat_draws_several_views_in_one_call() -> None:
+    fake, views = _FakeGsplat(), (_view(6, 4), _axis_view(6, 4))
+    p = _leaves(_parameters(7, degree=1, channels=2))
+    request = raster.Request(_gaussians(p), views, True, RasterConfig(), 1, (None, torch.ones(3)), (None, None), True)
+    out = raster_gsplat.render(request, module=fake)  # type: ignore[arg-type]
+    assert [name for name, *_ in fake.calls] == ["sh", "draw"]
+    draw = fake.calls[1][1]
+    for index, view in enumerate(views):
+        torch.testing.assert_close(draw["viewmats"][index], torch.tensor(view.cam_from_world, dtype=torch.float32))
+        np.testing.assert_allclose(draw["Ks"][index].numpy(), view.camera.matrix, rtol=1e-6)
+        offset = p["means"] - torch.tensor(view.world_from_cam[:3, 3], dtype=torch.float32)
+        torch.testing.assert_close(fake.calls[0][2][index], torch.nn.functional.normalize(offset, dim=1))
+    assert out.rgb.shape == (2, 3, 4, 6)
+    assert out.depth.shape == out.alpha.shape == (2, 1, 4, 6)
+    torch.testing.assert_close(out.rgb[1] - out.rgb[0], torch.full((3, 4, 6), 0.75))
+    out.depth[1].sum().backward()
+    assert out.trace.means2d.grad is not None
+    assert out.trace.means2d.grad[0].abs().max() == 0
+    torch.testing.assert_close(out.trace.means2d.grad[1], torch.full((7, 2), 4 * 24.0))
+    assert out.trace.radii.shape == (2, 7, 2)
+    assert out.trace.visible.shape == (2, 7)
 
 
 @needs_native

@@ -500,7 +500,7 @@ class Gaussians:
 
 @dataclass(slots=True, eq=False)
 class RasterTrace:
-    """What densification needs to know about a render.
+    """What densification needs to know about a render. Several views drawn at once add a leading dimension V to everything.
 
     Args:
         means2d: f32[N, 2] pixels; its gradient is kept after backward.
@@ -518,7 +518,8 @@ class RasterTrace:
 @dataclass(frozen=True, slots=True, eq=False)
 class Render:
     """A rendered view: ``rgb`` f32[3, H, W]; ``depth`` f32[1, H, W] metres, expected z (accumulated / alpha);
-    ``alpha`` f32[1, H, W]; ``extra`` f32[C, H, W] or None (accumulated, not divided by alpha)."""
+    ``alpha`` f32[1, H, W]; ``extra`` f32[C, H, W] or None (accumulated, not divided by alpha). Several views drawn at once
+    add a leading dimension V to everything."""
 
     rgb: Tensor
     depth: Tensor

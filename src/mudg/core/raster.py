@@ -1,18 +1,21 @@
-"""The one front door to Gaussian splatting: ``rasterize(gaussians, view, config) -> Render``, differentiable.
+"""The one front door to Gaussian splatting: ``rasterize(gaussians, view or views, config) -> Render``, differentiable.
 
 The mathematics, which every backend follows (it is written down, readable, in ``raster_torch``): elliptical weighted
 averaging of anisotropic Gaussians as in 3D Gaussian Splatting (Kerbl et al. 2023) with the conventions of gsplat: the
 projected covariance grows by ``blur_px2``; contributions below 1/255 are dropped; alpha is capped; a pixel stops when
 its transmittance would fall to 1e-4; colours are spherical harmonics plus 0.5, clamped at 0; pixel centres lie at +0.5.
 
-Pinhole cameras with a global shutter only: images are rectified on import, and ``Camera.readout_s`` is not used here.
+Pinhole cameras with a global shutter only. ``Camera.distortion`` describes the lens before rectification; images in a
+scene are rectified, so a picture drawn here belongs to the rectified camera and the coefficients play no part. A camera
+with ``readout_s`` > 0 is drawn as a global shutter at the view's time, which is said once per camera; a backend that follows
+the shutter would take the views' poses at the first and last row through ``Request.poses``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import torch
@@ -23,6 +26,7 @@ from mudg.base import log
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Gaussians, Render, View
 from mudg.core import raster_cpu, raster_gsplat, raster_torch
+from mudg.core.raster_request import Request
 
 Backend = Literal["auto", "cpu", "torch", "gsplat"]
 MAX_EXTRA_CHANNELS: Final = 28
@@ -63,19 +67,6 @@ class RasterConfig:
             raise UsageError("sh_degree is out of range", expected=f"0 to {MAX_SH_DEGREE}", got=str(self.sh_degree))
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
-    """A checked call, as the backends receive it. ``background`` is a Tensor[3] or None (black)."""
-
-    gaussians: Gaussians
-    view: View
-    config: RasterConfig
-    sh_degree: int
-    background: Tensor | None
-    world_from_cam: Tensor | None
-    absgrad: bool
-
-
 # Each backend: Request -> Render. The only place where backends are listed.
 BACKENDS: Final[dict[str, Callable[[Request], Render]]] = {
     "cpu": raster_cpu.render,
@@ -86,21 +77,23 @@ BACKENDS: Final[dict[str, Callable[[Request], Render]]] = {
 
 def rasterize(
     gaussians: Gaussians,
-    view: View,
+    view: View | Sequence[View],
     config: RasterConfig | None = None,
     *,
     background: Tensor | None = None,
     world_from_cam: Tensor | None = None,
     absgrad: bool = False,
 ) -> Render:
-    """Draw Gaussians into a view; everything returned is differentiable.
+    """Draw Gaussians into a view, or into several at once; everything returned is differentiable.
 
     Args:
         gaussians: activated parameters; gradients flow to means, quats, scales, opacity, sh and extra.
-        view: the camera, and the pose unless ``world_from_cam`` is given.
+        view: the camera, and the pose unless ``world_from_cam`` is given. A sequence of V views (one image size, any
+            cameras and poses) gives every result a leading dimension V; gradients are summed over the views.
         config: see ``RasterConfig``.
-        background: colour behind everything, [3] or [3, H, W], in [0, 1]; None = black. Differentiable.
-        world_from_cam: [4, 4] rigid, differentiable pose used instead of the view's.
+        background: colour behind everything, in [0, 1]: [3] or [3, H, W], or one per view: [V, 3] or [V, 3, H, W];
+            None = black. Differentiable.
+        world_from_cam: [4, 4] (with several views [V, 4, 4]) rigid, differentiable poses used instead of the views'.
         absgrad: also fill ``trace.abs_grad2d`` in backward (sum over pixels of |d loss / d mean2d|, pixels).
 
     Returns:
@@ -109,26 +102,23 @@ def rasterize(
         fills (pixels); rows of Gaussians that were not drawn are 0.
 
     Raises:
-        InputError: shapes, devices or types that do not fit.
+        InputError: shapes, devices or types that do not fit; views of different sizes, or none.
         ResourceError: the backend asked for is not available here, or memory ran out.
         NumericsError: a parameter is NaN or infinite (in any Gaussian), or the colour or a feature of a drawn one. Finite
             but absurd values (zero quaternion, scale of 1e38) are drawn or culled, never spread NaN.
     """
     config = config or RasterConfig()
-    degree = _check(gaussians, config, background, world_from_cam)
+    batched = not isinstance(view, View)
+    views = (view,) if isinstance(view, View) else tuple(view)
+    degree = _check(gaussians, config)
+    _check_views(views)
+    poses = _poses(world_from_cam, len(views), batched)
     name = _choose_backend(gaussians, config)
-    pixelwise = background if background is not None and background.ndim == 3 else None
-    flat = None if pixelwise is not None else background
-    request = Request(gaussians, view, config, degree, flat, world_from_cam, absgrad)
-    drawn = BACKENDS[name](request)
+    flat, pixelwise = _backgrounds(background, views, batched)
+    drawn = BACKENDS[name](Request(gaussians, views, batched, config, degree, flat, poses, absgrad))
     if pixelwise is None:
         return drawn
-    height, width = view.camera.height, view.camera.width
-    if tuple(pixelwise.shape) != (3, height, width):
-        raise InputError("the background does not fit the view", expected=f"[3, {height}, {width}] or [3]",
-                         got=str(list(pixelwise.shape)))  # fmt: skip
-    rgb = drawn.rgb + (1 - drawn.alpha) * pixelwise
-    return Render(rgb=rgb, depth=drawn.depth, alpha=drawn.alpha, extra=drawn.extra, trace=drawn.trace)
+    return replace(drawn, rgb=drawn.rgb + (1 - drawn.alpha) * pixelwise)
 
 
 def available(backend: str) -> str:
@@ -166,7 +156,7 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     return "torch"
 
 
-def _check(gaussians: Gaussians, config: RasterConfig, background: Tensor | None, pose: Tensor | None) -> int:
+def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     """Check what the dataclass does not; return the harmonics' degree."""
     coefficients = gaussians.sh.shape[1]
     allowed = math.isqrt(coefficients) - 1
@@ -186,8 +176,46 @@ def _check(gaussians: Gaussians, config: RasterConfig, background: Tensor | None
             raise InputError("all parameters must share device and type", where=f"gaussians.{name}",
                              expected=f"{gaussians.means.dtype} on {gaussians.means.device}",
                              got=f"{tensor.dtype} on {tensor.device}")  # fmt: skip
-    if background is not None and (background.ndim not in (1, 3) or background.shape[0] != 3):
-        raise InputError("the background has the wrong shape", expected="[3] or [3, H, W]", got=str(list(background.shape)))
-    if pose is not None and tuple(pose.shape) != (4, 4):
-        raise InputError("world_from_cam has the wrong shape", expected="[4, 4]", got=str(list(pose.shape)))
     return degree
+
+
+def _check_views(views: tuple[View, ...]) -> None:
+    if not views:
+        raise InputError("there is no view to draw", expected="a View or a sequence of Views")
+    size = (views[0].camera.width, views[0].camera.height)
+    for index, view in enumerate(views):
+        camera = view.camera
+        if (camera.width, camera.height) != size:
+            raise InputError("views drawn together must share one image size", where=f"view {index}, camera {camera.name!r}",
+                             expected=f"{size[0]}x{size[1]}", got=f"{camera.width}x{camera.height}")  # fmt: skip
+        if camera.readout_s > 0:
+            log.info_once(f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed; "
+                          "drawn as a global shutter at the view's time")  # fmt: skip
+
+
+def _poses(world_from_cam: Tensor | None, views: int, batched: bool) -> tuple[Tensor | None, ...]:
+    if world_from_cam is None:
+        return (None,) * views
+    wanted = (views, 4, 4) if batched else (4, 4)
+    if tuple(world_from_cam.shape) != wanted:
+        raise InputError("world_from_cam has the wrong shape", expected=str(list(wanted)), got=str(list(world_from_cam.shape)))
+    return world_from_cam.unbind(0) if batched else (world_from_cam,)
+
+
+def _backgrounds(
+    background: Tensor | None, views: tuple[View, ...], batched: bool
+) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
+    """One colour per view for the backend; or black, and what is added to the picture afterwards."""
+    black = (None,) * len(views)
+    if background is None:
+        return black, None
+    height, width = views[0].camera.height, views[0].camera.width
+    shape, per_view = tuple(background.shape), (len(views),) if batched else ()
+    if shape == (3,):
+        return (background,) * len(views), None
+    if batched and shape == (*per_view, 3):
+        return background.unbind(0), None
+    if shape in ((3, height, width), (*per_view, 3, height, width)):
+        return black, background
+    also = f", [{len(views)}, 3] or [{len(views)}, 3, {height}, {width}]" if batched else ""
+    raise InputError("the background has the wrong shape", expected=f"[3], [3, {height}, {width}]{also}", got=str(list(shape)))

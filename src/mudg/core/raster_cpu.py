@@ -16,12 +16,14 @@ from torch.autograd.function import once_differentiable
 
 from mudg import native
 from mudg.base.errors import InputError, NumericsError, ResourceError
-from mudg.base.types import Camera, RasterTrace, Render
+from mudg.base.types import Camera, Render
+from mudg.core.raster_request import Drawn, Request, joined, trace_leaves
 
 if TYPE_CHECKING:
-    from mudg.core.raster import RasterConfig, Request
+    from mudg.core.raster import RasterConfig
 
 _F, _I, _P = ctypes.c_float, ctypes.c_int32, ctypes.c_void_p
+_RECYCLE_FROM_BYTES: Final = 8 << 20
 PHASES: Final = ("project", "sort", "bin", "blend", "blend_backward", "project_backward")
 
 
@@ -72,16 +74,52 @@ class _Context:
 
 
 def _statistics(library: ctypes.CDLL, handle: int) -> dict[str, float]:
-    counts, phases = (ctypes.c_int64 * 5)(), (ctypes.c_double * 6)()
+    counts, phases = (ctypes.c_int64 * 6)(), (ctypes.c_double * 6)()
     library.mudg_raster_statistics(handle, counts, phases)
-    names = ("visible", "entries", "not_finite", "first_not_finite", "context_bytes", *PHASES)
+    names = ("visible", "entries", "not_finite", "first_not_finite", "context_bytes", "pairs", *PHASES)
     return {name: float(value) for name, value in zip(names, (*counts, *phases), strict=True)}
 
 
+class _Loan:
+    """Keeps borrowed memory out of the free list until the last tensor over it is gone."""
+
+    free: ClassVar[list[Tensor]] = []
+
+    def __init__(self, block: Tensor) -> None:
+        self.block = block
+
+    def __del__(self) -> None:
+        free = getattr(type(self), "free", None)  # gone when the interpreter is shutting down
+        if free is not None:
+            free.append(self.block)
+
+
+def _recycled_like(tensor: Tensor) -> Tensor:
+    """``torch.empty_like``, from memory of an earlier gradient where there is some.
+
+    The allocator gives blocks of this size back to the system, and every page of a fresh one costs a fault: at 200,000
+    Gaussians that was a tenth of a training step.
+    """
+    count = tensor.numel()
+    if count * tensor.element_size() < _RECYCLE_FROM_BYTES:
+        return torch.empty_like(tensor)
+    fitting = [i for i, block in enumerate(_Loan.free) if count <= block.numel() <= 1.5 * count]
+    if fitting:
+        block = _Loan.free.pop(fitting[0])
+    else:
+        _Loan.free.clear()  # blocks of a size that is no longer asked for
+        block = torch.empty(count + count // 8)
+    memory = (_F * count).from_address(block.data_ptr())
+    # The tensor keeps `memory` alive, and that the loan.
+    memory.loan = _Loan(block)  # type: ignore[attr-defined]
+    return torch.frombuffer(memory, dtype=torch.float32).view(tensor.shape)
+
+
 def release_memory() -> None:
-    """Free the working memory of contexts that are not in use."""
+    """Free the working memory that is not in use: contexts of the library and memory kept for gradients."""
     global _last_handle
     _last_handle = 0
+    _Loan.free.clear()
     library = native.library()
     while library is not None and _Context._free:
         library.mudg_raster_free(_Context._free.pop())
@@ -102,28 +140,34 @@ class _Call:
 
 def render(request: Request) -> Render:
     """Draw with the native kernel. See ``core.raster.rasterize``."""
-    gaussians, camera = request.gaussians, request.view.camera
-    library = _library()
+    gaussians = request.gaussians
+    _library()
     if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
         raise InputError("the native rasteriser works on float32 CPU tensors", where="gaussians.means",
                          expected="torch.float32 on cpu", got=f"{gaussians.means.dtype} on {gaussians.means.device}")  # fmt: skip
-    count = len(gaussians)
     parts = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacity, gaussians.sh, gaussians.extra)
-    tensors = (*parts, request.background, request.world_from_cam)
+    tensors = (*parts, *request.backgrounds, *request.poses)
     keeps_graph = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
-    pose = request.world_from_cam
-    if pose is None:
-        pose = torch.from_numpy(request.view.world_from_cam.copy())
-    means2d = torch.empty(count, 2, requires_grad=keeps_graph)
+    means2d, leaves = trace_leaves(request, gaussians.means, keeps_graph)
+    absolute = torch.zeros_like(means2d) if request.absgrad and keeps_graph else None
+    parts_of_absolute = (None,) * len(leaves) if absolute is None else absolute.view(len(leaves), -1, 2).unbind(0)
+    drawn = [
+        _draw(request, index, leaf, part, keeps_graph)
+        for index, (leaf, part) in enumerate(zip(leaves, parts_of_absolute, strict=True))
+    ]
+    return joined(request, drawn, means2d, absolute)
+
+
+def _draw(request: Request, index: int, means2d: Tensor, abs_grad2d: Tensor | None, keeps_graph: bool) -> Drawn:
+    g = request.gaussians
     call = _Call(
-        library=library, camera=camera, config=request.config, sh_degree=request.sh_degree, keeps_graph=keeps_graph,
-        radii=torch.empty(count, 2, dtype=torch.int32),
-        abs_grad2d=torch.zeros(count, 2) if request.absgrad and keeps_graph else None,
+        library=_library(), camera=request.views[index].camera, config=request.config, sh_degree=request.sh_degree,
+        keeps_graph=keeps_graph, radii=torch.empty(len(g), 2, dtype=torch.int32), abs_grad2d=abs_grad2d,
     )  # fmt: skip
-    rgb, depth_sum, alpha, extra = _Rasterize.apply(*parts, request.background, pose, means2d, call)
-    depth = depth_sum / alpha.clamp_min(1e-10)
-    trace = RasterTrace(means2d, call.radii, (call.radii > 0).any(1), call.abs_grad2d)
-    return Render(rgb=rgb, depth=depth, alpha=alpha, extra=None if gaussians.extra is None else extra, trace=trace)
+    rgb, depth, alpha, extra = _Rasterize.apply(
+        g.means, g.quats, g.scales, g.opacity, g.sh, g.extra, request.backgrounds[index], request.pose(index), means2d, call
+    )
+    return Drawn(rgb, depth, alpha, None if g.extra is None else extra, call.radii)
 
 
 def last_statistics() -> dict[str, float]:
@@ -137,7 +181,7 @@ _last_handle = 0
 
 
 class _Rasterize(torch.autograd.Function):
-    """forward: parameters -> rgb, accumulated depth, alpha, extra. Gradients come from the library."""
+    """forward: parameters -> rgb, depth, alpha, extra. Gradients come from the library."""
 
     @staticmethod
     def forward(
@@ -173,8 +217,8 @@ class _Rasterize(torch.autograd.Function):
         parts, call, needs = ctx.saved_tensors, ctx.call, ctx.needs_input_grad  # reading them checks for edits in place
         count = parts[0].shape[0]
         upstream = [None if g is None else g.contiguous() for g in (of_rgb, of_depth, of_alpha, of_extra)]
-        out = [torch.empty_like(t) for t in parts[:4]]
-        out += [torch.empty_like(t) if t is not None and needed else None for t, needed in zip(parts[4:], needs[4:6])]
+        out = [_recycled_like(t) for t in parts[:4]]
+        out += [_recycled_like(t) if t is not None and needed else None for t, needed in zip(parts[4:], needs[4:6])]
         of_means2d = torch.empty(count, 2)
         absolute = None if call.abs_grad2d is None else torch.empty(count, 2)
         gradient = _Gradient(*(_at(t) for t in (*out, of_means2d, absolute)))

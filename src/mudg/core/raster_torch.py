@@ -16,10 +16,11 @@ import torch
 from torch import Tensor
 
 from mudg.base.errors import NumericsError
-from mudg.base.types import Camera, Gaussians, RasterTrace, Render
+from mudg.base.types import Camera, Gaussians, Render
+from mudg.core.raster_request import Drawn, Request, joined, trace_leaves
 
 if TYPE_CHECKING:
-    from mudg.core.raster import RasterConfig, Request
+    from mudg.core.raster import RasterConfig
 
 ALPHA_MIN: Final = 1.0 / 255.0
 STOP_TRANSMITTANCE: Final = 1e-4
@@ -40,17 +41,28 @@ class Splats:
 
 def render(request: Request) -> Render:
     """Draw with torch operations. See ``core.raster.rasterize``."""
-    g, camera, config = request.gaussians, request.view.camera, request.config
-    pose = request.world_from_cam
-    if pose is None:
-        pose = torch.from_numpy(request.view.world_from_cam.copy())
-    pose = pose.to(g.means)
+    g = request.gaussians
     _refuse_not_finite(g)
+    tensors = (g.means, g.quats, g.scales, *request.poses)
+    keeps_graph = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    # The means are handed out as a leaf, so that their gradient is kept; a zero that carries it joins the graph.
+    means2d, probes = trace_leaves(request, g.means, keeps_graph)
+    absolute = torch.zeros_like(means2d) if request.absgrad and keeps_graph else None
+    drawn, shown = [], []
+    for index, probe in enumerate(probes):
+        table = None if absolute is None else absolute.view(len(probes), -1, 2)[index]
+        one, splats = _draw(request, index, probe, table)
+        drawn.append(one)
+        shown.append(torch.where(one.radii > 0, splats.means2d.detach(), 0))
+    means2d.detach().copy_(torch.stack(shown).view_as(means2d))
+    return joined(request, drawn, means2d, absolute)
+
+
+def _draw(request: Request, index: int, probe: Tensor, absolute: Tensor | None) -> tuple[Drawn, Splats]:
+    g, camera, config = request.gaussians, request.views[index].camera, request.config
+    pose, background = request.pose(index).to(g.means), request.backgrounds[index]
     splats = project(g, pose, camera, config)
     colors = sh_colors(g.sh, g.means - pose[:3, 3], request.sh_degree)
-    keeps_graph = torch.is_grad_enabled() and splats.means2d.requires_grad
-    # The means are handed out as a leaf, so that their gradient is kept; a zero that carries it joins the graph.
-    probe = torch.zeros_like(splats.means2d).requires_grad_(keeps_graph)
     size = (camera.width, camera.height)
     with torch.no_grad():
         touched = (splats.depth < config.far_m) & (splats.opacity >= ALPHA_MIN)
@@ -59,22 +71,16 @@ def render(request: Request) -> Render:
         touched &= (splats.extents > 0).all(1) & (high >= 0.5).all(1) & (low <= limit - 0.5).all(1)
         order = torch.nonzero(touched)[:, 0]
         order = order[torch.argsort(splats.depth[order], stable=True)]
+        radii = torch.where(touched[:, None], splats.extents.clamp(0, 1e9).ceil().clamp_min(1), 0).int()
     channels = torch.cat([colors, splats.depth[:, None], *([] if g.extra is None else [g.extra])], 1)[order]
     if not (torch.isfinite(channels).all() and torch.isfinite(g.sh[order]).all()):
         raise NumericsError("the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra")
-    absolute = torch.zeros_like(probe) if request.absgrad and keeps_graph else None
     blended, alpha = _blend_tiles(splats, probe, order, channels, absolute, size, config.alpha_max)
     rgb, depth_sum, extra = blended[:3], blended[3:4], blended[4:]
-    if request.background is not None:
-        rgb = rgb + (1 - alpha) * request.background.to(rgb)[:, None, None]
-    visible = torch.zeros_like(touched)
-    visible[order] = True
-    with torch.no_grad():
-        radii = torch.where(visible[:, None], splats.extents.clamp(0, 1e9).ceil().clamp_min(1), 0).int()
-        probe.copy_(torch.where(visible[:, None], splats.means2d, 0))
-    trace = RasterTrace(probe, radii, visible, absolute)
-    return Render(rgb=rgb, depth=depth_sum / alpha.clamp_min(1e-10), alpha=alpha,
-                  extra=None if g.extra is None else extra, trace=trace)  # fmt: skip
+    if background is not None:
+        rgb = rgb + (1 - alpha) * background.to(rgb)[:, None, None]
+    depth = depth_sum / alpha.clamp_min(1e-10)
+    return Drawn(rgb, depth, alpha, None if g.extra is None else extra, radii), splats
 
 
 def project(g: Gaussians, world_from_cam: Tensor, camera: Camera, config: RasterConfig) -> Splats:

@@ -45,6 +45,7 @@ struct Kernels {
   void (*project_backward)(RasterState&, RasterGradient&);
   double (*photometric)(const PhotometricJob&);
   void (*adam)(const AdamJob&);
+  double (*peak_multiply_add)(std::int64_t rounds, float* sink);
 };
 
 const Kernels& kernels_portable();

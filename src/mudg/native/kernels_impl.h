@@ -4,6 +4,7 @@
 #include "adam.h"
 #include "kernels.h"
 #include "loss.h"
+#include "peak.h"
 #include "raster_backward.h"
 #include "raster_forward.h"
 #include "raster_project.h"
@@ -68,7 +69,8 @@ void blend_backward(RasterState& state, const RasterImageGradient& image) {
   }
 }
 
-constexpr Kernels kTable = {project_forward, blend_forward, blend_backward, project_backward, photometric, adam};
+constexpr Kernels kTable = {project_forward, blend_forward, blend_backward, project_backward, photometric, adam,
+                            peak_multiply_add};
 
 }  // namespace
 }  // namespace mudg::MUDG_ISA_NAMESPACE

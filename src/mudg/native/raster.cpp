@@ -1,5 +1,7 @@
 // C interface of the rasteriser: contexts, forward, backward.
+#include <algorithm>
 #include <chrono>
+#include <ctime>
 #include <new>
 
 #include "api.h"
@@ -22,19 +24,31 @@ const Kernels& kernels() {
 
 namespace {
 
+// Seconds: processor time where one thread does all the work (what others take of a busy machine does not count), else
+// wall time.
+double seconds_now(bool alone) {
+#if defined(CLOCK_THREAD_CPUTIME_ID)
+  timespec time{};
+  if (alone && clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time) == 0)
+    return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
+#endif
+  (void)alone;
+  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
 class PhaseClock {
  public:
-  explicit PhaseClock(RasterContext& context) : context_(context), since_(Clock::now()) {}
+  explicit PhaseClock(RasterContext& context) : context_(context), since_(seconds_now(alone_)) {}
   void finish(RasterPhase phase) {
-    const Clock::time_point now = Clock::now();
-    context_.phase_s[phase] = std::chrono::duration<double>(now - since_).count();
+    const double now = seconds_now(alone_);
+    context_.phase_s[phase] = now - since_;
     since_ = now;
   }
 
  private:
-  using Clock = std::chrono::steady_clock;
+  const bool alone_ = thread_count() == 1;
   RasterContext& context_;
-  Clock::time_point since_;
+  double since_;
 };
 
 RasterStatus forward(RasterContext& context, const RasterScene& scene, RasterImage& image) {
@@ -65,6 +79,23 @@ RasterStatus backward(RasterContext& context, const RasterImageGradient& image, 
   return RasterStatus::kOk;
 }
 
+// Pairs in the tiles' lists up to where the last pixel of each block was finished.
+std::int64_t blended_pairs(const RasterState& s) {
+  std::int64_t total = 0;
+  for (int tile = 0; tile < s.tiles_x * s.tiles_y; ++tile) {
+    const std::int32_t* last = s.last_item + static_cast<std::size_t>(tile) * kPixelsPerTile;
+    std::int32_t block_last[kBlocksPerTile];
+    for (int b = 0; b < kBlocksPerTile; ++b)
+      block_last[b] = *std::max_element(last + b * kPixelsPerBlock, last + (b + 1) * kPixelsPerBlock);
+    const std::int32_t begin = s.tile_start[tile], end = s.tile_start[tile + 1];
+    for (std::int32_t i = begin; i < end; ++i) {
+      for (unsigned left = s.items[i].blocks; left != 0; left &= left - 1)
+        total += i - begin <= block_last[__builtin_ctz(left)];
+    }
+  }
+  return total;
+}
+
 }  // namespace
 }  // namespace mudg
 
@@ -88,14 +119,20 @@ MUDG_API int mudg_raster_backward(mudg::RasterContext* context, const mudg::Rast
 }
 
 // After a forward pass: visible Gaussians, tile entries, Gaussians with non-finite input, index of the first of those,
-// and the bytes that the context holds; then seconds per phase of the last forward and backward pass.
-MUDG_API void mudg_raster_statistics(const mudg::RasterContext* context, std::int64_t counts[5], double phase_s[6]) {
+// the bytes that the context holds, and the pairs of a Gaussian and a 4x4 block that were blended; then seconds per phase of the last forward and backward pass.
+MUDG_API void mudg_raster_statistics(const mudg::RasterContext* context, std::int64_t counts[6], double phase_s[6]) {
   counts[0] = context->state.visible_count;
   counts[1] = context->state.entry_count;
   counts[2] = context->state.not_finite_count;
   counts[3] = context->state.first_not_finite;
   counts[4] = static_cast<std::int64_t>(context->bytes());
+  counts[5] = context->state.visible_count > 0 ? mudg::blended_pairs(context->state) : 0;
   for (int phase = 0; phase < mudg::kPhases; ++phase) phase_s[phase] = context->phase_s[phase];
+}
+
+// Floating-point operations of `rounds` rounds of independent multiply-adds on one thread (see peak.h).
+MUDG_API double mudg_peak_multiply_add(std::int64_t rounds, float* sink) {
+  return mudg::kernels().peak_multiply_add(rounds, sink);
 }
 
 }  // extern "C"

@@ -27,7 +27,7 @@ bool RasterContext::prepare(const RasterScene& scene) {
   state.scene = scene;
   state.channels = 4 + scene.extra_channels;
   state.padded_channels = round_up(state.channels, 4);
-  state.splat_stride = round_up(kFirstChannel + state.padded_channels, 16);
+  state.splat_stride = kFirstChannel + state.padded_channels;
   state.record_stride = kRecordChannels + state.padded_channels;
   state.tiles_x = (scene.width + kTileSize - 1) / kTileSize;
   state.tiles_y = (scene.height + kTileSize - 1) / kTileSize;
@@ -42,7 +42,8 @@ bool RasterContext::prepare(const RasterScene& scene) {
                   entry_worker.reserve(count + 16) && depth_key.reserve(count + 16) &&
                   entry_offset.reserve(count + 16) && entry_counts.reserve(count + 16) &&
                   first_record.reserve(count + 17) && tile_start.reserve(tiles + 1) && tile_cursor.reserve(tiles + 1) &&
-                  final_transmittance.reserve(tiles * kPixelsPerTile) && last_item.reserve(tiles * kPixelsPerTile);
+                  final_transmittance.reserve(tiles * kPixelsPerTile) && last_item.reserve(tiles * kPixelsPerTile) &&
+                  expected_depth.reserve(tiles * kPixelsPerTile);
   if (!ok) return false;
   state.splats = splats.data();
   state.clamped = clamped.data();
@@ -54,6 +55,7 @@ bool RasterContext::prepare(const RasterScene& scene) {
   state.tile_start = tile_start.data();
   state.final_transmittance = final_transmittance.data();
   state.last_item = last_item.data();
+  state.expected_depth = expected_depth.data();
   state.worker_count = thread_count();
   for (int worker = 0; worker < state.worker_count; ++worker) {
     if (!tile_counts[worker].reserve(tiles)) return false;
@@ -77,7 +79,7 @@ bool RasterContext::prepare_backward() {
 }
 
 std::size_t RasterContext::bytes() const {
-  std::size_t total = splats.bytes() + final_transmittance.bytes() + records.bytes() + tile_background.bytes() +
+  std::size_t total = splats.bytes() + final_transmittance.bytes() + expected_depth.bytes() + records.bytes() + tile_background.bytes() +
                       clamped.bytes() + entry_worker.bytes() + depth_key.bytes() + entry_offset.bytes() +
                       order.bytes() + sort_key.bytes() + sort_key2.bytes() + sort_order.bytes() + entry_counts.bytes() +
                       first_record.bytes() + tile_start.bytes() + tile_cursor.bytes() + last_item.bytes() +

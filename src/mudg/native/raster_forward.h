@@ -10,8 +10,9 @@ template <int kChannels>
 struct ForwardTile {
   alignas(64) float color[kBlocksPerTile][kChannels][kPixelsPerBlock];
   alignas(64) float running[kBlocksPerTile][kPixelsPerBlock];  // transmittance, 0 once the pixel is finished
-  alignas(64) float final[kBlocksPerTile][kPixelsPerBlock];    // transmittance after the last contribution
-  alignas(64) int last[kBlocksPerTile][kPixelsPerBlock];       // its list position, -1 if there was none
+  alignas(64) float final[kBlocksPerTile][kPixelsPerBlock];    // transmittance behind the last entry blended
+  alignas(64) int last[kBlocksPerTile][kPixelsPerBlock];       // last list position before the pixel was finished
+  alignas(64) float alphas[kBatch][kPixelsPerBlock];
   Chunk<kChannels> chunk;
 
   // Returns the blocks that lie in the image at least in part.
@@ -35,41 +36,51 @@ struct ForwardTile {
   // block is finished.
   MUDG_INLINE bool blend_block(int b, int base, const TilePlace& place, Floats cap) {
     const Floats pixel_x = place.pixel_x(b), pixel_y = place.pixel_y(b), stop = splat(kStopTransmittance);
-    Floats transmittance = load(running[b]), after = load(final[b]);
+    const std::uint8_t* entries = chunk.lists.entries[b];
+    Floats transmittance = load(running[b]), behind = load(final[b]);
     Ints last_position = load_int(last[b]);
     Floats sums[kChannels];
     for (int c = 0; c < kChannels; ++c) sums[c] = load(color[b][c]);
-    bool alive = true;
-    for (int j = 0; j < chunk.counts[b]; ++j) {
-      const int entry = chunk.entries[b][j];
-      const float* row = chunk.row(entry);
-      const Alpha alpha = alpha_of(row, pixel_x, pixel_y, cap);
-      // The transmittance of finished pixels is 0, so they fail the test by themselves: no separate mask on the
-      // critical path.
-      const Floats effective = keep(alpha.counts, alpha.value);
-      const Floats next = neg_mul_add(effective, transmittance, transmittance);
-      const Mask goes_on = next > stop;
-      const Floats weight = keep(goes_on, effective * transmittance);
-      after = select(goes_on, next, after);
-      last_position = select_int(alpha.counts & goes_on, splat_int(base + entry), last_position);
-      transmittance = keep(goes_on, next);
-      for (int c = 0; c < kChannels; ++c) sums[c] = mul_add(splat(row[kFirstChannel + c]), weight, sums[c]);
-      if (__builtin_expect(bits(goes_on) == 0, 0)) {
-        alive = false;
-        break;
+    Mask alive = transmittance > stop;
+    for (int first = 0; first < chunk.lists.counts[b] && bits(alive) != 0; first += kBatch) {
+      const int count = smaller(kBatch, chunk.lists.counts[b] - first);
+      raw_alphas(chunk.rows, chunk.kRow, entries + first, count, pixel_x, pixel_y, alphas);
+      for (int j = 0; j < count; ++j) {
+        const int entry = entries[first + j];
+        const float* row = chunk.row(entry);
+        const Floats alpha = min_of(load(alphas[j]), cap);
+        // Transmittance only falls, so a pixel that has stopped stays so without a mask on the critical path.
+        const Floats next = neg_mul_add(alpha, transmittance, transmittance);
+        alive = next > stop;
+        const Floats weight = keep(alive, alpha * transmittance);
+        transmittance = next;
+        behind = select(alive, next, behind);
+        last_position = select_int(alive, splat_int(base + entry), last_position);
+        for (int c = 0; c < kChannels; ++c) sums[c] = mul_add(splat(row[kFirstChannel + c]), weight, sums[c]);
       }
+      transmittance = keep(alive, transmittance);  // before it gets so small that arithmetic becomes slow
     }
     store(running[b], transmittance);
-    store(final[b], after);
+    store(final[b], behind);
     store_int(last[b], last_position);
     for (int c = 0; c < kChannels; ++c) store(color[b][c], sums[c]);
-    return alive;
+    return bits(alive) != 0;
   }
 
   MUDG_INLINE void add_background(const float* background) {
     for (int b = 0; b < kBlocksPerTile; ++b) {
       const Floats left = load(final[b]);
       for (int c = 0; c < 3; ++c) store(color[b][c], mul_add(splat(background[c]), left, load(color[b][c])));
+    }
+  }
+
+  // Turns accumulated depth into expected depth, and keeps it for the backward pass (`kept`: [16 blocks][16 pixels]).
+  MUDG_INLINE void divide_depth(float* kept) {
+    for (int b = 0; b < kBlocksPerTile; ++b) {
+      const Floats alpha = splat(1.0f) - load(final[b]);
+      const Floats depth = keep(alpha > splat(kLeastAlpha), load(color[b][3]) / max_of(alpha, splat(kLeastAlpha)));
+      store(color[b][3], depth);
+      store(kept + b * kPixelsPerBlock, depth);
     }
   }
 
@@ -104,21 +115,22 @@ void blend_tile(RasterState& state, int tile, float* const* planes, float* alpha
   const int count = state.tile_start[tile + 1] - state.tile_start[tile];
   ForwardTile<kChannels> work;
   unsigned blocks = work.start(place);
-  const int rows = smaller(kTileSize, place.height - place.y);
-  for (int y = 0; y < rows; ++y) {  // the output is written at the end: fetch its lines meanwhile
-    const std::size_t at = static_cast<std::size_t>(place.y + y) * place.width + place.x;
-    for (int c = 0; c < state.channels; ++c) __builtin_prefetch(planes[c] + at, 1, 2);
-    __builtin_prefetch(alpha + at, 1, 2);
-  }
+  Lookahead ahead;
+  ahead.pixels_of(place);  // the output is written at the end
   const Floats cap = splat(state.scene.alpha_max);
   for (int base = 0; base < count && blocks != 0; base += kChunk) {
     work.chunk.gather(state, items + base, smaller(kChunk, count - base), blocks);
+    // The lists of consecutive tiles lie side by side.
+    const TileItem *next = items + smaller(base + kChunk, count), *end = state.items + state.entry_count;
+    ahead.splats_of(next, next + smaller<std::ptrdiff_t>(kChunk, end - next));
     for (unsigned left = blocks; left != 0; left &= left - 1) {
       const int b = __builtin_ctz(left);
-      if (work.chunk.counts[b] > 0 && !work.blend_block(b, base, place, cap)) blocks &= ~(1u << b);
+      ahead.helping<true>(state, planes, alpha);
+      if (work.chunk.lists.counts[b] > 0 && !work.blend_block(b, base, place, cap)) blocks &= ~(1u << b);
     }
   }
   work.add_background(state.scene.background);
+  work.divide_depth(state.expected_depth + static_cast<std::size_t>(tile) * kPixelsPerTile);
   std::memcpy(state.final_transmittance + static_cast<std::size_t>(tile) * kPixelsPerTile, work.final,
               sizeof work.final);
   std::memcpy(state.last_item + static_cast<std::size_t>(tile) * kPixelsPerTile, work.last, sizeof work.last);

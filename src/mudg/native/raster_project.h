@@ -52,7 +52,7 @@ MUDG_INLINE unsigned project_lanes(const RasterScene& s, int first, SplatLanes& 
       sqrt_of(mul_add(p.offset[0], p.offset[0],
                       mul_add(p.offset[1], p.offset[1], mul_add(p.offset[2], p.offset[2], splat(1e-24f)))));
   Floats basis[kMaxSh];
-  sh_basis<Floats>(s.sh_degree, p.offset[0] * inv_length, p.offset[1] * inv_length, p.offset[2] * inv_length, basis);
+  sh_basis(s.sh_degree, p.offset[0] * inv_length, p.offset[1] * inv_length, p.offset[2] * inv_length, basis);
   for (int k = 0; k < (s.sh_degree + 1) * (s.sh_degree + 1); ++k) store(out.basis[k], basis[k]);
   return bits((poison >= zero) & (poison <= zero));
 }
@@ -132,6 +132,7 @@ void project_group(RasterState& state, RasterImage& image, int first, int worker
   WorkerEntries& worker = state.workers[worker_id];
   SplatLanes lanes;
   const unsigned finite = project_lanes(s, first, lanes);
+  const std::size_t used_before = worker.used;
   for (int l = 0; l < kLanes && first + l < s.count; ++l) {
     const int g = first + l;
     const bool is_finite = (finite >> l) & 1u;
@@ -142,11 +143,11 @@ void project_group(RasterState& state, RasterImage& image, int first, int worker
     if (is_finite && footprint_of(s, lanes, l, f)) {
       const std::size_t tiles =
           static_cast<std::size_t>((f.right >> 4) - (f.left >> 4) + 1) * ((f.bottom >> 4) - (f.top >> 4) + 1);
-      TileEntry* out = worker.room(tiles + 1);
+      TileEntry* out = worker.room(larger<std::size_t>(tiles + 1, 16));
       if (out == nullptr || offset + tiles >= kHidden) {
         __atomic_store_n(&state.out_of_memory, 1, __ATOMIC_RELAXED);
       } else {
-        touched = emit_footprint(f, state.tiles_x, out, worker.tile_counts);
+        touched = emit_footprint(f, state.tiles_x, out);
       }
     }
     worker.used += static_cast<std::size_t>(touched);
@@ -165,6 +166,7 @@ void project_group(RasterState& state, RasterImage& image, int first, int worker
     std::memcpy(&state.depth_key[g], &lanes.depth[l], sizeof(float));
     if (!write_splat(state, lanes, l, g)) note_not_finite(state, g);
   }
+  for (std::size_t e = used_before; e < worker.used; ++e) ++worker.tile_counts[worker.entries[e].tile];
 }
 
 void project_forward(RasterState& state, RasterImage& image) {

@@ -7,6 +7,8 @@
 namespace mudg::MUDG_ISA_NAMESPACE {
 namespace {
 
+constexpr int kPrefetchAhead = 6;  // Gaussians
+
 // Gradients of one group of sixteen splats, by lane.
 struct GroupGradient {
   alignas(64) float mean2d[2][kLanes];
@@ -14,6 +16,7 @@ struct GroupGradient {
                                          // over both, yy)
   alignas(64) float depth[kLanes];
   alignas(64) float opacity[kLanes];       // of the opacity after anti-aliasing
+  alignas(64) float rgb[3][kLanes];        // of the colour, 0 where it was cut off at zero
   alignas(64) float direction[3][kLanes];  // of the mean, by way of the viewing direction of the harmonics
 };
 
@@ -29,14 +32,16 @@ MUDG_INLINE bool sum_records(const RasterState& state, int g, float mean_x, floa
   const TileEntry* entry = state.workers[state.entry_worker[g]].entries + state.entry_offset[g];
   const float* record = state.records + static_cast<std::size_t>(state.first_record[g]) * state.record_stride;
   bool any = false;
+  const double inv_tiles_x = 1.0 / state.tiles_x;
   for (int k = 0; k < state.entry_counts[g]; ++k, record += state.record_stride) {
     std::uint32_t first_word;
     std::memcpy(&first_word, record, sizeof first_word);
     if (first_word == kNoContribution) continue;
     any = true;
     const int tile = entry[k].tile;
-    const float x = mean_x - static_cast<float>(tile % state.tiles_x * kTileSize + kTileSize / 2);
-    const float y = mean_y - static_cast<float>(tile / state.tiles_x * kTileSize + kTileSize / 2);
+    const int tile_y = static_cast<int>((static_cast<double>(tile) + 0.5) * inv_tiles_x);  // tile / tiles_x, but faster
+    const float x = mean_x - static_cast<float>((tile - tile_y * state.tiles_x) * kTileSize + kTileSize / 2);
+    const float y = mean_y - static_cast<float>(tile_y * kTileSize + kTileSize / 2);
     const float m = record[0], mx = record[1], my = record[2];
     out.mass += m;
     out.x += x * m - mx;
@@ -61,38 +66,64 @@ MUDG_INLINE void zero_rows(const RasterScene& s, const RasterGradient& gradient,
   if (gradient.abs_means2d != nullptr) gradient.abs_means2d[2 * row] = gradient.abs_means2d[2 * row + 1] = 0.0f;
 }
 
-// Gradient of the harmonics' coefficients, and of the mean through the viewing direction.
-MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& gradient, int g,
-                                const float* of_channels, int l, GroupGradient& group) {
+// Gradients of the harmonics' coefficients, and of the mean through the viewing direction. `live`: bits of the lanes
+// that contributed.
+MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& gradient, int first, unsigned live,
+                                GroupGradient& group) {
   const RasterScene& s = state.scene;
-  float of_rgb[3];
-  for (int c = 0; c < 3; ++c) of_rgb[c] = (state.clamped[g] >> c) & 1 ? 0.0f : of_channels[c];
-  float d[3], squared = 1e-24f;
-  for (int k = 0; k < 3; ++k) {
-    d[k] = (s.means[3 * static_cast<std::size_t>(g) + k] - s.center_high[k]) - s.center_low[k];
-    squared += d[k] * d[k];
-  }
-  const float inv_length = 1.0f / __builtin_sqrtf(squared);
-  for (float& value : d) value *= inv_length;
-  float basis[kMaxSh], of_basis[kMaxSh];
-  sh_basis<float>(s.sh_degree, d[0], d[1], d[2], basis);
+  Floats d[3];
+  load_columns<3>(s.means, first, s.count, d);
+  for (int k = 0; k < 3; ++k) d[k] = (d[k] - splat(s.center_high[k])) - splat(s.center_low[k]);
+  const Floats squared = mul_add(d[0], d[0], mul_add(d[1], d[1], mul_add(d[2], d[2], splat(1e-24f))));
+  const Floats inv_length = splat(1.0f) / sqrt_of(squared);
+  for (int k = 0; k < 3; ++k) d[k] = d[k] * inv_length;
   const int active = (s.sh_degree + 1) * (s.sh_degree + 1);
-  const float* sh = s.sh + static_cast<std::size_t>(g) * s.sh_coefficients * 3;
-  for (int k = 0; k < active; ++k)
-    of_basis[k] = sh[3 * k] * of_rgb[0] + sh[3 * k + 1] * of_rgb[1] + sh[3 * k + 2] * of_rgb[2];
-  if (gradient.sh != nullptr) {
-    float* of_sh = gradient.sh + static_cast<std::size_t>(g) * s.sh_coefficients * 3;
+  Floats basis[kMaxSh], of_basis[kMaxSh];
+  alignas(64) float columns[kMaxSh][kLanes];
+  sh_basis(s.sh_degree, d[0], d[1], d[2], basis);
+  for (int k = 0; k < active; ++k) store(columns[k], basis[k]);
+  alignas(64) float of_columns[kMaxSh][kLanes] = {};
+  for (unsigned left = live; left != 0; left &= left - 1) {
+    const int l = __builtin_ctz(left);
+    const std::size_t row = static_cast<std::size_t>(first + l) * s.sh_coefficients * 3;
+    const float* sh = s.sh + row;
+    const float red = group.rgb[0][l], green = group.rgb[1][l], blue = group.rgb[2][l];
+    float values[kMaxSh], of_values[kMaxSh];
+    for (int k = 0; k < active; ++k) of_values[k] = sh[3 * k] * red + sh[3 * k + 1] * green + sh[3 * k + 2] * blue;
+    for (int k = 0; k < active; ++k) of_columns[k][l] = of_values[k];
+    if (gradient.sh == nullptr) continue;
+    float* of_sh = gradient.sh + row;
+    for (int k = 0; k < active; ++k) values[k] = columns[k][l];
     for (int k = 0; k < active; ++k) {
-      for (int c = 0; c < 3; ++c) of_sh[3 * k + c] = basis[k] * of_rgb[c];
+      of_sh[3 * k] = values[k] * red;
+      of_sh[3 * k + 1] = values[k] * green;
+      of_sh[3 * k + 2] = values[k] * blue;
     }
     for (int k = 3 * active; k < 3 * s.sh_coefficients; ++k) of_sh[k] = 0.0f;
   }
-  if (s.sh_degree > 0) {
-    float v[3];
-    sh_basis_backward(s.sh_degree, d[0], d[1], d[2], of_basis, v);
-    const float along = v[0] * d[0] + v[1] * d[1] + v[2] * d[2];
-    for (int k = 0; k < 3; ++k) group.direction[k][l] = (v[k] - along * d[k]) * inv_length;
+  if (s.sh_degree == 0) return;
+  for (int k = 0; k < active; ++k) of_basis[k] = load(of_columns[k]);
+  Floats v[3];
+  sh_basis_backward(s.sh_degree, d[0], d[1], d[2], of_basis, v);
+  const Floats along = dot3(v, d);
+  for (int k = 0; k < 3; ++k) store(group.direction[k], neg_mul_add(along, d[k], v[k]) * inv_length);
+}
+
+// Brings closer what the gathering of Gaussian g will read and write.
+MUDG_INLINE void prefetch_gaussian(const RasterState& state, const RasterGradient& gradient, int g) {
+  const RasterScene& s = state.scene;
+  const std::size_t harmonics = static_cast<std::size_t>(s.sh_coefficients) * 3;
+  if (gradient.sh != nullptr) {
+    for (std::size_t at = 0; at < harmonics; at += 16) __builtin_prefetch(gradient.sh + g * harmonics + at, 1, 2);
   }
+  if (state.entry_counts[g] == 0) return;
+  for (std::size_t at = 0; at < harmonics; at += 16) __builtin_prefetch(s.sh + g * harmonics + at, 0, 2);
+  __builtin_prefetch(state.splats + static_cast<std::size_t>(g) * state.splat_stride, 0, 2);
+  const std::size_t stride = static_cast<std::size_t>(state.record_stride);
+  const float* record = state.records + state.first_record[g] * stride;
+  const std::size_t bytes = smaller(state.entry_counts[g], 4) * stride;
+  for (std::size_t at = 0; at < bytes; at += 16) __builtin_prefetch(record + at, 0, 2);
+  __builtin_prefetch(state.workers[state.entry_worker[g]].entries + state.entry_offset[g], 0, 2);
 }
 
 // Reads the records of sixteen Gaussians. Returns whether any of them contributed to the image.
@@ -100,16 +131,17 @@ MUDG_INLINE bool gather_group(const RasterState& state, const RasterGradient& gr
                               GroupGradient& group) {
   const RasterScene& s = state.scene;
   std::memset(&group, 0, sizeof group);
-  bool any = false;
+  unsigned live = 0;
   RecordSums sums;
   for (int l = 0; l < kLanes && first + l < s.count; ++l) {
     const int g = first + l;
+    if (g + kPrefetchAhead < s.count) prefetch_gaussian(state, gradient, g + kPrefetchAhead);
     const float* splat_row = state.splats + static_cast<std::size_t>(g) * state.splat_stride;
     if (state.entry_counts[g] == 0 || !sum_records(state, g, splat_row[kMeanX], splat_row[kMeanY], sums)) {
       zero_rows(s, gradient, g);
       continue;
     }
-    any = true;
+    live |= 1u << l;
     const float a = splat_row[kStretch] * (2.0f * kLn2), b = splat_row[kShear] * a;
     const float c = splat_row[kHeight] * (2.0f * kLn2) + splat_row[kShear] * b;
     group.mean2d[0][l] = a * sums.x + b * sums.y;
@@ -131,9 +163,10 @@ MUDG_INLINE bool gather_group(const RasterState& state, const RasterGradient& gr
     if (gradient.extra != nullptr) {
       for (int k = 0; k < s.extra_channels; ++k) gradient.extra[row * s.extra_channels + k] = sums.channels[4 + k];
     }
-    color_backward(state, gradient, g, sums.channels, l, group);
+    for (int c = 0; c < 3; ++c) group.rgb[c][l] = (state.clamped[g] >> c) & 1 ? 0.0f : sums.channels[c];
   }
-  return any;
+  if (live != 0) color_backward(state, gradient, first, live, group);
+  return live != 0;
 }
 
 struct CovarianceGradient {

@@ -9,68 +9,60 @@ namespace {
 
 constexpr int kMaxSh = 16;
 
-MUDG_INLINE void constant(float value, float& out) { out = value; }
-MUDG_INLINE void constant(float value, Floats& out) { out = splat(value); }
-template <class V>
-MUDG_INLINE V lift(float value) {
-  V out;
-  constant(value, out);
-  return out;
-}
-
-// basis[(degree + 1)^2] at the unit direction (x, y, z); V is float or Floats.
-template <class V>
-MUDG_INLINE void sh_basis(int degree, V x, V y, V z, V* basis) {
-  basis[0] = lift<V>(0.2820947917738781f);
+// basis[(degree + 1)^2] at the unit direction (x, y, z).
+MUDG_INLINE void sh_basis(int degree, Floats x, Floats y, Floats z, Floats* basis) {
+  basis[0] = splat(0.2820947917738781f);
   if (degree < 1) return;
-  basis[1] = lift<V>(-0.48860251190292f) * y;
-  basis[2] = lift<V>(0.48860251190292f) * z;
-  basis[3] = lift<V>(-0.48860251190292f) * x;
+  basis[1] = splat(-0.48860251190292f) * y;
+  basis[2] = splat(0.48860251190292f) * z;
+  basis[3] = splat(-0.48860251190292f) * x;
   if (degree < 2) return;
-  const V zz = z * z, cos2 = x * x - y * y, sin2 = lift<V>(2.0f) * x * y;
-  const V slope = lift<V>(-1.092548430592079f) * z;
-  const V a = lift<V>(0.5462742152960395f);
+  const Floats zz = z * z, cos2 = x * x - y * y, sin2 = splat(2.0f) * x * y;
+  const Floats slope = splat(-1.092548430592079f) * z;
+  const Floats a = splat(0.5462742152960395f);
   basis[4] = a * sin2;
   basis[5] = slope * y;
-  basis[6] = lift<V>(0.9461746957575601f) * zz - lift<V>(0.3153915652525201f);
+  basis[6] = splat(0.9461746957575601f) * zz - splat(0.3153915652525201f);
   basis[7] = slope * x;
   basis[8] = a * cos2;
   if (degree < 3) return;
-  const V c = lift<V>(0.4570457994644658f) - lift<V>(2.285228997322329f) * zz;
-  const V d = lift<V>(1.445305721320277f) * z;
-  const V e = lift<V>(-0.5900435899266435f);
-  const V cos3 = x * cos2 - y * sin2, sin3 = x * sin2 + y * cos2;
+  const Floats c = splat(0.4570457994644658f) - splat(2.285228997322329f) * zz;
+  const Floats d = splat(1.445305721320277f) * z;
+  const Floats e = splat(-0.5900435899266435f);
+  const Floats cos3 = x * cos2 - y * sin2, sin3 = x * sin2 + y * cos2;
   basis[9] = e * sin3;
   basis[10] = d * sin2;
   basis[11] = c * y;
-  basis[12] = z * (lift<V>(1.865881662950577f) * zz - lift<V>(1.119528997770346f));
+  basis[12] = z * (splat(1.865881662950577f) * zz - splat(1.119528997770346f));
   basis[13] = c * x;
   basis[14] = d * cos2;
   basis[15] = e * cos3;
 }
 
 // Gradient of sum_k weight[k] * basis_k with respect to the direction, before the projection onto the unit sphere.
-MUDG_INLINE void sh_basis_backward(int degree, float x, float y, float z, const float* weight, float* direction) {
-  direction[0] = direction[1] = direction[2] = 0.0f;
+MUDG_INLINE void sh_basis_backward(int degree, Floats x, Floats y, Floats z, const Floats* weight, Floats* direction) {
+  const auto number = [](float value) { return splat(value); };
+  direction[0] = direction[1] = direction[2] = number(0.0f);
   if (degree < 1) return;
-  direction[0] -= 0.48860251190292f * weight[3];
-  direction[1] -= 0.48860251190292f * weight[1];
-  direction[2] += 0.48860251190292f * weight[2];
+  direction[0] = number(-0.48860251190292f) * weight[3];
+  direction[1] = number(-0.48860251190292f) * weight[1];
+  direction[2] = number(0.48860251190292f) * weight[2];
   if (degree < 2) return;
-  const float cos2 = x * x - y * y, sin2 = 2.0f * x * y;
-  const float slope = -1.092548430592079f, a = 0.5462742152960395f;
-  direction[0] += slope * z * weight[7] + a * (2.0f * x * weight[8] + 2.0f * y * weight[4]);
-  direction[1] += slope * z * weight[5] + a * (2.0f * x * weight[4] - 2.0f * y * weight[8]);
-  direction[2] += 2.0f * 0.9461746957575601f * z * weight[6] + slope * (x * weight[7] + y * weight[5]);
+  const Floats two = number(2.0f), x2 = two * x, y2 = two * y;
+  const Floats cos2 = x * x - y * y, sin2 = x2 * y;
+  const Floats slope = number(-1.092548430592079f), a = number(0.5462742152960395f);
+  direction[0] = direction[0] + slope * z * weight[7] + a * (x2 * weight[8] + y2 * weight[4]);
+  direction[1] = direction[1] + slope * z * weight[5] + a * (x2 * weight[4] - y2 * weight[8]);
+  direction[2] = direction[2] + number(2.0f * 0.9461746957575601f) * z * weight[6] + slope * (x * weight[7] + y * weight[5]);
   if (degree < 3) return;
-  const float c = 0.4570457994644658f - 2.285228997322329f * z * z, c_dz = -2.0f * 2.285228997322329f * z;
-  const float d = 1.445305721320277f, e = -0.5900435899266435f;
-  direction[0] += c * weight[13] + d * z * (2.0f * x * weight[14] + 2.0f * y * weight[10]) +
-                  e * (3.0f * cos2 * weight[15] + 3.0f * sin2 * weight[9]);
-  direction[1] += c * weight[11] + d * z * (2.0f * x * weight[10] - 2.0f * y * weight[14]) +
-                  e * (3.0f * cos2 * weight[9] - 3.0f * sin2 * weight[15]);
-  direction[2] += (3.0f * 1.865881662950577f * z * z - 1.119528997770346f) * weight[12] +
-                  c_dz * (x * weight[13] + y * weight[11]) + d * (cos2 * weight[14] + sin2 * weight[10]);
+  const Floats c = number(0.4570457994644658f) - number(2.285228997322329f) * z * z, c_dz = number(-2.0f * 2.285228997322329f) * z;
+  const Floats d = number(1.445305721320277f), e = number(-3.0f * 0.5900435899266435f);
+  direction[0] = direction[0] + c * weight[13] + d * z * (x2 * weight[14] + y2 * weight[10]) +
+                 e * (cos2 * weight[15] + sin2 * weight[9]);
+  direction[1] = direction[1] + c * weight[11] + d * z * (x2 * weight[10] - y2 * weight[14]) +
+                 e * (cos2 * weight[9] - sin2 * weight[15]);
+  direction[2] = direction[2] + (number(3.0f * 1.865881662950577f) * z * z - number(1.119528997770346f)) * weight[12] +
+                 c_dz * (x * weight[13] + y * weight[11]) + d * (cos2 * weight[14] + sin2 * weight[10]);
 }
 
 // color[3] = 0.5 + sum_k basis[k * stride] * sh[k], sh as rows of three.

@@ -22,6 +22,7 @@ constexpr int kMaxChannels = 32;             // RGB + depth + features
 constexpr float kStopTransmittance = 1e-4f;  // a pixel is finished when its transmittance would fall to this or below
 constexpr float kLog2Of255 = 7.994353436858858f;  // contributions below alpha = 1/255 are dropped
 constexpr float kLog2E = 1.4426950408889634f;
+constexpr float kLeastAlpha = 1e-10f;        // below, a pixel has no depth
 constexpr float kLn2 = 0.6931471805599453f;
 
 // One projected Gaussian, followed by its channel values: R, G, B, depth, features.
@@ -58,7 +59,7 @@ struct RasterScene {
 };
 
 struct RasterImage {
-  float *rgb, *depth, *alpha, *extra;  // [3,H,W] [H,W] accumulated z [H,W] [C,H,W]
+  float *rgb, *depth, *alpha, *extra;  // [3,H,W] [H,W] expected z [H,W] [C,H,W]
   float* means2d;                      // [N,2], 0 where not drawn
   std::int32_t* radii;                 // [N,2], 0 where not drawn
 };
@@ -75,8 +76,9 @@ struct RasterGradient {
 
 enum class RasterStatus : int { kOk = 0, kOutOfMemory = 1, kTooManyEntries = 2, kNotFinite = 3 };
 
-// Tile entries that one worker made, in the order in which it met the Gaussians, and how many fell into each tile.
-struct WorkerEntries {
+// Tile entries that one worker made, in the order in which it met the Gaussians, and how many fell into each tile. A
+// cache line for each worker: `used` changes with every Gaussian.
+struct alignas(64) WorkerEntries {
   TileEntry* entries;
   std::size_t used, capacity;
   std::int32_t* tile_counts;
@@ -109,7 +111,8 @@ struct RasterState {
   std::int32_t* tile_start;     // [tiles + 1]
   TileItem* items;              // [entry_count]
   float* final_transmittance;   // [tiles][16 blocks][16 pixels]
-  std::int32_t* last_item;      // the same layout: last list position that contributed, -1 if none
+  std::int32_t* last_item;      // the same layout: last list position before the pixel was finished, -1 if none
+  float* expected_depth;        // the same layout: the depth image
   float* records;               // [entry_count][record_stride]
   float* tile_background;       // [tiles][4] per-tile part of the background's gradient
   double* camera_parts;         // [chunks][16] per-chunk parts of the camera's gradient
@@ -121,6 +124,6 @@ struct RasterState {
   std::int32_t out_of_memory;
 };
 constexpr std::uint32_t kHidden = 0xffffffffu;
-constexpr int kCameraChunk = 256;  // blocks of 16 Gaussians summed into one part of the camera gradient
+constexpr int kCameraChunk = 64;  // blocks of 16 Gaussians summed into one part of the camera gradient
 
 }  // namespace mudg

@@ -105,7 +105,6 @@ MUDG_INLINE float sum(Floats x) {
 MUDG_INLINE Floats reciprocal(Floats x) { return splat(1.0f) / x; }
 
 MUDG_INLINE __m256 exp2_half(__m256 x) {
-  x = _mm256_max_ps(x, _mm256_set1_ps(-126.0f));
   const __m256 whole = _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
   const __m256 part = _mm256_sub_ps(x, whole);
   __m256 p = _mm256_set1_ps(1.3264727e-3f);
@@ -118,8 +117,12 @@ MUDG_INLINE __m256 exp2_half(__m256 x) {
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), exponent));
 }
 
-// 2^x with a relative error below 1.3e-7; x below -126 counts as -126.
-MUDG_INLINE Floats exp2_of(Floats x) { return {exp2_half(x.a), exp2_half(x.b)}; }
+constexpr int kGroup = 2;  // values worked on side by side, to hide latencies
+
+// 2^x with a relative error below 1.3e-7, of a group; meaningless below -126.
+MUDG_INLINE void exp2_group(const Floats* x, Floats* out) {
+  for (int k = 0; k < kGroup; ++k) out[k] = {exp2_half(x[k].a), exp2_half(x[k].b)};
+}
 
 MUDG_INLINE void split_exponent_half(__m256 x, __m256& exponent, __m256& mantissa) {
   const __m256i raw = _mm256_castps_si256(x);

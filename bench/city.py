@@ -1,6 +1,6 @@
 """Processor times of the generated city: world build, frames, sweeps. Prints a table; nothing is written.
 
-python bench/bench_city.py [--threads 1] [--seeds 6]
+python bench/city.py [--threads 1] [--seeds 6]
 """
 
 from __future__ import annotations

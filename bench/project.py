@@ -1,6 +1,6 @@
 """Times the point z-buffer: points into one view. Wall time and processor time, medians, milliseconds.
 
-    python bench/bench_project.py --points 2000000 --size 960x640 --threads 2
+    python bench/project.py --points 2000000 --size 960x640 --threads 2
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Seconds of the small diffusion model: one network pass, one decoding, one whole clip of eight frames, on one thread.
 
-    OMP_NUM_THREADS=1 python bench/bench_mdm.py [--model embedded] [--steps 4]
+    OMP_NUM_THREADS=1 python bench/mdm.py [--model embedded] [--steps 4]
 """
 
 from __future__ import annotations
