@@ -1,5 +1,7 @@
 """The pixel-level part of the diffusion model: what is copied, what the loss asks for, shapes."""
 
+import math
+
 import pytest
 import torch
 
@@ -81,8 +83,24 @@ def test_loss_terms_at_known_values():
     assert float(right["pixel_error"]) == pytest.approx(0.05 * -3.0)
     off = refine.refine_loss(Refined(rgb + 0.1, code, scores, code), truth)
     assert float(off["pixel_rgb"]) == pytest.approx(0.1 + 2 * 0.01, rel=1e-5)
+    apart = refine.refine_loss(Refined(rgb, code + 0.1, scores, code), truth, log_per_code=2.0)
+    share = 1 + 2 * float((ids == refine.SKY).float().mean())
+    assert float(apart["pixel_depth"]) == pytest.approx(5 * share * (math.expm1(0.2) - 0.0025), rel=1e-4)
     unlabelled = refine.refine_loss(Refined(rgb, code, scores, code), PixelTruth(rgb, code, torch.full_like(ids, 255)))
     assert float(unlabelled["pixel_semantics"]) == 0
+
+
+def test_class_weights_are_taken_back():
+    codec, refiner, latents, given = some()
+    weights = torch.linspace(0.5, 3.0, 19)
+    with torch.no_grad():
+        before = refiner(codec, latents, given, 4)
+        refiner.take_back(weights)
+        after = refiner(codec, latents, given, 4)
+    lost = before.scores - after.scores
+    assert torch.allclose(lost, weights.log().view(1, -1, 1, 1).expand_as(lost), atol=1e-5)
+    assert torch.equal(before.rgb, after.rgb)
+    assert torch.equal(before.depth_code, after.depth_code)
 
 
 def test_the_stated_error_does_not_move_the_colour():

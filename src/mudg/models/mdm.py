@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -418,7 +419,9 @@ class MDM(nn.Module):
         factor = self.codec.factor
         tall, wide = (slice(s.start * factor, s.stop * factor) for s in (rows, columns))
         made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
-        return refine_loss(made, truth.crop(tall, wide), class_weights)
+        codec = self.config.codec
+        log_per_code = math.log(codec.far_m / codec.near_m) / 2 if codec.depth_code == "log" else 1.0
+        return refine_loss(made, truth.crop(tall, wide), class_weights, log_per_code=log_per_code)
 
     def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
         """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.refine`)."""

@@ -16,9 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mudg.base import palette
 from mudg.models.vae import CLASSES, MODALITIES, ChannelNorm, Modality, PatchCodec
 
 UNKNOWN = 255
+SKY = palette.ID["sky"]
+MAX_LOG_RATIO = 2.0
+"""Depth painted farther than e^2 times the truth costs no more than that."""
 COPY_SCORE = 6.0
 """What a class given by the condition adds to its score when the gate is open."""
 
@@ -122,6 +126,12 @@ class Refiner(nn.Module):
         self.leave = nn.Conv2d(fine, sum(self.SIZES), 1)
         self.reset()
 
+    def take_back(self, class_weights: Tensor) -> None:
+        """Undo what class weights f32[19] in the loss did to the scores: each class loses the logarithm of its weight."""
+        first = sum(self.SIZES[:5])
+        with torch.no_grad():
+            self.leave.bias[first : first + 4 * CLASSES] -= class_weights.log().repeat_interleave(4)  # type: ignore[index]
+
     def reset(self) -> None:
         """Output that adds nothing and copies little, whatever the other weights are."""
         with torch.no_grad():
@@ -179,11 +189,15 @@ class PixelTruth:
         )
 
 
-def refine_loss(made: Refined, truth: PixelTruth, class_weights: Tensor | None = None) -> dict[str, Tensor]:
+def refine_loss(
+    made: Refined, truth: PixelTruth, class_weights: Tensor | None = None, *, log_per_code: float = 1.0
+) -> dict[str, Tensor]:
     """Weighted terms of the pixel loss, scalars with gradient.
 
     pixel_rgb        L1 + 2 x squared error + half of the L1 of gradients
-    pixel_depth      10 x smooth L1 (beta 0.02) of the depth code
+    pixel_depth      5 x smooth L1 (beta 0.005) of made / true depth - 1, threefold in the sky. The codes are taken for logarithms
+                     of depth in steps of `log_per_code`. A surface painted too far away costs more than one too near, as in
+                     the measure it is scored by; the sky's share makes up for that
     pixel_semantics  0.2 x cross-entropy, classes weighted, summed over labelled pixels and divided by the number of all
     pixel_error      0.05 x negative log-likelihood of the colour's absolute error under the stated scale (Laplace); it moves
                      the statement only, not the colour
@@ -193,8 +207,10 @@ def refine_loss(made: Refined, truth: PixelTruth, class_weights: Tensor | None =
     error = made.rgb - truth.rgb
     across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
     rgb = error.abs().mean() + 2.0 * error.square().mean() + 0.5 * (across.abs().mean() + down.abs().mean())
-    off = functional.smooth_l1_loss(made.depth_code, truth.depth_code, beta=0.02, reduction="none")
-    depth = 10.0 * (off if truth.depth_known is None else off * truth.depth_known).mean()
+    ratio = torch.expm1(((made.depth_code - truth.depth_code) * log_per_code).clamp(max=MAX_LOG_RATIO))
+    off = functional.smooth_l1_loss(ratio, torch.zeros_like(ratio), beta=0.005, reduction="none")
+    off = off * (1.0 + 2.0 * (truth.ids == SKY).unsqueeze(1))
+    depth = 5.0 * (off if truth.depth_known is None else off * truth.depth_known).mean()
     weight = None if class_weights is None else class_weights.to(made.scores.dtype)
     semantics = functional.cross_entropy(made.scores, truth.ids, weight, ignore_index=UNKNOWN, reduction="none").mean()
     size = error.detach().abs().mean(1, keepdim=True)

@@ -161,14 +161,16 @@ class LearnConfig:
     weight_decay: float = Field(default=0.01, ge=0)
     clip_norm: float = Field(default=1.0, ge=0)
     """Gradients are scaled down to this norm (0 = never)."""
-    frozen: Literal["nothing", "temporal_transformers", "temporal_layers"] = "nothing"
-    """What keeps its weights. The published second stage freezes the temporal transformers alone."""
+    frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
+    """What keeps its weights. The published second stage freezes the temporal transformers alone; with denoiser only the
+    refiner is trained."""
     augment: bool = True
     """Vary colours, mirror, and spoil given classes."""
     reference_dropout: float = Field(default=0.2, ge=0, le=1)
     """How often a clip goes without its reference image; only for models that use one."""
     balance: float = Field(default=0.0, ge=0, le=1)
-    """How strongly rare classes count in the semantic loss: 0 = as often as they occur, 1 = all classes alike."""
+    """How strongly rare classes count in the semantic loss: 0 = as often as they occur, 1 = all classes alike. A refiner's
+    scores are freed of it at the end."""
     average_decay: float = Field(default=0.998, ge=0, lt=1)
     """Decay of the moving average of the weights (0 = no average)."""
     checkpoint_every: int = Field(default=100, ge=1)

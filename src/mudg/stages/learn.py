@@ -143,6 +143,8 @@ def _finish(
 ) -> None:  # fmt: skip
     """Score and export what was trained."""
     made = with_weights(model, weights)
+    if made.refiner is not None and config.balance:
+        made.refiner.take_back(class_weights(clips, min(config.first_cities, 20), config.balance))
     shards = learn_clips.scored_shards(config)
     scores = learn_score.score(made, shards, clips, steps=config.score_steps, seed=config.seed, bf16=bf16)
     store.write_json(directory.path / "metrics.json", scores)
@@ -328,7 +330,12 @@ def freeze(model: MDM, what: str) -> int:
     """
     if what == "nothing":
         return 0
-    names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
+    if what == "denoiser":
+        names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
+        if model.refiner is None:
+            raise UsageError("without a refiner nothing would be left to train", where="--frozen", got=what)
+    else:
+        names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
     count = 0
     for name, parameter in model.trained_part().named_parameters():
         if name in names:
