@@ -34,7 +34,8 @@ class Buffer {
     capacity_ = wanted;
     alignment_ = alignment;
 #if defined(__linux__)
-    if (bytes >= kHugePage) madvise(data_, bytes / kHugePage * kHugePage, MADV_HUGEPAGE);  // a wish; refusal does no harm
+    // A wish: refusal does no harm.
+    if (bytes >= kHugePage) madvise(data_, bytes / kHugePage * kHugePage, MADV_HUGEPAGE);
 #endif
     return true;
   }

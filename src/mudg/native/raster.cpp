@@ -119,7 +119,8 @@ MUDG_API int mudg_raster_backward(mudg::RasterContext* context, const mudg::Rast
 }
 
 // After a forward pass: visible Gaussians, tile entries, Gaussians with non-finite input, index of the first of those,
-// the bytes that the context holds, and the pairs of a Gaussian and a 4x4 block that were blended; then seconds per phase of the last forward and backward pass.
+// the bytes that the context holds, and the pairs of a Gaussian and a 4x4 block that were blended; then seconds per
+// phase of the last forward and backward pass.
 MUDG_API void mudg_raster_statistics(const mudg::RasterContext* context, std::int64_t counts[6], double phase_s[6]) {
   counts[0] = context->state.visible_count;
   counts[1] = context->state.entry_count;

@@ -65,8 +65,8 @@ MUDG_INLINE void store_quads(const Floats* f, float (*out)[4][4]) {
 }
 
 // Adds the moments of block b's entries to their records. `weights` has room for a multiple of sixteen.
-MUDG_INLINE void accumulate_moments(int b, const float (*weights)[kPixelsPerBlock], const std::uint8_t* entries, int count,
-                                    float* records, int record_stride) {
+MUDG_INLINE void accumulate_moments(int b, const float (*weights)[kPixelsPerBlock], const std::uint8_t* entries,
+                                    int count, float* records, int record_stride) {
   const Floats near = splat(0.5f), far = splat(1.5f), near2 = splat(0.25f), far2 = splat(2.25f);
   const Floats cx = splat(static_cast<float>((b & 3) * 4 - 6)), cy = splat(static_cast<float>((b >> 2) * 4 - 6));
   for (int first = 0; first < count; first += 16) {
@@ -124,8 +124,8 @@ struct MomentBasis {
 };
 constexpr MomentBasis kMomentBasis;
 
-MUDG_INLINE void accumulate_moments(int b, const float (*weights)[kPixelsPerBlock], const std::uint8_t* entries, int count,
-                                    float* records, int record_stride) {
+MUDG_INLINE void accumulate_moments(int b, const float (*weights)[kPixelsPerBlock], const std::uint8_t* entries,
+                                    int count, float* records, int record_stride) {
   accumulate_rows<NarrowRow, kMomentColumns>(kMomentBasis.rows[b], weights, entries, count, records, record_stride);
 }
 #endif

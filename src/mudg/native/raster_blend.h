@@ -94,8 +94,8 @@ struct TilePlace {
   }
 };
 
-// Memory that will be needed soon. The requests are issued a few at a time, one helping per block of computation: all at
-// once they would only wait for each other.
+// Memory that will be needed soon. The requests are issued a few at a time, one helping per block of computation: all
+// at once they would only wait for each other.
 class Lookahead {
  public:
   // Splat rows of the list entries [begin, end).
@@ -119,11 +119,13 @@ class Lookahead {
 
   template <bool kWrite, class Pointer>
   MUDG_INLINE void helping(const RasterState& state, const Pointer* planes, const float* alpha) {
-    for (const TileItem* stop = smaller(splat_item_ + splat_step_, splat_end_); splat_item_ < stop; ++splat_item_) {
+    const TileItem* splat_stop = smaller(splat_item_ + splat_step_, splat_end_);
+    for (; splat_item_ < splat_stop; ++splat_item_) {
       const float* row = state.splats + static_cast<std::size_t>(splat_item_->gaussian) * state.splat_stride;
       for (int at = 0; at < state.splat_stride; at += 16) __builtin_prefetch(row + at, 0, 2);
     }
-    for (const TileItem* stop = smaller(record_item_ + record_step_, record_end_); record_item_ < stop; ++record_item_) {
+    const TileItem* record_stop = smaller(record_item_ + record_step_, record_end_);
+    for (; record_item_ < record_stop; ++record_item_) {
       const float* row = state.records + static_cast<std::size_t>(record_item_->record) * state.record_stride;
       __builtin_prefetch(row, 1, 2);
       __builtin_prefetch(row + state.record_stride - 1, 1, 2);
@@ -165,12 +167,13 @@ struct Chunk {
     for (int i = size; i < round_up(size, 16); ++i) masks[i] = 0;
     std::memset(lists.counts, 0, sizeof lists.counts);
     for (int i = 0; i < size; i += 16) lists.append(masks + i, i);
-    for (int b = 0; b < kBlocksPerTile; ++b) std::memset(lists.entries[b] + lists.counts[b], 0, kGroup);  // see raw_alphas
+    for (int b = 0; b < kBlocksPerTile; ++b)  // raw_alphas reads whole groups
+      std::memset(lists.entries[b] + lists.counts[b], 0, kGroup);
   }
 };
 
-// Alphas before the cap of `count` entries on one block, 0 where they fall below 1/255; `out` has room for a whole number
-// of groups. The forward and the backward pass both use it, so that they agree bit for bit on which pixels are touched.
+// Alphas before the cap of `count` entries on one block, 0 where they fall below 1/255; `out` has room for a whole
+// number of groups. The forward and the backward pass both use it, so that they agree bit for bit on which pixels are touched.
 //
 // One alpha is a chain of some twenty dependent operations. Left in one loop with the blending it fills the processor's
 // scheduler with waiting operations; several entries side by side, step by step, keep it busy.

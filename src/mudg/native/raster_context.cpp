@@ -79,7 +79,8 @@ bool RasterContext::prepare_backward() {
 }
 
 std::size_t RasterContext::bytes() const {
-  std::size_t total = splats.bytes() + final_transmittance.bytes() + expected_depth.bytes() + records.bytes() + tile_background.bytes() +
+  std::size_t total = splats.bytes() + final_transmittance.bytes() + expected_depth.bytes() + records.bytes() +
+                      tile_background.bytes() +
                       clamped.bytes() + entry_worker.bytes() + depth_key.bytes() + entry_offset.bytes() +
                       order.bytes() + sort_key.bytes() + sort_key2.bytes() + sort_order.bytes() + entry_counts.bytes() +
                       first_record.bytes() + tile_start.bytes() + tile_cursor.bytes() + last_item.bytes() +

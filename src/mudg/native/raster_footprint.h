@@ -77,7 +77,7 @@ MUDG_INLINE int emit_sixteen_tiles(const Footprint& f, bool whole_rectangle, int
     last.v = _mm512_mask_set1_epi32(_mm512_set1_epi32(-1), inside, f.right >> 2);
   }
   const __m512i left = _mm512_set1_epi32(tx * 4), one = _mm512_set1_epi32(1);
-  // Bit c: block column c of the strip is reached. A shift by 32 or more gives 0, so strips that are not reached give 0.
+  // Bit c: block column c of the strip is reached. A shift by 32 or more gives 0.
   const __m512i high = _mm512_sllv_epi32(_mm512_add_epi32(one, one), _mm512_sub_epi32(last.v, left));
   const __m512i low = _mm512_sllv_epi32(one, _mm512_sub_epi32(first.v, left));
   const __mmask16 reached = _mm512_cmpge_epi32_mask(last.v, first.v);
@@ -93,7 +93,8 @@ MUDG_INLINE int emit_sixteen_tiles(const Footprint& f, bool whole_rectangle, int
   const __m512i tile = _mm512_add_epi32(_mm512_mullo_epi32(row, _mm512_set1_epi32(tiles_x)),
                                         _mm512_add_epi32(column, _mm512_set1_epi32(ty * tiles_x + tx)));
   const __mmask16 touched = _mm512_test_epi32_mask(blocks, blocks);
-  const __m512i tiles = _mm512_maskz_compress_epi32(touched, tile), masks = _mm512_maskz_compress_epi32(touched, blocks);
+  const __m512i tiles = _mm512_maskz_compress_epi32(touched, tile);
+  const __m512i masks = _mm512_maskz_compress_epi32(touched, blocks);
   const __m512i half = _mm512_srli_epi32(lane, 1);
   const __m512i pairs = _mm512_mask_add_epi32(half, 0xaaaa, half, _mm512_set1_epi32(16));  // 0 16 1 17 2 18 ..
   const __m512i later = _mm512_add_epi32(pairs, _mm512_set1_epi32(8));
@@ -107,7 +108,8 @@ MUDG_INLINE int emit_sixteen_tiles(const Footprint& f, bool whole_rectangle, int
 MUDG_INLINE int emit_footprint(const Footprint& f, int tiles_x, TileEntry* out) {
   const bool small = (f.right >> 2) - (f.left >> 2) < 2 || (f.bottom >> 2) == (f.top >> 2);
 #if defined(__AVX512F__)
-  if ((f.right >> 4) - (f.left >> 4) < 4 && (f.bottom >> 4) - (f.top >> 4) < 4) return emit_sixteen_tiles(f, small, tiles_x, out);
+  if ((f.right >> 4) - (f.left >> 4) < 4 && (f.bottom >> 4) - (f.top >> 4) < 4)
+    return emit_sixteen_tiles(f, small, tiles_x, out);
 #endif
   if (small) return emit_rectangle(f, tiles_x, out);
   int written = 0;

@@ -53,9 +53,11 @@ MUDG_INLINE void sh_basis_backward(int degree, Floats x, Floats y, Floats z, con
   const Floats slope = number(-1.092548430592079f), a = number(0.5462742152960395f);
   direction[0] = direction[0] + slope * z * weight[7] + a * (x2 * weight[8] + y2 * weight[4]);
   direction[1] = direction[1] + slope * z * weight[5] + a * (x2 * weight[4] - y2 * weight[8]);
-  direction[2] = direction[2] + number(2.0f * 0.9461746957575601f) * z * weight[6] + slope * (x * weight[7] + y * weight[5]);
+  direction[2] = direction[2] + number(2.0f * 0.9461746957575601f) * z * weight[6] +
+                 slope * (x * weight[7] + y * weight[5]);
   if (degree < 3) return;
-  const Floats c = number(0.4570457994644658f) - number(2.285228997322329f) * z * z, c_dz = number(-2.0f * 2.285228997322329f) * z;
+  const Floats c = number(0.4570457994644658f) - number(2.285228997322329f) * z * z;
+  const Floats c_dz = number(-2.0f * 2.285228997322329f) * z;
   const Floats d = number(1.445305721320277f), e = number(-3.0f * 0.5900435899266435f);
   direction[0] = direction[0] + c * weight[13] + d * z * (x2 * weight[14] + y2 * weight[10]) +
                  e * (cos2 * weight[15] + sin2 * weight[9]);
