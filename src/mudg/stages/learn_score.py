@@ -340,13 +340,18 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
         f"{config.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
         "other model, was used."
     )
+    confidence = (
+        "where measured or warped colour covers a pixel, times how settled the sample is; see `confidence_of`."
+        if model.refiner is None
+        else "falls with the error of the colour that the refiner expects, and where depth contradicts measurements nearby."
+    )
     count = sum(p.numel() for p in model.parameters()) / 1e6
     samples = config.steps * config.batch_frames
     continued = f", continued from an earlier model ({config.start})" if config.start else ""
     return f"""# Small multi-modal diffusion model
 
-Turns a projected, coloured LiDAR cloud (and recorded images warped with it) into dense colour, depth and semantic
-frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million parameters, stored in
+Turns a projected, coloured LiDAR cloud (with recorded images and, where there are any, classes warped along) into dense
+colour, depth and semantic frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million parameters, stored in
 float16. All three modalities come from one pass.
 
 **Training data**: {data}
@@ -362,7 +367,7 @@ truth):
 {table(scores)}
 ```
 
-**Confidence**: where measured or warped colour covers a pixel, times how settled the sample is; see `confidence_of`.
+**Confidence**: {confidence}
 
 **Limits**: colours and shapes far from any measured point are guesses; rare classes are weak; trained at one resolution
 and one kind of generated street, so real images outside the LiDAR band come out smeared. Not for use in vehicles.
