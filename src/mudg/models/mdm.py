@@ -499,8 +499,7 @@ class MDM(nn.Module):
         align       bring each frame's depth to the measured scale first (`core.align`)
         bf16        run the network in bfloat16
 
-        Measured depth (`condition.valid`) replaces generated depth; sky is set to the codec's far distance. See
-        `confidence_of` for the confidence.
+        Measured depth (`condition.valid`) replaces generated depth.
         """
         if sampler not in noise.SAMPLERS:
             raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
@@ -538,7 +537,7 @@ class MDM(nn.Module):
             if align:
                 depth, fits = align_depth(depth, condition.depth, condition.valid)
             confidence = confidence * depth_agreement(depth, condition)
-            depth = settle_depth(depth, condition, ids, self.config.codec.far_m)
+            depth = settle_depth(depth, condition, self.config.codec.far_m)
         wanted = lambda m, x: x if m in modalities else None  # noqa: E731
         return Sample(
             wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents, tuple(fits)
@@ -634,22 +633,12 @@ def depth_agreement(depth: Tensor, condition: Condition, reach_px: int = 2) -> T
     return torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
 
 
-def settle_depth(depth: Tensor, condition: Condition, semantics: Tensor | None, far_m: float) -> Tensor:
-    """Generated depth brought to terms with what was measured, f32[T,1,H,W] metres.
+def settle_depth(depth: Tensor, condition: Condition, far_m: float) -> Tensor:
+    """Generated depth with measured depth put in wherever a point was seen, f32[T,1,H,W] metres, at most `far_m`.
 
-    Where a point was seen its depth is taken: the condition's points have passed a visibility test. Elsewhere the nearest
-    point's depth (`condition.depth` is filled) is taken if it lies within the range of generated depths of the 3x3
-    neighbourhood, widened by 30 %: on one and the same surface the measured neighbour is more exact, beyond an edge the
-    generated depth stands. Sky pixels without a measurement get `far_m`.
+    The condition's points have passed a visibility test, so they are taken as they are.
     """
-    highest = functional.max_pool2d(depth, 3, stride=1, padding=1) * 1.3
-    lowest = -functional.max_pool2d(-depth, 3, stride=1, padding=1) / 1.3
-    same_surface = (condition.depth <= highest) & (condition.depth >= lowest)
-    settled = torch.where(condition.valid | same_surface, condition.depth, depth)
-    if semantics is not None:
-        sky = (semantics == SKY).unsqueeze(1) & ~condition.valid
-        settled = torch.where(sky, torch.full_like(settled, far_m), settled)
-    return settled.clamp(max=far_m)
+    return torch.where(condition.valid, condition.depth, depth).clamp(max=far_m)
 
 
 # files ----------------------------------------------------------------------------------------------------------------
