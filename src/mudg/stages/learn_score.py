@@ -351,8 +351,8 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
     return f"""# Small multi-modal diffusion model
 
 Turns a projected, coloured LiDAR cloud (with recorded images and, where there are any, classes warped along) into dense
-colour, depth and semantic frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million parameters, stored in
-float16. All three modalities come from one pass.
+colour, depth and semantic frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million
+parameters, stored in float16. All three modalities come from one pass.
 
 **Training data**: {data}
 
