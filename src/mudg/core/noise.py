@@ -257,7 +257,7 @@ def dpm_solver(
     level = torch.log(alpha / sigma)
     x, before, step_before = start, None, math.inf
     for number, t in enumerate(step_indices):
-        x0, _ = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)
+        x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0]
         if on_step is not None:
             on_step(number, x0)
         if number + 1 == len(step_indices):
@@ -295,7 +295,7 @@ def renoise(
         raise UsageError("stochastic sampling needs a source of noise", where="noise.renoise")
     x, x0 = start, start
     for number, t in enumerate(step_indices):
-        x0, _ = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)
+        x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0]
         x0 = x0 / schedule.scale[t]
         if on_step is not None:
             on_step(number, x0)
