@@ -191,7 +191,7 @@ class BenchConfig:
     """reported: the list on which nothing is chosen. development: the list to look at while choosing."""
     count: int = Field(default=6, ge=1, le=6)
     """How many cities of the list; four clips each (2, 3, 4 m and the recorded path)."""
-    steps: tuple[int, ...] = (1, 4, 8)
+    steps: tuple[int, ...] = (1, 2, 8)
     """Denoising steps to compare."""
     sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
     eta: float = Field(default=1.0, ge=0, le=1)
@@ -214,7 +214,7 @@ class SynthesizeConfig:
     """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded path."""
     model: str = "embedded"
     """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
-    steps: int = Field(default=4, ge=1, le=1000)
+    steps: int = Field(default=2, ge=1, le=1000)
     """Denoising steps. More give more texture, and less agreement with the truth pixel by pixel."""
     sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
     """How the steps are taken. Each costs one pass of the network per step."""
