@@ -383,9 +383,9 @@ def run_preset(fast: bool = False) -> RunConfig:
     iterations.
     """
     config = with_lines(RunConfig(), cameras=())
-    frames, width, height, cameras, iterations, steps = 24, 384, 256, config.ingest.city.cameras, 1000, 4
+    frames, width, height, cameras, iterations, steps = 24, 384, 256, config.ingest.city.cameras, 1000, 2
     if fast:
-        frames, width, height, cameras, iterations, steps = 12, 240, 160, ("front",), 250, 2
+        frames, width, height, cameras, iterations, steps = 12, 240, 160, ("front",), 250, 1
     city = replace(config.ingest.city, seed=DEMO_CITY, n_frames=frames, width=width, height=height, cameras=cameras)
     return replace(
         config,
