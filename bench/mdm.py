@@ -48,12 +48,16 @@ def main() -> None:
     model = mdm.load(options.model)
     condition = made_up_condition(model.config.window, 128, 192)
     latents = model.sample(condition, steps=1).latents
+    encoded = model.encode_condition(condition)
     print(  # noqa: T201
         f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M parameters, {model.config.window} frames of 192x128"
     )
     for bf16 in (False, True):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            decode = seconds(lambda: model.codec.decode(latents))
+            if model.refiner is None:
+                decode = seconds(lambda: model.codec.decode(latents))
+            else:
+                decode = seconds(lambda: model.refine(latents, encoded.pixels, model.config.window))
         one = seconds(lambda bf16=bf16: model.sample(condition, steps=1, bf16=bf16))
         more = seconds(lambda bf16=bf16: model.sample(condition, steps=options.steps, bf16=bf16))
         pass_s = (more - one) / max(1, options.steps - 1)
