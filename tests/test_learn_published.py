@@ -28,7 +28,7 @@ from mudg.stages.config import FuseConfig, SynthesizeConfig
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory):
-    return write_clips(tmp_path_factory.mktemp("clips"), points=True)
+    return write_clips(tmp_path_factory.mktemp("clips"), 32, 32, points=True)
 
 
 @pytest.fixture(scope="module")
@@ -39,16 +39,16 @@ def converted(tmp_path_factory):
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     root = tmp_path_factory.mktemp("street")
-    ToyStreet(times=[0.1 * n for n in range(9)]).write(root / "scene", width=96, height=64)
+    ToyStreet(times=[0.1 * n for n in range(5)]).write(root / "scene", width=72, height=48)
     fuse.run(FuseConfig(), root / "scene", root / "fuse")
     return root
 
 
 def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the result."""
-    one = learn.run(published_settings(converted, clips), tmp_path / "one")
-    large = write_clips(tmp_path / "large", 64, 48, points=True)
-    config = published_settings(one, large, width=64, height=48, frozen="temporal_transformers", steps=1)
+    one = learn.run(published_settings(converted, clips, steps=1), tmp_path / "one")
+    large = write_clips(tmp_path / "large", 48, 32, points=True)
+    config = published_settings(one, large, width=48, height=32, frozen="temporal_transformers", steps=1)
     begun, fresh = learn.starting_model(config)
     first, start = (published_model.read(folder).state_dict() for folder in (converted, one))
     assert not fresh
@@ -64,15 +64,15 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     for state in (start, end):  # learnt, and never that of the noise step
         assert not torch.equal(state["net.label.0.weight"], first["net.label.0.weight"])
         assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
-    assert (last.config.width, last.config.height) == (64, 48)
+    assert (last.config.width, last.config.height) == (48, 32)
     assert torch.equal(last.schedule.scale, published_model.read(converted).schedule.scale)
     assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
-    assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 2
+    assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
     view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
     made = read_observations(
         synthesize.run(view, street / "scene", street / "fuse", tmp_path / "made") / "front_shift+1.0"
     )
-    assert len(made) == 9 and bool(torch.isfinite(made[8].rgb).all())
+    assert len(made) == 5 and bool(torch.isfinite(made[4].rgb).all())
 
 
 def test_settings_of_the_frozen_layers_agree_with_the_published_stages():
@@ -122,6 +122,7 @@ def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 
 
+@pytest.mark.slow
 def test_portions_and_recomputing_change_nothing(converted, clips, tmp_path):
     learn.run(published_settings(converted, clips), tmp_path / "plain")
     learn.run(published_settings(converted, clips, accumulate=2, recompute=True), tmp_path / "portions")
@@ -129,6 +130,7 @@ def test_portions_and_recomputing_change_nothing(converted, clips, tmp_path):
     assert all(portions[step] == pytest.approx(plain[step], rel=SAME) for step in (1, 2))
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
     """ddp, then fsdp from the checkpoint that ddp wrote, with frozen layers."""
     common = {"frozen": "temporal_transformers", "steps": 3}
@@ -155,7 +157,7 @@ def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
 def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch):
     """By the model itself: clips come with theirs even where all are to go without."""
     given, dropped = [], []
-    encode, lose = PublishedMDM.encode_planes, PublishedMDM.loss
+    encode = PublishedMDM.encode_planes
 
     def watched(model, color, depth, valid, reference, *rest):
         given.append(bool(torch.equal(reference, color[:, 0])))
@@ -163,11 +165,12 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
 
     def noted(model, *rest, dropout, **more):
         dropped.append(dropout.both + dropout.reference)
-        return lose(model, *rest, dropout=dropout, **more)
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(PublishedMDM, "encode_planes", watched)
     monkeypatch.setattr(PublishedMDM, "loss", noted)
-    learn.run(published_settings(converted, clips, reference_dropout=0.8, steps=1), tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt):
+        learn.run(published_settings(converted, clips, reference_dropout=0.8), tmp_path / "run")
     assert given and not any(given)
     assert dropped == [pytest.approx(0.8)]
     assert ContextDropout.of(0.2) == PAPER_DROPOUT
@@ -187,7 +190,7 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
         learn.run(published_settings(converted, clips, widths=(16, 32)), tmp_path / "run")
     with pytest.raises(UsageError, match="without a refiner"):
         learn.run(published_settings(converted, clips, frozen="denoiser"), tmp_path / "refiner")
-    warped = write_clips(tmp_path / "warped")
+    warped = write_clips(tmp_path / "warped", 32, 32)
     with pytest.raises(InputError, match="warped images"):
         learn.run(published_settings(converted, warped), tmp_path / "other")
 
@@ -204,7 +207,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     clip = log_clips.make_clip(log, held, 0)
     recorded = synthesize.recorded_images(log.scene, held_out=False, classes=False)
     views = [log.frame(name).view for name in window.frames]
-    conditions = ConditionRules(48, 32, 96, 64, published=True)
+    conditions = ConditionRules(48, 32, 72, 48, published=True)
     wanted = build_condition(log.cloud, log.scene.tracks, views, recorded, conditions)
     for name in ("color", "depth", "valid", "reference"):
         assert torch.equal(getattr(clip.condition, name), getattr(wanted, name)), name
@@ -251,6 +254,7 @@ def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
     assert torch.allclose(condition.reference, small[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_published_model_goes_on_learning_on_a_log(converted, street, tmp_path):
     """Logs are cut into clips of the very size asked for, whatever the camera's aspect."""
     source = f"{street / 'scene'}={street / 'fuse'}"
@@ -261,4 +265,4 @@ def test_a_published_model_goes_on_learning_on_a_log(converted, street, tmp_path
     index = json.loads((tmp_path / "run" / "clips" / log_clips.INDEX).read_text())["rules"]
     assert (index["width"], index["height"], index["published"]) == (32, 32, True)
     assert "the first image as condition" in (made / "MODEL_CARD.md").read_text()
-    assert read_scene(street / "scene").cameras["front"].width == 96
+    assert read_scene(street / "scene").cameras["front"].width == 72

@@ -38,11 +38,11 @@ def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
 
 
 def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, points: bool = False) -> Path:
-    """Three shards to train on and one to score, two clips each; `points`: of points alone."""
+    """Three shards to train on and one to score, two clips each; `points`: of points alone, and one to score."""
     for number in [*range(3), HELD_OUT]:
         made = [made_up_clip(number * 7 + k, width, height) for k in range(2)]
-        made = [points_alone(clip) for clip in made] if points else made
-        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0]))
+        made = [points_alone(clip) for clip in made[: 1 if number == HELD_OUT else 2]] if points else made
+        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0][: len(made)]))
     return folder
 
 

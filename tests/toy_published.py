@@ -94,7 +94,7 @@ def published_settings(start, clips, **changes):
     """A run of two steps of `learn` on clips of points alone that goes on from a folder of the tiny model."""
     settings = LearnConfig(
         start=str(start), clips=str(clips), cities=3, first_cities=3, clips_per_city=2, held_out=1, watched=1, workers=0,
-        width=48, height=32, window=4, full_window_share=1.0, steps=2, batch_frames=16, lr=1e-4, last_lr_share=1.0, warmup_steps=0,
+        width=32, height=32, window=4, full_window_share=1.0, steps=2, batch_frames=8, lr=1e-4, last_lr_share=1.0, warmup_steps=0,
         beta2=0.999, clip_norm=0.5, average_decay=0.0, augment=False, precision="float32", log_every=1, checkpoint_every=100,
         sample_every=100, sample_steps=1, score_steps=1,
     )  # fmt: skip

@@ -110,8 +110,7 @@ def pack_clips(
         "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
         "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
         "color": np.stack([u8(c.condition.color) for c in clips]),
-        "sparse_depth": np.stack([np.where(c.condition.depth[:, 0] == 0, 0, f16(c.condition.depth)).astype(np.float16)
-                                  for c in clips]),  # fmt: skip
+        "sparse_depth": np.stack([f16(c.condition.depth) * (c.condition.depth[:, 0] != 0).numpy() for c in clips]),
         "flags": np.stack([flags(c) for c in clips]),
         "backdrop": np.stack([u8(_backdrop(c)) for c in clips]),
         "reference": np.stack([u8(c.condition.reference) for c in clips]),

@@ -113,7 +113,7 @@ class LearnConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the network is trained. Scoring and clip making stay on the CPU."""
+    """Where the network is trained. Clip making stays on the CPU, and scoring too, but of a published-type model."""
     parallel: Literal["ddp", "fsdp"] = "ddp"
     """Under torchrun: ddp = a whole network per process; fsdp = parameters and moments in pieces."""
     accumulate: int = Field(default=1, ge=1)

@@ -104,9 +104,7 @@ def await_shard(folder: Path, city: int, patience_s: float = 900.0) -> None:
 # logs -----------------------------------------------------------------------------------------------------------------
 
 
-def log_rules(
-    config: LearnConfig, sources: list[LogSource], multiple: int, points_alone: bool = False
-) -> LogClipRules:
+def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, points_alone: bool = False) -> LogClipRules:
     """How clips are cut from logs: of the configuration's area, in the aspect of the first log's first camera.
 
     `points_alone`: with the published system's condition, and of the configuration's very size, whatever the aspect.

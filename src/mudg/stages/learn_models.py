@@ -57,7 +57,7 @@ class Kind:
             stands for `model.loss`
     save    (model, folder, card, facts)
     card    (model, settings, scores, words on the training data) -> text of the model card
-    rebuilt (model, weights of its trained part) -> a copy of the model with these, on the CPU, ready for use
+    rebuilt (model, weights of its trained part) -> a model with these, ready for use
     drops_reference  the model's own loss leaves references out: clips come with theirs
     points_alone     the condition is the published system's: points, and 0 where nothing was seen
     """

@@ -113,11 +113,13 @@ def _joined(clips: list[Encoded]) -> Encoded:
 
 
 def rebuilt(model: PublishedMDM, weights: Mapping[str, Tensor]) -> PublishedMDM:
-    """The model on the CPU, ready for use, with these weights in its trained part. Shares memory with what it is made of."""
+    """The model where it was trained, ready for use, with these weights in its trained part. Shares memory with what it is
+    made of: it is large, and scoring it on a CPU would take longer than training it on a GPU."""
     with torch.device("meta"):
         made = PublishedMDM(model.config)
-    fixed = {name: value.cpu() for name, value in model.state_dict().items() if name not in weights}
-    made.load_state_dict({**fixed, **weights}, assign=True)
+    fixed = {name: value for name, value in model.state_dict().items() if name not in weights}
+    trained = {name: value.to(model.device) for name, value in weights.items()}
+    made.load_state_dict({**fixed, **trained}, assign=True)
     made.requires_grad_(False)
     made.adopt_scale()
     made.sampling = model.sampling
@@ -132,7 +134,8 @@ def save(model: PublishedMDM, folder: Path, text: str, facts: Mapping[str, Any])
     before = facts.get("continued_from", {})
     handed_on = {name: before[name] for name in ("licence", "caption", "base_scale") if name in before}
     licence = f"\n## Licence\n\n{handed_on['licence']}\n" if "licence" in handed_on else ""
-    published_model.write(folder, model.config, model.state_dict(), {**facts, **handed_on}, text + licence)
+    tensors = {name: value.cpu() for name, value in model.state_dict().items()}
+    published_model.write(folder, model.config, tensors, {**facts, **handed_on}, text + licence)
 
 
 def card(model: PublishedMDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
