@@ -39,7 +39,7 @@ def converted(tmp_path_factory):
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     root = tmp_path_factory.mktemp("street")
-    ToyStreet(times=[0.1 * n for n in range(5)]).write(root / "scene", width=72, height=48)
+    ToyStreet(times=[0.1 * n for n in range(5)]).write(root / "scene", labels=False, width=72, height=48)
     fuse.run(FuseConfig(), root / "scene", root / "fuse")
     return root
 
@@ -90,23 +90,21 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     model, _ = learn.starting_model(settings)
     model.trained_part().train()
 
+    @torch.no_grad()
     def losses(step, part):
-        batch = learn_clips.draw_batch(settings, clips, step, 4, 4, "batch", part)
-        return learn._losses(model.loss, model, settings, batch, step, part.start or 0, 4, torch.ones(19), False)
+        batch = learn_clips.draw_batch(settings, clips, step, 2, 4, "batch", part)
+        return learn._losses(model.loss, model, settings, batch, step, part.start, 2, torch.ones(19), False)
 
-    shown = set()
-    for step in range(3):
-        whole, parts = losses(step, slice(0, 4)), [losses(step, slice(n, n + 2)) for n in (0, 2)]
+    for step in range(2):
+        whole, parts = losses(step, slice(0, 2)), [losses(step, slice(n, n + 1)) for n in (0, 1)]
         assert all(list(part.terms) == list(whole.terms) for part in parts)
-        for name, value in {**whole.terms, "total": float(whole.total.detach())}.items():
-            mean = sum(float({**p.terms, "total": p.total.detach()}[name]) for p in parts) / 2
+        for name, value in {**whole.terms, "total": float(whole.total)}.items():
+            mean = sum(float({**p.terms, "total": p.total}[name]) for p in parts) / 2
             assert mean == pytest.approx(value, rel=SAME)
-        shown |= {frozenset(whole.terms)}
-    again, other = (losses(0, slice(0, 4)).total.detach() for _ in range(2))
-    assert torch.equal(again, other)
+    again = losses(1, slice(0, 2)).total
+    assert torch.equal(again, whole.total)
     model.eval()
-    assert abs(float(losses(0, slice(0, 4)).total.detach()) / float(again) - 1) > 1e-3  # dropout did something
-    assert len(shown) > 1
+    assert abs(float(losses(1, slice(0, 2)).total) / float(again) - 1) > 1e-3  # dropout did something
 
 
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
@@ -117,7 +115,8 @@ def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     nothing = replace(
         batch, depth_known=torch.zeros_like(batch.depth_known), semantics=torch.full_like(batch.semantics, 255)
     )
-    terms, without = loss(batch).terms, loss(nothing).terms
+    with torch.no_grad():
+        terms, without = loss(batch).terms, loss(nothing).terms
     assert {"depth", "semantics"} & set(terms)
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 
@@ -187,7 +186,7 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
     with pytest.raises(UsageError, match="cannot be kept"):
         learn.run(published_settings(converted, clips, cache_latents=True), tmp_path / "run")
     with pytest.raises(UsageError, match="cannot be described"):
-        learn.run(published_settings(converted, clips, widths=(16, 32)), tmp_path / "run")
+        learn.run(published_settings(converted, clips, widths=(16, 32, 64)), tmp_path / "run")
     with pytest.raises(UsageError, match="without a refiner"):
         learn.run(published_settings(converted, clips, frozen="denoiser"), tmp_path / "refiner")
     warped = write_clips(tmp_path / "warped", 32, 32)
@@ -219,7 +218,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert torch.allclose(batch.color[0], wanted.color, atol=1 / 500)
     assert 0 < float(batch.depth[~batch.depth_known].min()) and float(batch.depth[~batch.depth_known].max()) <= 100
     thinner = log_clips.make_clip(log, window, 0)
-    assert float(thinner.condition.valid.float().mean()) < float(clip.condition.valid.float().mean())
+    assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
 
 
 def test_filling_takes_the_nearest_measured_depth():
