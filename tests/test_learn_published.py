@@ -44,11 +44,19 @@ def street(tmp_path_factory):
     return root
 
 
+def corner(batch):
+    """The upper left 16x16 pixels: enough for a loss."""
+    names = ("rgb", "depth", "semantics", "color", "sparse_depth", "valid", "warped", "reference", "depth_known")
+    return replace(batch, **{name: getattr(batch, name)[..., :16, :16] for name in names})
+
+
 def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the result."""
-    one = learn.run(published_settings(converted, clips, steps=1), tmp_path / "one")
-    large = write_clips(tmp_path / "large", 48, 32, points=True)
-    config = published_settings(one, large, width=48, height=32, frozen="temporal_transformers", steps=1)
+    one = learn.run(published_settings(converted, clips, steps=1, batch_frames=4), tmp_path / "one")
+    large = write_clips(tmp_path / "large", 36, 32, points=True)
+    config = published_settings(
+        one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
+    )
     begun, fresh = learn.starting_model(config)
     first, start = (published_model.read(folder).state_dict() for folder in (converted, one))
     assert not fresh
@@ -64,7 +72,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     for state in (start, end):  # learnt, and never that of the noise step
         assert not torch.equal(state["net.label.0.weight"], first["net.label.0.weight"])
         assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
-    assert (last.config.width, last.config.height) == (48, 32)
+    assert (last.config.width, last.config.height) == (36, 32)
     assert torch.equal(last.schedule.scale, published_model.read(converted).schedule.scale)
     assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
     assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
@@ -92,7 +100,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
     @torch.no_grad()
     def losses(step, part):
-        batch = learn_clips.draw_batch(settings, clips, step, 2, 4, "batch", part)
+        batch = corner(learn_clips.draw_batch(settings, clips, step, 2, 4, "batch", part))
         return learn._losses(model.loss, model, settings, batch, step, part.start, 2, torch.ones(19), False)
 
     for step in range(2):
@@ -110,7 +118,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     settings = published_settings(converted, clips)
     model, _ = learn.starting_model(settings)
-    batch = learn_clips.draw_batch(settings, clips, 0, 4, 4, "batch")
+    batch = corner(learn_clips.draw_batch(settings, clips, 0, 4, 4, "batch"))
     loss = lambda shown: learn._losses(model.loss, model, settings, shown, 0, 0, 4, torch.ones(19), False)  # noqa: E731
     nothing = replace(
         batch, depth_known=torch.zeros_like(batch.depth_known), semantics=torch.full_like(batch.semantics, 255)
