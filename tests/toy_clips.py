@@ -37,12 +37,19 @@ def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
     return Clip(condition, rgb, depth, depth < 500, ids)
 
 
-def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
-    """Three shards to train on and one to score, two clips each."""
+def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, points: bool = False) -> Path:
+    """Three shards to train on and one to score, two clips each; `points`: of points alone, and one to score."""
     for number in [*range(3), HELD_OUT]:
         made = [made_up_clip(number * 7 + k, width, height) for k in range(2)]
-        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0]))
+        made = [points_alone(clip) for clip in made[: 1 if number == HELD_OUT else 2]] if points else made
+        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0][: len(made)]))
     return folder
+
+
+def points_alone(clip: Clip) -> Clip:
+    """The clip with the published system's condition: 0 where nothing was seen, nothing warped in."""
+    c = clip.condition
+    return replace(clip, condition=Condition(c.views, c.color * c.valid, c.depth * c.valid, c.valid, c.reference))
 
 
 def tiny(clips: Path | str, **changes: Any) -> LearnConfig:

@@ -1,6 +1,7 @@
 """A tiny network of the published kind, and fake checkpoints of it as the training frameworks write them."""
 
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from mudg.models.published import PublishedConfig, PublishedMDM
 from mudg.models.resampler import ResamplerConfig
 from mudg.models.video_unet import VideoUNetConfig
 from mudg.stages import convert
+from mudg.stages.config import ConvertConfig, LearnConfig
 
 TINY = PublishedConfig(
     net=VideoUNetConfig(
@@ -86,3 +88,21 @@ def tiny_model():
         fill(getattr(model, part), part + ".", "")
     model.text.copy_(value_for("text", tuple(model.text.shape)))
     return model.eval()
+
+
+def published_settings(start, clips, **changes):
+    """A run of two steps of `learn` on clips of points alone that goes on from a folder of the tiny model."""
+    settings = LearnConfig(
+        start=str(start), clips=str(clips), cities=3, first_cities=3, clips_per_city=2, held_out=1, watched=1, workers=0,
+        width=32, height=32, window=4, full_window_share=1.0, steps=2, batch_frames=8, lr=1e-4, last_lr_share=1.0, warmup_steps=0,
+        beta2=0.999, clip_norm=0.5, average_decay=0.0, augment=False, precision="float32", log_every=1, checkpoint_every=100,
+        sample_every=100, sample_steps=1, score_steps=1,
+    )  # fmt: skip
+    return replace(settings, **changes)
+
+
+def write_tiny(folder):
+    """The tiny model as `convert` writes it."""
+    torch.save({"state_dict": tiny_checkpoint()}, folder / "512.ckpt")
+    convert.convert_file(ConvertConfig(), folder / "512.ckpt", folder / "model", TINY)
+    return folder / "model"

@@ -54,6 +54,14 @@ class CityClipRules:
     """Recorded images are this many times larger than the clips; their colours are gathered at that size."""
     point_colors: bool = False
     """Also keep the colours of the nearest points, without images, in training clips (clips for scoring always do)."""
+    published: bool = False
+    """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at the time of
+    the first view, from where it was recorded."""
+
+    @property
+    def frames(self) -> int:
+        """Length of the log."""
+        return max(FRAMES, FIRST + self.window)
 
 
 @dataclass(frozen=True)
@@ -137,11 +145,12 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
 
 def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> tuple[list[Clip], tuple[float, ...]]:
     """All clips of one city and their shifts in metres; `log` is the city's own from `make_log`, made here if not given."""
-    log = log or make_log(rules, city)
+    log = log or make_log(rules, city, rules.frames)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
     size = (rules.width, rules.height)
     recorded_views = log.world.frame_views("front")[FIRST : FIRST + rules.window]
-    conditions = ConditionRules(*size, rules.width * rules.fine, rules.height * rules.fine)
+    fine = (rules.width * rules.fine, rules.height * rules.fine)
+    conditions = ConditionRules(*size, *fine, published=rules.published)
     tracks = log.world.tracks()
     clips = []
     shifts = shifts_of(rules, city)
@@ -150,6 +159,7 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> t
     for shift_m in shifts:
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
         given, cache = (_thinned(log.recorded, rng), {}) if shift_m == 0.0 else (known, sources)
+        given = log.recorded if rules.published else given  # for the reference only
         condition = build_condition(log.cloud, tracks, views, given, conditions, cache)
         truths = [log.world.render(view.resized(*size)) for view in views]
         clips.append(clip_from_truth(condition, truths))
@@ -192,7 +202,7 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     """Make one city's clips and write its shard; returns the number of clips. Runs in a process of its own."""
     torch.set_num_threads(1)
     native.set_threads(1)
-    log = make_log(rules, city)
+    log = make_log(rules, city, rules.frames)
     clips, shifts = make_clips(rules, city, log)
     points = None
     if city >= HELD_OUT or rules.point_colors:

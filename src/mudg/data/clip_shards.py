@@ -77,7 +77,7 @@ def pack_clips(
     """Arrays of a shard from clips of one size; `point_color` f32[T,3,H,W] per clip is kept if given.
 
     Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is, and
-    marked as unknown.
+    marked as unknown. A condition's depth of 0 (nothing seen; points alone) stays 0.
     """
 
     def u8(image: Tensor) -> NDArray[np.uint8]:
@@ -110,7 +110,7 @@ def pack_clips(
         "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
         "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
         "color": np.stack([u8(c.condition.color) for c in clips]),
-        "sparse_depth": np.stack([f16(c.condition.depth) for c in clips]),
+        "sparse_depth": np.stack([f16(c.condition.depth) * (c.condition.depth[:, 0] != 0).numpy() for c in clips]),
         "flags": np.stack([flags(c) for c in clips]),
         "backdrop": np.stack([u8(_backdrop(c)) for c in clips]),
         "reference": np.stack([u8(c.condition.reference) for c in clips]),

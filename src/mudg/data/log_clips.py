@@ -31,7 +31,15 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition, Frame, FusedCloud, PointCloud, Scene, Sweep, View
 from mudg.core.project import project_points
 from mudg.data.clip_shards import FAR_M, pack_clips, shard_path, write_shard
-from mudg.data.clips import ConditionRules, Recorded, Source, build_condition, remove_shine_through, resize_image
+from mudg.data.clips import (
+    ConditionRules,
+    Recorded,
+    Source,
+    build_condition,
+    nearest_valid,
+    remove_shine_through,
+    resize_image,
+)
 from mudg.data.cloudfile import read_fused
 from mudg.data.scenefile import read_image, read_label, read_points, read_scene
 
@@ -63,6 +71,9 @@ class LogClipRules:
     fine: int = 2
     """Colours are gathered at so many times the clip's size."""
     seed: int = 0
+    published: bool = False
+    """The published system's condition: points alone, 0 where nothing was seen, projected at the camera's size; the reference is
+    the window's first image."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +182,8 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
     cloud = log.cloud if window.held_out else thinned(log.cloud, rng.uniform(rules.least_points, 1.0), rng)
     conditions = ConditionRules(rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
     places = [log.place[name] for name in window.frames]
+    if rules.published:
+        return _published_clip(log, window, cloud, places)
     margin = gap + conditions.images_per_view  # at a log's end all images come from one side
     images = log.images(log.moment[places[0]] - margin, log.moment[places[-1]] + margin)
     sources: dict[int, Source] = {}
@@ -189,6 +202,32 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
     rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
     depth = torch.where(known, depth, condition.depth)  # a plausible filling: the noisy input shows it
     return Clip(condition, rgb, depth, known, ids)
+
+
+def _published_clip(log: OpenLog, window: LogWindow, cloud: FusedCloud, places: Sequence[int]) -> Clip:
+    """A clip with the condition that the published model is given; no image but the reference has a part in it."""
+    rules = log.rules
+    images = log.images(log.moment[places[0]], log.moment[places[-1]])
+    views = [images[place].view for place in places]
+    camera = views[0].camera
+    conditions = ConditionRules(rules.width, rules.height, camera.width, camera.height, published=True)
+    condition = build_condition(cloud, log.scene.tracks, views, [images[places[0]]], conditions)
+    truths = [
+        _truth(log.scene, log.frame(name), images[place], view)
+        for name, place, view in zip(window.frames, places, condition.views)
+    ]
+    rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
+    depth = torch.where(known, depth, _nearest_depth(condition.depth, conditions.far_m))
+    return Clip(condition, rgb, depth, known, ids)
+
+
+def _nearest_depth(depth: Tensor, far_m: float) -> Tensor:
+    """Depth f32[T,1,H,W] with its zeros replaced by the nearest pixel's that has some; `far_m` in a frame without any."""
+    filled = []
+    for image in depth[:, 0].numpy():
+        rows, columns = nearest_valid(image > 0)
+        filled.append(torch.from_numpy(image[rows, columns] if (image > 0).any() else np.full_like(image, far_m)))
+    return torch.stack(filled)[:, None]
 
 
 def thinned(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:
@@ -302,7 +341,8 @@ def write_log(source: LogSource, rules: LogClipRules, windows: Sequence[tuple[in
 def claim(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]) -> None:
     """Write down what the shards of a folder are made of; UsageError if they are made of something else."""
     inputs = [[store.digest(s.scene), store.digest(s.fused)] for s in sources]
-    wanted = {"rules": store.parse_json(store.json_text(asdict(rules)), INDEX), "logs": inputs}
+    stated = {name: value for name, value in asdict(rules).items() if name != "published" or value}
+    wanted = {"rules": store.parse_json(store.json_text(stated), INDEX), "logs": inputs}
     path = folder / INDEX
     if path.is_file():
         found = store.read_json(path)

@@ -160,6 +160,12 @@ class ContextDropout:
     both: float = 0.05
     reference: float = 0.15
 
+    @classmethod
+    def of(cls, reference: float) -> ContextDropout:
+        """With the reference missing in this share of the clips (0.2: the paper, 0.1: the released code)."""
+        both = min(cls.both, reference)
+        return cls(cls.text, both, round(min(reference - both, 1 - cls.text - both), 12))
+
 
 PAPER_DROPOUT = ContextDropout()
 """The reference is missing in 20 % of the clips, as the paper says."""
@@ -237,15 +243,25 @@ class PublishedMDM(nn.Module):
                     colour there (of every clip), frame 0 excepted
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
-        stack = lambda name: torch.stack([getattr(c, name) for c in batch]).to(self.device)  # noqa: E731
-        color, depth, valid, reference = stack("color"), stack("depth"), stack("valid").float(), stack("reference")
+        stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
+        return self.encode_planes(
+            stack("color"), stack("depth"), stack("valid"), stack("reference"), generator, known
+        )  # fmt: skip
+
+    def encode_planes(
+        self, color: Tensor, depth: Tensor, valid: Tensor, reference: Tensor, generator: torch.Generator | None = None,
+        known: Tensor | None = None,
+    ) -> Encoded:  # fmt: skip
+        """As `encode_condition`, from stacked tensors: color f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres,
+        valid bool[B,T,1,H,W], reference f32[B,3,H,W] in [0,1]."""
+        color, depth, valid, reference = (x.to(self.device) for x in (color, depth, valid.float(), reference))
         self.check_size(*color.shape[-2:])
         self.check_frames(color.shape[1])
         if self.config.missing_is_zero:
             color, depth = color * valid, depth * valid
         seen = valid
         if known is not None:
-            color = torch.cat([known.to(color).expand(len(batch), -1, -1, -1, -1), color[:, len(known) :]], 1)
+            color = torch.cat([known.to(color).expand(len(color), -1, -1, -1, -1), color[:, len(known) :]], 1)
             seen = torch.cat([torch.ones_like(seen[:, : len(known)]), seen[:, len(known) :]], 1)
         color = torch.cat([reference[:, None], color[:, 1:]], 1)
         seen = torch.cat([torch.ones_like(seen[:, :1]), seen[:, 1:]], 1)
@@ -307,36 +323,62 @@ class PublishedMDM(nn.Module):
         generator: torch.Generator,
         *,
         dropout: ContextDropout = PAPER_DROPOUT,
+        known: Mapping[Modality, Tensor] | None = None,
+        first: int = 0,
+        whole: int = 0,
     ) -> Losses:
         """Mean squared error of the velocity; every clip of the batch shows one modality, drawn by `MODALITY_SHARES`.
 
         truth       latents of `encode_truth`, each [B,T,4,h,w]
         generator   of all draws: modality, noise step, noise, which context is left out, dropout inside the network
+        known       f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere
+        first, whole  these clips are number `first` and following of a batch of `whole` clips (0 = of just these); what is
+                    drawn for a clip does not depend on how that batch is divided
+
+        Terms: one for each modality that any clip of the whole batch shows, so that all parts have the same; scaled so that the
+        mean over equal parts is the mean over the clips that show it.
         """
         batch = encoded.planes.shape[0]
-        t = noise.stratified_steps(batch, len(self.schedule), generator).to(self.device)
-        names = _draw_modalities(batch, generator)
+        whole, own = whole or batch, slice(first, first + batch)
+        t = noise.stratified_steps(whole, len(self.schedule), generator)[own].to(self.device)
+        shown = _draw_modalities(whole, generator)
+        names = shown[own]
         x0 = torch.stack([truth[m][n] for n, m in enumerate(names)])
-        eps = noise.video_noise(x0.shape, generator).to(self.device)
-        u = torch.rand(batch, generator=generator).to(self.device)
+        seed, shape = generator.initial_seed(), (1, *x0.shape[1:])
+        draws = [noise.video_noise(shape, seeds.torch_generator(seed, first + n, "noise")) for n in range(batch)]
+        eps = torch.cat(draws).to(self.device)
+        u = torch.rand(whole, generator=generator)[own].to(self.device)
         no_text = u < dropout.text + dropout.both
         no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
         text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
         features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
-        self._seed_dropout(generator)
+        self._seed_dropout(seed, range(first, first + batch))
         stated = self.predict(
             self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
         )
-        errors = (stated - self.schedule.velocity(x0, eps, t)).square().flatten(1).mean(1)
-        shown = dict.fromkeys(names)
-        terms = {m: float(errors[[n == m for n in names]].detach().mean()) for m in shown}
-        return Losses(errors.mean(), terms)
+        squares = (stated - self.schedule.velocity(x0, eps, t)).square()
+        if known:
+            everywhere = torch.ones_like(x0[0, :, :1])
+            squares = squares * torch.stack([known[m][n] if m in known else everywhere for n, m in enumerate(names)])
+        errors = squares.flatten(1).mean(1)
+        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in shown}
+        return Losses(errors.mean(), {m: total * whole / (batch * shown.count(m)) for m, total in sums.items()})
 
-    def _seed_dropout(self, generator: torch.Generator) -> None:
-        inner = torch.Generator(self.device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
-        for module in self.modules():
-            if isinstance(module, SeededDropout):
-                module.generator = inner
+    def _seed_dropout(self, seed: int, clips: range) -> None:
+        layers = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]
+        for number, layer in enumerate(layers):
+            layer.seeds = tuple(seeds.key(seed, clip, f"dropout {number}") for clip in clips)
+
+    def trained_part(self) -> nn.ModuleDict:
+        """What training changes, by attribute name: the denoising network and the resampler of the image tokens."""
+        return nn.ModuleDict({"net": self.net, "image_tokens": self.image_tokens})
+
+    def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
+        """Names in `trained_part` of the parameters that mix frames: of the temporal transformers inside the blocks, which is
+        what the published second stage froze, or of `all` temporal layers, which is what its text says."""
+        layers = temporal_layers(self.net, all_layers=which == "all")
+        ids = {id(parameter) for layer in layers for parameter in layer.parameters()}
+        return {name for name, parameter in self.trained_part().named_parameters() if id(parameter) in ids}
 
     # sampling ---------------------------------------------------------------------------------------------------------
 

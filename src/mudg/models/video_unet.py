@@ -13,7 +13,6 @@ Source: paper of MuDG, section on the multi-modal diffusion model; architecture 
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 
 import torch
@@ -60,25 +59,32 @@ class VideoUNetConfig:
 
 
 class SeededDropout(nn.Module):
-    """Dropout whose draws come from `generator`, which the caller sets before a training step."""
+    """Dropout that draws for each clip from a seed of its own; the caller sets `seeds`, one per clip, before a training step.
 
-    generator: torch.Generator | None = None
+    What is drawn depends on the layer's seeds alone: neither on the other clips of the batch nor on when the layer is run, so
+    that a second computation in the backward pass draws the same.
+    """
+
+    seeds: tuple[int, ...] = ()
 
     def __init__(self, share: float) -> None:
         super().__init__()
         self.share = share
 
     def forward(self, x: Tensor) -> Tensor:
+        """[B*n,..] -> the same; the first axis holds the clips one after another."""
         if not self.training or self.share == 0:
             return x
-        if self.generator is None:
+        if not self.seeds or len(x) % len(self.seeds):
             raise UsageError(
-                "dropout needs a generator for its draws",
-                where="SeededDropout",
-                remedy="call PublishedMDM.loss, or eval()",
-            )
-        keep = torch.rand(x.shape, generator=self.generator, device=self.generator.device) >= self.share
-        return x * keep.to(x) / (1 - self.share)
+                "dropout needs a seed for every clip", where="SeededDropout", expected=f"a divisor of {len(x)} seeds",
+                got=str(len(self.seeds)), remedy="call PublishedMDM.loss, or eval()",
+            )  # fmt: skip
+        shape = (len(x) // len(self.seeds), *x.shape[1:])
+        draws = [
+            torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
+        ]
+        return x * (torch.cat(draws) >= self.share).to(x) / (1 - self.share)
 
 
 def attend(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
@@ -360,29 +366,7 @@ class VideoUNet(nn.Module):
         """A stage, kept for the backward pass or not. Dropout draws the same numbers when it is computed again."""
         if not (self.checkpointing and self.training and torch.is_grad_enabled()):
             return stage(*inputs)
-        generator = next((m.generator for m in stage.modules() if isinstance(m, SeededDropout)), None)
-        again = contextlib.nullcontext() if generator is None else _Replay(generator)
-        return checkpoint(
-            stage,
-            *inputs,
-            use_reentrant=False,
-            preserve_rng_state=False,
-            context_fn=lambda: (contextlib.nullcontext(), again),
-        )  # type: ignore[return-value]
-
-
-class _Replay:
-    """While it is entered, a generator draws again what it drew after this object was made."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self._generator, self._then = generator, generator.get_state()
-
-    def __enter__(self) -> None:
-        self._now = self._generator.get_state()
-        self._generator.set_state(self._then)
-
-    def __exit__(self, *_: object) -> None:
-        self._generator.set_state(self._now)
+        return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)  # type: ignore[return-value]
 
 
 def temporal_layers(net: VideoUNet, *, all_layers: bool) -> list[nn.Module]:

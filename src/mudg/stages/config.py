@@ -79,7 +79,7 @@ class LearnConfig:
     seed: int = 0
     """Fixes the cities, the weights' start and every draw."""
     start: str = ""
-    """Folder of a model to continue from, or "embedded" for the shipped one (empty = train from nothing)."""
+    """Folder of a model to continue from, a converted one too, or "embedded" for the shipped one (empty = train from nothing)."""
     scenes: tuple[str, ...] = ()
     """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED each."""
     scene_cameras: tuple[str, ...] = ()
@@ -113,7 +113,7 @@ class LearnConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the network is trained. Scoring and clip making stay on the CPU."""
+    """Where the network is trained. Clip making stays on the CPU, and scoring too, but of a published-type model."""
     parallel: Literal["ddp", "fsdp"] = "ddp"
     """Under torchrun: ddp = a whole network per process; fsdp = parameters and moments in pieces."""
     accumulate: int = Field(default=1, ge=1)
@@ -167,7 +167,8 @@ class LearnConfig:
     augment: bool = True
     """Vary colours, mirror, and spoil given classes."""
     reference_dropout: float = Field(default=0.2, ge=0, le=1)
-    """How often a clip goes without its reference image; only for models that use one."""
+    """How often a clip goes without its reference image; only for models that use one. Published-type models: 0.2 as the
+    paper says, 0.1 as the released code does."""
     balance: float = Field(default=0.0, ge=0, le=1)
     """How strongly rare classes count in the semantic loss: 0 = as often as they occur, 1 = all classes alike. A refiner's
     scores are freed of it at the end."""

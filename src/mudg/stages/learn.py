@@ -12,16 +12,16 @@ OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
 OUT/latents/  with `cache_latents`             OUT/tensorboard/  with `tensorboard`
 
 Clips are in `learn_clips`, processes and layouts in `learn_parallel`, checkpoints in `learn_state`, what is asked of a
-model in `learn_models`.
+model in `learn_models`, the published-type model in `learn_published`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib.util
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +38,11 @@ from mudg.data.log_clips import LogClipRules
 from mudg.models import mdm
 from mudg.models.mdm import MDM, Losses, MDMConfig
 from mudg.models.vae import PatchCodec
-from mudg.stages import learn_clips, learn_parallel, learn_score
+from mudg.stages import learn_clips, learn_parallel, learn_published, learn_score, published_model
 from mudg.stages.config import LearnConfig
 from mudg.stages.learn_clips import class_weights, draw_batch
 from mudg.stages.learn_latents import cached_latents
-from mudg.stages.learn_models import Part, kind_of
+from mudg.stages.learn_models import Model, Part, kind_of
 from mudg.stages.learn_parallel import Interruption, Ranks, Spread, agreed, joined
 from mudg.stages.learn_state import TrainingState, mean_of, newest
 from mudg.stages.precision import choose_bf16
@@ -111,39 +111,41 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> stor
     return opened[0] if ranks.leads else store.RunDir(out, "learn", "", {}, complete=False)
 
 
-def _run(model: MDM, fresh: set[str], config: LearnConfig, directory: store.RunDir, ranks: Ranks) -> None:
+def _run(model: Model, fresh: set[str], config: LearnConfig, directory: store.RunDir, ranks: Ranks) -> None:
     out = directory.path
     bf16 = choose_bf16(config.precision)
     clips = Path(config.clips) if config.clips else out / "clips"
     rules: LogClipRules | None = None
-    asked = config
+    asked, kind = config, kind_of(model)
     if config.scenes:
         sources = [log_clips.log_source(text) for text in config.scenes]
-        rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple)
+        rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple, kind.points_alone)
         counts = ranks.leader_does(lambda: learn_clips.make_log_clips(asked, rules, clips))
         config = learn_clips.for_logs(config, rules, *counts)
     making = ranks.leads and not config.scenes
-    with learn_clips.MakingClips(config, clips) if making else contextlib.nullcontext():
-        if "codec" in fresh:
+    with learn_clips.MakingClips(config, clips, kind.points_alone) if making else contextlib.nullcontext():
+        if "codec" in fresh and isinstance(model, MDM):
             ranks.leader_does(lambda: _train_codec(model, config, directory, clips, bf16))
             _take_codec(model, out, ranks)
             draw_weights(model.net, config.seed, "weights")
-        if model.refiner is not None and "refiner" in fresh:
+        if "refiner" in fresh and isinstance(model, MDM) and model.refiner is not None:
             draw_weights(model.refiner, config.seed, "refiner weights")
             model.refiner.reset()
-        model.codec.requires_grad_(False)
+        model.requires_grad_(False)
+        model.trained_part().requires_grad_(True)
         with cached_latents(model.codec, out / "latents") if config.cache_latents else contextlib.nullcontext():
             weights = _train_network(model, config, directory, clips, bf16, ranks)
     ranks.leader_does(lambda: _finish(model, weights, config, asked, directory, clips, bf16, rules))
 
 
 def _finish(
-    model: MDM, weights: dict[str, Tensor], config: LearnConfig, asked: LearnConfig, directory: store.RunDir, clips: Path,
+    model: Model, weights: dict[str, Tensor], config: LearnConfig, asked: LearnConfig, directory: store.RunDir, clips: Path,
     bf16: bool, rules: LogClipRules | None,
 ) -> None:  # fmt: skip
     """Score and export what was trained."""
-    made = with_weights(model, weights)
-    if made.refiner is not None and config.balance:
+    kind = kind_of(model)
+    made = kind.rebuilt(model, weights)
+    if isinstance(made, MDM) and made.refiner is not None and config.balance:
         made.refiner.take_back(class_weights(clips, min(config.first_cities, 20), config.balance))
     shards = learn_clips.scored_shards(config)
     scores = learn_score.score(made, shards, clips, steps=config.score_steps, seed=config.seed, bf16=bf16)
@@ -152,12 +154,12 @@ def _finish(
     if config.start:
         facts["continued_from"] = mdm.facts(config.start)
     words = learn_clips.data_words(config, rules)
-    kind_of(made).save(made, directory.path / "model", learn_score.model_card(made, config, scores, words), facts)
+    kind.save(made, directory.path / "model", kind.card(made, config, scores, words), facts)
     directory.finish({"held_out": scores["average"]})
     log.info(learn_score.table(scores))
 
 
-def starting_model(config: LearnConfig) -> tuple[MDM, set[str]]:
+def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
 
     With `start` the network is that of the earlier model, grown by a refiner and given classes where the settings ask for
@@ -165,16 +167,21 @@ def starting_model(config: LearnConfig) -> tuple[MDM, set[str]]:
     size and length than before.
 
     Raises:
-        UsageError: the settings ask for another network than the earlier model has.
+        UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
     """
     wanted = model_config(config)
     if not config.start:
         return MDM(wanted), {"codec", "refiner"}
+    if published_model.is_published(config.start):
+        if not _says_nothing(config):
+            raise UsageError("the network of a published-type model cannot be described", where="--start",
+                             remedy="leave out widths, blocks, attention, patch and refiner")  # fmt: skip
+        return learn_published.starting(config), set()
     before = mdm.load(config.start)
     if before.config.window != config.window:
         log.info(f"learn: clips of {config.window} frames; the model to continue from had {before.config.window}")
     now = {"window": config.window, "area_px": wanted.area_px}
-    resized = MDM(dataclasses.replace(before.config, **now))
+    resized = MDM(replace(before.config, **now))
     resized.load_state_dict(before.state_dict())
     if wanted != resized.config and not _is_kind_of(resized.config, wanted) and _says_nothing(config):
         log.info("learn: the network is that of the model to continue from")
@@ -188,21 +195,13 @@ def starting_model(config: LearnConfig) -> tuple[MDM, set[str]]:
 def _is_kind_of(one: MDMConfig, other: MDMConfig) -> bool:
     """Whether two networks differ at most in what `mdm.grown` can add."""
     plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
-    return dataclasses.replace(one, **plain) == dataclasses.replace(other, **plain)
+    return replace(one, **plain) == replace(other, **plain)
 
 
 def _says_nothing(config: LearnConfig) -> bool:
     """Whether the settings leave the network as it is by default."""
     default = LearnConfig(window=config.window, width=config.width, height=config.height)
     return model_config(config) == model_config(default)
-
-
-def with_weights(model: MDM, weights: dict[str, Tensor]) -> MDM:
-    """A copy of a model on the CPU, ready for use, whose trained part has these weights."""
-    made = type(model)(model.config)
-    frozen = {name: value for name, value in model.state_dict().items() if name not in weights}
-    made.load_state_dict({**frozen, **weights})
-    return made.eval()
 
 
 def model_config(config: LearnConfig) -> MDMConfig:
@@ -322,7 +321,7 @@ def frames_at(config: LearnConfig, step: int) -> int:
     return config.window if late else max(1, config.window // 2)
 
 
-def freeze(model: MDM, what: str) -> int:
+def freeze(model: Model, what: str) -> int:
     """Let a part of the network keep its weights (see `LearnConfig.frozen`); returns the number of parameters it has.
 
     Raises:
@@ -332,7 +331,7 @@ def freeze(model: MDM, what: str) -> int:
         return 0
     if what == "denoiser":
         names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
-        if model.refiner is None:
+        if not isinstance(model, MDM) or model.refiner is None:
             raise UsageError("without a refiner nothing would be left to train", where="--frozen", got=what)
     else:
         names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
@@ -349,7 +348,7 @@ def freeze(model: MDM, what: str) -> int:
     return count
 
 
-def _begin(model: MDM, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[TrainingState, Spread]:
+def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[TrainingState, Spread]:
     """Freeze, spread over the processes, make the optimiser, and take up the newest checkpoint."""
     freeze(model, config.frozen)
     model.to(ranks.device)
@@ -378,14 +377,16 @@ def _begin(model: MDM, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[Tr
 
 
 def _train_network(
-    model: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool, ranks: Ranks
+    model: Model, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool, ranks: Ranks
 ) -> dict[str, Tensor]:
-    """Train denoiser and refiner; returns the weights to use (the moving average), whole, in the leader."""
+    """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
     out = run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
     weights = class_weights(folder, min(config.first_cities, 20), config.balance).to(ranks.device)
     board = _Board(run_dir.path / "tensorboard") if config.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.parallel}
+    kind = kind_of(model)
+    drawn = replace(config, reference_dropout=0.0) if kind.drops_reference else config
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
     with log.task("network", config.steps, begun) as bar, Interruption() as interruption:
@@ -398,7 +399,7 @@ def _train_network(
             terms: dict[str, float] = {}
             state.optimizer.zero_grad(set_to_none=True)
             for part in parts:
-                batch = draw_batch(config, folder, step, count, frames, "batch", part).to(ranks.device)
+                batch = draw_batch(drawn, folder, step, count, frames, "batch", part).to(ranks.device)
                 with spread.portion(last=part is parts[-1]):
                     losses = _losses(spread, model, config, batch, step, part.start, count, weights, bf16)
                     (losses.total / len(parts)).backward()
@@ -424,7 +425,7 @@ def _train_network(
                 saved_at = done
             if done % config.sample_every == 0 or last:
                 shown = state.shown(ranks)
-                ranks.leader_does(lambda: _look(with_weights(model, shown), config, run_dir, folder, done, bf16))  # noqa: B023
+                ranks.leader_does(lambda: _look(kind.rebuilt(model, shown), config, run_dir, folder, done, bf16))  # noqa: B023
             if stop and not last:
                 log.info(f"learn: stopped after step {saved_at}, which is saved")
                 interruption.end()
@@ -434,7 +435,7 @@ def _train_network(
 
 
 def _losses(
-    objective: Any, model: MDM, config: LearnConfig, batch: Batch, step: int, first: int, count: int, weights: Tensor,
+    objective: Any, model: Model, config: LearnConfig, batch: Batch, step: int, first: int, count: int, weights: Tensor,
     bf16: bool,
 ) -> Losses:  # fmt: skip
     """Loss of clips `first` and following of the step's `count` clips."""
@@ -466,7 +467,7 @@ class _Board:
         self._writer.close()
 
 
-def _look(shown: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool) -> None:
+def _look(shown: Model, config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool) -> None:
     """Score a model on a few held-out clips and draw a grid of what it makes."""
     scores = learn_score.score(
         shown, learn_clips.scored_shards(config)[: config.watched], folder, steps=config.sample_steps, seed=config.seed,

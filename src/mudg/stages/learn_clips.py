@@ -44,18 +44,19 @@ def cities_at(config: LearnConfig, step: int) -> int:
 # cities ---------------------------------------------------------------------------------------------------------------
 
 
-def clip_rules(config: LearnConfig) -> city_clips.CityClipRules:
-    """What the generator is asked for."""
+def clip_rules(config: LearnConfig, points_alone: bool = False) -> city_clips.CityClipRules:
+    """What the generator is asked for; `points_alone`: the published system's condition."""
     return city_clips.CityClipRules(
-        width=config.width, height=config.height, window=config.window, seed=config.seed, clips=config.clips_per_city
-    )
+        width=config.width, height=config.height, window=config.window, seed=config.seed, clips=config.clips_per_city,
+        published=points_alone,
+    )  # fmt: skip
 
 
 class MakingClips:
     """Processes that make the missing clips of cities, held-out ones first, while the block runs."""
 
-    def __init__(self, config: LearnConfig, folder: Path) -> None:
-        self._rules, self._folder = clip_rules(config), folder
+    def __init__(self, config: LearnConfig, folder: Path, points_alone: bool = False) -> None:
+        self._rules, self._folder = clip_rules(config, points_alone), folder
         wanted = [*held_out(config), *range(config.cities)]
         self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
         self._workers = config.workers
@@ -103,8 +104,11 @@ def await_shard(folder: Path, city: int, patience_s: float = 900.0) -> None:
 # logs -----------------------------------------------------------------------------------------------------------------
 
 
-def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int) -> LogClipRules:
-    """How clips are cut from logs: of the configuration's area, in the aspect of the first log's first camera."""
+def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, points_alone: bool = False) -> LogClipRules:
+    """How clips are cut from logs: of the configuration's area, in the aspect of the first log's first camera.
+
+    `points_alone`: with the published system's condition, and of the configuration's very size, whatever the aspect.
+    """
     scene = read_scene(sources[0].scene)
     names = config.scene_cameras or tuple(scene.cameras)
     if names[0] not in scene.cameras:
@@ -112,10 +116,12 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int) -> L
                          expected=", ".join(scene.cameras), got=names[0])  # fmt: skip
     camera = scene.cameras[names[0]]
     width, height = model_size(camera.width, camera.height, multiple, config.width * config.height)
+    if points_alone:
+        width, height = config.width, config.height
     return LogClipRules(
         width=width, height=height, window=config.window, stride=config.stride, frame_step=config.frame_step,
         cameras=config.scene_cameras, held_out_every=config.held_out_every, label_confidence=config.label_confidence,
-        seed=config.seed,
+        seed=config.seed, published=points_alone,
     )  # fmt: skip
 
 
@@ -161,10 +167,11 @@ def data_words(config: LearnConfig, rules: LogClipRules | None) -> str:
     """A sentence on the training data for the model card; empty for cities, which the card describes itself."""
     if rules is None:
         return ""
+    given = "the projected points and the first image" if rules.published else "images taken at other times"
     return (
         f"{config.cities} clips of {config.window} frames of {len(config.scenes)} recorded "
         f"{'log' if len(config.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, looked at from where they were\n"
-        f"recorded, with images taken at other times as condition. Depth was learned where a sweep measured it. The model this\n"
+        f"recorded, with {given} as condition. Depth was learned where a sweep measured it. The model this\n"
         f"one continues from has training data of its own. `held-out` below means every {config.held_out_every}. window of these logs."
     )
 

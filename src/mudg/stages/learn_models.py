@@ -2,7 +2,7 @@
 
 The loop itself (draws, layouts, checkpoints, averages) knows nothing of a model but this: `loss` gives the loss of some
 clips of a batch, `trained_part` names the modules that change, `temporal_parameters` those that a later stage may freeze.
-A new kind of model is a class with these methods and a row in `KINDS`.
+A new kind of model is a class with these methods and a row in `KINDS`. The published-type one is in `learn_published`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ from torch.nn import functional
 
 from mudg.base import seeds
 from mudg.base.errors import UsageError
-from mudg.data.clip_shards import Batch
 from mudg.models import mdm
 from mudg.models.mdm import MDM, Losses
+from mudg.models.published import PublishedMDM
+from mudg.stages import learn_published, learn_score
 from mudg.stages.config import LearnConfig
+from mudg.stages.learn_published import Objective, Part
+
+Model = MDM | PublishedMDM
 
 
 class Trainable(Protocol):
-    """The methods of a model that the training loop uses; `MDM` is the first of them."""
+    """The methods of a model that the training loop uses; `MDM` and `PublishedMDM` have them."""
 
     def trained_part(self) -> nn.ModuleDict:
         """The modules that training changes, by the names of the attributes that hold them."""
@@ -45,19 +49,6 @@ class Trainable(Protocol):
         ...
 
 
-Objective = Callable[..., Losses]
-
-
-@dataclass(frozen=True)
-class Part:
-    """Some clips of a step's batch: `batch` holds clips `first` and following of `count`."""
-
-    batch: Batch
-    step: int
-    first: int
-    count: int
-
-
 @dataclass(frozen=True)
 class Kind:
     """How one class of models is trained and saved.
@@ -65,10 +56,18 @@ class Kind:
     loss    (objective, model, settings, part, class weights f32[19]) -> losses; encodes the clips and calls `objective`, which
             stands for `model.loss`
     save    (model, folder, card, facts)
+    card    (model, settings, scores, words on the training data) -> text of the model card
+    rebuilt (model, weights of its trained part) -> a model with these, ready for use
+    drops_reference  the model's own loss leaves references out: clips come with theirs
+    points_alone     the condition is the published system's: points, and 0 where nothing was seen
     """
 
     loss: Callable[[Objective, Any, LearnConfig, Part, Tensor], Losses]
     save: Callable[[Any, Path, str, Mapping[str, Any]], None]
+    card: Callable[[Any, LearnConfig, Mapping[str, Any], str], str]
+    rebuilt: Callable[[Any, Mapping[str, Tensor]], Any]
+    drops_reference: bool = False
+    points_alone: bool = False
 
 
 def mdm_loss(objective: Objective, model: MDM, config: LearnConfig, part: Part, weights: Tensor) -> Losses:
@@ -100,7 +99,21 @@ def refined_window(config: LearnConfig, model: MDM, step: int) -> tuple[slice, s
     return spans[0], spans[1]
 
 
-KINDS: dict[type[nn.Module], Kind] = {MDM: Kind(mdm_loss, mdm.save)}
+def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
+    """A copy of a model on the CPU, ready for use, whose trained part has these weights."""
+    made = MDM(model.config)
+    frozen = {name: value for name, value in model.state_dict().items() if name not in weights}
+    made.load_state_dict({**frozen, **weights})
+    return made.eval()
+
+
+KINDS: dict[type[nn.Module], Kind] = {
+    MDM: Kind(mdm_loss, mdm.save, learn_score.model_card, mdm_rebuilt),
+    PublishedMDM: Kind(
+        learn_published.loss, learn_published.save, learn_published.card, learn_published.rebuilt, drops_reference=True,
+        points_alone=True,
+    ),
+}  # fmt: skip
 
 
 def kind_of(model: nn.Module) -> Kind:

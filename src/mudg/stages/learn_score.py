@@ -21,6 +21,7 @@ from mudg.core import metrics
 from mudg.data import clip_shards
 from mudg.data.clip_shards import Batch
 from mudg.models.mdm import MDM, Sample
+from mudg.models.published import PublishedMDM
 from mudg.stages.config import LearnConfig
 
 SKY = palette.ID["sky"]
@@ -35,7 +36,7 @@ SCORES = (
 
 
 def score(
-    model: MDM,
+    model: MDM | PublishedMDM,
     cities: Sequence[int],
     folder: Path,
     *,

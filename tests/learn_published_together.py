@@ -1,0 +1,37 @@
+"""One of two processes that train a published-type model together: started by test_learn_published with (rank, store file,
+folder of the model, folder of clips, out)."""
+
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["GLOO_SOCKET_IFNAME"] = "lo"
+
+import torch.distributed as dist
+from toy_published import published_settings
+
+from mudg.stages import learn
+from mudg.stages.learn_parallel import Interruption
+
+rank, store, start, clips, out = int(sys.argv[1]), *sys.argv[2:5], Path(sys.argv[5])
+dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
+common = {"frozen": "temporal_transformers", "steps": 3}
+losses, asked = learn._losses, Interruption.asked
+
+
+def stop_after_two(spread, model, config, batch, at, *rest):
+    if at == 1:
+        Interruption.asked = property(lambda self: True)
+    return losses(spread, model, config, batch, at, *rest)
+
+
+learn._losses = stop_after_two
+try:
+    learn.run(published_settings(start, clips, **common), out)
+except KeyboardInterrupt:
+    learn._losses, Interruption.asked = losses, asked
+else:
+    sys.exit("the run was not stopped")
+learn.run(published_settings(start, clips, **common, parallel="fsdp", recompute=True), out)
+dist.destroy_process_group()

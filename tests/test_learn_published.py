@@ -1,0 +1,275 @@
+"""Training the published-type network with `learn`: two stages, any layout, clips of points alone."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_learn_parallel import SAME, environment, losses_of
+from toy_clips import write_clips
+from toy_published import published_settings, tiny_model, write_tiny
+from toy_scene import ToyStreet
+
+from mudg.base.errors import InputError, UsageError
+from mudg.data import city_clips, clip_shards, log_clips
+from mudg.data.clips import ConditionRules, build_condition
+from mudg.data.log_clips import LogClipRules, LogSource
+from mudg.data.observations import read_observations
+from mudg.data.scenefile import read_scene
+from mudg.models import published
+from mudg.models.published import PAPER_DROPOUT, RELEASED_DROPOUT, ContextDropout, PublishedMDM
+from mudg.stages import convert, fuse, learn, learn_clips, published_model, synthesize
+from mudg.stages.config import FuseConfig, SynthesizeConfig
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return write_clips(tmp_path_factory.mktemp("clips"), 32, 32, points=True)
+
+
+@pytest.fixture(scope="module")
+def converted(tmp_path_factory):
+    return write_tiny(tmp_path_factory.mktemp("converted"))
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    root = tmp_path_factory.mktemp("street")
+    ToyStreet(times=[0.1 * n for n in range(5)]).write(root / "scene", labels=False, width=72, height=48)
+    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    return root
+
+
+def corner(batch):
+    """The upper left 16x16 pixels: enough for a loss."""
+    names = ("rgb", "depth", "semantics", "color", "sparse_depth", "valid", "warped", "reference", "depth_known")
+    return replace(batch, **{name: getattr(batch, name)[..., :16, :16] for name in names})
+
+
+def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
+    """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the result."""
+    one = learn.run(published_settings(converted, clips, steps=1, batch_frames=4), tmp_path / "one")
+    large = write_clips(tmp_path / "large", 36, 32, points=True)
+    config = published_settings(
+        one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
+    )
+    begun, fresh = learn.starting_model(config)
+    first, start = (published_model.read(folder).state_dict() for folder in (converted, one))
+    assert not fresh
+    assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
+    two = learn.run(config, tmp_path / "two")
+    last = published_model.read(two)
+    end = last.state_dict()
+    trained = {name for name in first if name.startswith(("net.", "image_tokens."))}
+    temporal = begun.temporal_parameters("transformers")
+    assert {name for name in first if not torch.equal(first[name], start[name])} == trained
+    assert {name for name in first if not torch.equal(start[name], end[name])} == trained - temporal
+    assert temporal and not any(name.startswith("net.first.") or ".res" in name for name in temporal)
+    for state in (start, end):  # learnt, and never that of the noise step
+        assert not torch.equal(state["net.label.0.weight"], first["net.label.0.weight"])
+        assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
+    assert (last.config.width, last.config.height) == (36, 32)
+    assert torch.equal(last.schedule.scale, published_model.read(converted).schedule.scale)
+    assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
+    assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
+    view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
+    made = read_observations(
+        synthesize.run(view, street / "scene", street / "fuse", tmp_path / "made") / "front_shift+1.0"
+    )
+    assert len(made) == 5 and bool(torch.isfinite(made[4].rgb).all())
+
+
+def test_settings_of_the_frozen_layers_agree_with_the_published_stages():
+    """By names here, by modules in `choose_trainable`."""
+    model = tiny_model()
+    for which in ("transformers", "all"):
+        moving = {id(p) for p in published.choose_trainable(model, 2, which)}
+        named = {n for n, p in model.trained_part().named_parameters() if id(p) not in moving}
+        assert named == model.temporal_parameters(which)
+
+
+def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
+    """With dropout inside the network on; terms too, and they have the same names in every part."""
+    settings = published_settings(converted, clips)
+    model, _ = learn.starting_model(settings)
+    model.trained_part().train()
+
+    @torch.no_grad()
+    def losses(step, part):
+        batch = corner(learn_clips.draw_batch(settings, clips, step, 2, 4, "batch", part))
+        return learn._losses(model.loss, model, settings, batch, step, part.start, 2, torch.ones(19), False)
+
+    for step in range(2):
+        whole, parts = losses(step, slice(0, 2)), [losses(step, slice(n, n + 1)) for n in (0, 1)]
+        assert all(list(part.terms) == list(whole.terms) for part in parts)
+        for name, value in {**whole.terms, "total": float(whole.total)}.items():
+            mean = sum(float({**p.terms, "total": p.total}[name]) for p in parts) / 2
+            assert mean == pytest.approx(value, rel=SAME)
+    again = losses(1, slice(0, 2)).total
+    assert torch.equal(again, whole.total)
+    model.eval()
+    assert abs(float(losses(1, slice(0, 2)).total) / float(again) - 1) > 1e-3  # dropout did something
+
+
+def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
+    settings = published_settings(converted, clips)
+    model, _ = learn.starting_model(settings)
+    batch = corner(learn_clips.draw_batch(settings, clips, 0, 4, 4, "batch"))
+    loss = lambda shown: learn._losses(model.loss, model, settings, shown, 0, 0, 4, torch.ones(19), False)  # noqa: E731
+    nothing = replace(
+        batch, depth_known=torch.zeros_like(batch.depth_known), semantics=torch.full_like(batch.semantics, 255)
+    )
+    with torch.no_grad():
+        terms, without = loss(batch).terms, loss(nothing).terms
+    assert {"depth", "semantics"} & set(terms)
+    assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
+
+
+@pytest.mark.slow
+def test_portions_and_recomputing_change_nothing(converted, clips, tmp_path):
+    learn.run(published_settings(converted, clips), tmp_path / "plain")
+    learn.run(published_settings(converted, clips, accumulate=2, recompute=True), tmp_path / "portions")
+    plain, portions = losses_of(tmp_path / "plain"), losses_of(tmp_path / "portions")
+    assert all(portions[step] == pytest.approx(plain[step], rel=SAME) for step in (1, 2))
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
+    """ddp, then fsdp from the checkpoint that ddp wrote, with frozen layers."""
+    common = {"frozen": "temporal_transformers", "steps": 3}
+    learn.run(published_settings(converted, clips, **common), tmp_path / "one")
+    script = str(Path(__file__).with_name("learn_published_together.py"))
+    arguments = [str(tmp_path / "store"), str(converted), str(clips), str(tmp_path / "both")]
+    both = [
+        subprocess.Popen(
+            [sys.executable, script, str(rank), *arguments], env=environment(), stderr=subprocess.PIPE, text=True
+        )
+        for rank in (0, 1)
+    ]
+    errors = [process.communicate(timeout=540)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], "\n".join(errors)
+    one, other = losses_of(tmp_path / "one"), losses_of(tmp_path / "both")
+    off = {step: abs(one[step] - other[step]) / one[step] for step in (1, 2, 3)}
+    print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
+    assert max(off.values()) < SAME, off
+    first, second = (published_model.read(tmp_path / name / "model").state_dict() for name in ("one", "both"))
+    for name in first:
+        torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
+
+
+def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch):
+    """By the model itself: clips come with theirs even where all are to go without."""
+    given, dropped = [], []
+    encode = PublishedMDM.encode_planes
+
+    def watched(model, color, depth, valid, reference, *rest):
+        given.append(bool(torch.equal(reference, color[:, 0])))
+        return encode(model, color, depth, valid, reference, *rest)
+
+    def noted(model, *rest, dropout, **more):
+        dropped.append(dropout.both + dropout.reference)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PublishedMDM, "encode_planes", watched)
+    monkeypatch.setattr(PublishedMDM, "loss", noted)
+    with pytest.raises(KeyboardInterrupt):
+        learn.run(published_settings(converted, clips, reference_dropout=0.8), tmp_path / "run")
+    assert given and not any(given)
+    assert dropped == [pytest.approx(0.8)]
+    assert ContextDropout.of(0.2) == PAPER_DROPOUT
+    assert ContextDropout.of(0.1) == RELEASED_DROPOUT
+    assert ContextDropout.of(0.0) == ContextDropout(0.05, 0.0, 0.0)
+
+
+def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
+    for wrong in ({"window": 8}, {"full_window_share": 0.5}):
+        with pytest.raises(UsageError, match=r"exactly the length(.|\n)*--window 4 --full-window-share 1"):
+            learn.run(published_settings(converted, clips, **wrong), tmp_path / "run")
+    with pytest.raises(UsageError, match="multiples of 4"):
+        learn.run(published_settings(converted, clips, width=50), tmp_path / "run")
+    with pytest.raises(UsageError, match="cannot be kept"):
+        learn.run(published_settings(converted, clips, cache_latents=True), tmp_path / "run")
+    with pytest.raises(UsageError, match="cannot be described"):
+        learn.run(published_settings(converted, clips, widths=(16, 32, 64)), tmp_path / "run")
+    with pytest.raises(UsageError, match="without a refiner"):
+        learn.run(published_settings(converted, clips, frozen="denoiser"), tmp_path / "refiner")
+    warped = write_clips(tmp_path / "warped", 32, 32)
+    with pytest.raises(InputError, match="warped images"):
+        learn.run(published_settings(converted, warped), tmp_path / "other")
+
+
+# clips ----------------------------------------------------------------------------------------------------------------
+
+
+def test_clips_of_logs_show_points_alone(street, tmp_path):
+    """The condition is the one that `synthesize` builds for the published model, and survives the disk."""
+    rules = LogClipRules(width=48, height=32, window=4, stride=4, held_out_every=0, published=True)
+    log = log_clips.OpenLog(LogSource(street / "scene", street / "fuse"), rules)
+    window = log_clips.log_windows(log.scene, rules)[0]
+    held = replace(window, held_out=True)  # all points are kept
+    clip = log_clips.make_clip(log, held, 0)
+    recorded = synthesize.recorded_images(log.scene, held_out=False, classes=False)
+    views = [log.frame(name).view for name in window.frames]
+    conditions = ConditionRules(48, 32, 72, 48, published=True)
+    wanted = build_condition(log.cloud, log.scene.tracks, views, recorded, conditions)
+    for name in ("color", "depth", "valid", "reference"):
+        assert torch.equal(getattr(clip.condition, name), getattr(wanted, name)), name
+    assert float((clip.condition.reference - clip.rgb[0]).abs().mean()) < 0.03  # frame 0's own image
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([clip], [0.0], gaps=True))
+    batch = clip_shards.read_batch(tmp_path, [(0, 0, range(4))])
+    assert torch.allclose(batch.sparse_depth[0], wanted.depth, rtol=1e-3, atol=1e-3)
+    assert bool((batch.sparse_depth == 0).any()) and not bool(batch.warped.any())
+    assert torch.allclose(batch.color[0], wanted.color, atol=1 / 500)
+    assert 0 < float(batch.depth[~batch.depth_known].min()) and float(batch.depth[~batch.depth_known].max()) <= 100
+    thinner = log_clips.make_clip(log, window, 0)
+    assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
+
+
+def test_filling_takes_the_nearest_measured_depth():
+    depth = torch.zeros(2, 1, 1, 5)
+    depth[0, 0, 0, 1], depth[0, 0, 0, 4] = 7.0, 30.0
+    assert log_clips._nearest_depth(depth, 100.0)[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
+
+
+def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
+    sources = [LogSource(street / "scene", street / "fuse")]
+    rules = LogClipRules(width=48, height=32, window=4)
+    log_clips.claim(tmp_path, rules, sources)
+    assert "published" not in json.loads((tmp_path / log_clips.INDEX).read_text())["rules"]  # as in earlier versions
+    with pytest.raises(UsageError, match="other logs or settings"):
+        log_clips.claim(tmp_path, replace(rules, published=True), sources)
+
+
+def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
+    rules = city_clips.CityClipRules(width=48, height=32, window=16, clips=1, published=True)
+    assert rules.frames == 18 and city_clips.CityClipRules().frames == city_clips.FRAMES
+    log = city_clips.make_log(replace(rules, width=24, height=16), 0, rules.frames)
+    (clip,), _ = city_clips.make_clips(replace(rules, width=24, height=16), 0, log)
+    condition = clip.condition
+    assert len(clip.rgb) == 16 and condition.warped is None
+    empty = ~condition.valid
+    assert bool(empty.any()) and float((condition.depth * empty).abs().max()) == 0
+    assert float((condition.color * empty).abs().max()) == 0
+    found = np.stack([r.rgb for r in log.recorded if r.view.time_s == condition.views[0].time_s][:1])
+    small = torch.nn.functional.interpolate(
+        torch.from_numpy(found).permute(0, 3, 1, 2).float() / 255, size=(16, 24), mode="bilinear", align_corners=False
+    )
+    assert torch.allclose(condition.reference, small[0], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_published_model_goes_on_learning_on_a_log(converted, street, tmp_path):
+    """Logs are cut into clips of the very size asked for, whatever the camera's aspect."""
+    source = f"{street / 'scene'}={street / 'fuse'}"
+    config = published_settings(
+        converted, "", scenes=(source,), stride=4, held_out_every=0, width=32, height=32, steps=1, batch_frames=4
+    )
+    made = learn.run(config, tmp_path / "run")
+    index = json.loads((tmp_path / "run" / "clips" / log_clips.INDEX).read_text())["rules"]
+    assert (index["width"], index["height"], index["published"]) == (32, 32, True)
+    assert "the first image as condition" in (made / "MODEL_CARD.md").read_text()
+    assert read_scene(street / "scene").cameras["front"].width == 72
