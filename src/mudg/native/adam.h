@@ -11,6 +11,7 @@ namespace {
 constexpr float kTinyMoment = 1e-37f;
 
 constexpr int kAdamBlock = 256;           // rows whose runs of visible ones are noted at a time
+constexpr std::int64_t kAdamNarrow = 16;  // columns up to this width are gone through in whole vectors
 constexpr std::size_t kAdamGrain = 16384;  // elements per piece of work
 
 struct AdamLanes {
@@ -32,7 +33,8 @@ MUDG_INLINE void adam_range(const AdamJob& job, const AdamColumn& column, std::s
   float *parameter = column.parameter, *moment1 = column.moment1, *moment2 = column.moment2;
   std::size_t i = begin;
   for (; i + kLanes <= end; i += kLanes) {
-    const AdamLanes next = adam_lanes(job, step_size, load_unaligned(parameter + i), load_unaligned(column.gradient + i),
+    const Floats gradient = load_unaligned(column.gradient + i);
+    const AdamLanes next = adam_lanes(job, step_size, load_unaligned(parameter + i), gradient,
                                       load_unaligned(moment1 + i), load_unaligned(moment2 + i));
     store_unaligned(parameter + i, next.parameter);
     store_unaligned(moment1 + i, next.moment1);
@@ -40,11 +42,45 @@ MUDG_INLINE void adam_range(const AdamJob& job, const AdamColumn& column, std::s
   }
   if (i == end) return;
   const int left = static_cast<int>(end - i);
-  const AdamLanes next = adam_lanes(job, step_size, load_first(parameter + i, left), load_first(column.gradient + i, left),
+  const Floats gradient = load_first(column.gradient + i, left);
+  const AdamLanes next = adam_lanes(job, step_size, load_first(parameter + i, left), gradient,
                                     load_first(moment1 + i, left), load_first(moment2 + i, left));
   store_first(parameter + i, left, next.parameter);
   store_first(moment1 + i, left, next.moment1);
   store_first(moment2 + i, left, next.moment2);
+}
+
+// The rows [begin, end) of a narrow column, of which some are visible: whole vectors in which the lanes of the other
+// rows keep their values. Runs of few elements, one after the other, would each wait for the store before.
+MUDG_INLINE void adam_narrow(const AdamJob& job, const AdamColumn& column, std::int64_t begin, std::int64_t end) {
+  alignas(64) float shown[kAdamBlock * kAdamNarrow + kLanes];
+  const std::size_t width = static_cast<std::size_t>(column.width);
+  for (std::int64_t row = begin; row < end; ++row)
+    store_unaligned(shown + static_cast<std::size_t>(row - begin) * width, splat(job.visible[row] ? 1.0f : 0.0f));
+  const Floats step_size = splat(column.step_size), half = splat(0.5f);
+  const std::size_t start = static_cast<std::size_t>(begin) * width;
+  const std::size_t count = static_cast<std::size_t>(end - begin) * width;
+  for (std::size_t i = 0; i < count; i += kLanes) {
+    const Mask moves = load(shown + i) > half;
+    if (bits(moves) == 0) continue;
+    float *parameter = column.parameter + start + i, *moment1 = column.moment1 + start + i;
+    float* moment2 = column.moment2 + start + i;
+    const float* gradient = column.gradient + start + i;
+    if (i + kLanes <= count) {
+      const Floats p = load_unaligned(parameter), m = load_unaligned(moment1), v = load_unaligned(moment2);
+      const AdamLanes next = adam_lanes(job, step_size, p, load_unaligned(gradient), m, v);
+      store_unaligned(parameter, select(moves, next.parameter, p));
+      store_unaligned(moment1, select(moves, next.moment1, m));
+      store_unaligned(moment2, select(moves, next.moment2, v));
+    } else {
+      const int left = static_cast<int>(count - i);
+      const Floats p = load_first(parameter, left), m = load_first(moment1, left), v = load_first(moment2, left);
+      const AdamLanes next = adam_lanes(job, step_size, p, load_first(gradient, left), m, v);
+      store_first(parameter, left, select(moves, next.parameter, p));
+      store_first(moment1, left, select(moves, next.moment1, m));
+      store_first(moment2, left, select(moves, next.moment2, v));
+    }
+  }
 }
 
 // All columns of a few rows: the runs of visible rows are looked for once, not once per column.
@@ -66,11 +102,17 @@ MUDG_INLINE void adam_block(const AdamJob& job, std::int64_t begin, std::int64_t
       after[runs++] = row;
     }
   }
+  const bool mixed = runs > 1;
   for (int c = 0; c < job.column_count; ++c) {
     const AdamColumn& column = job.columns[c];
     const std::int64_t width = column.width;
+    if (mixed && width <= kAdamNarrow) {
+      adam_narrow(job, column, begin, end);
+      continue;
+    }
     for (int run = 0; run < runs; ++run) {
-      adam_range(job, column, static_cast<std::size_t>(first[run] * width), static_cast<std::size_t>(after[run] * width));
+      const auto from = static_cast<std::size_t>(first[run] * width), to = static_cast<std::size_t>(after[run] * width);
+      adam_range(job, column, from, to);
     }
   }
 }

@@ -2,8 +2,8 @@
 //
 // SSIM as usual: 11x11 Gaussian window of sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2. The window is
 // separable: rows are blurred into a ring of eleven, which is then blurred across. The first sweep leaves the
-// derivatives of SSIM with respect to the three blurred quantities that depend on x (mean, E[x^2 + y^2], E[x y]); the second
-// blurs those once more and assembles the gradient.
+// derivatives of SSIM with respect to the three blurred quantities that depend on x (mean, E[x^2 + y^2], E[x y]); the
+// second blurs those once more and assembles the gradient.
 #pragma once
 
 #include "kernels.h"
