@@ -102,7 +102,7 @@ def one_step(model: SceneModel, view: View, target: Target, stats: DensifyStats,
     with clock.part("backward"):
         loss.backward()
     with clock.part("adam"):
-        model.table.adam_step(step, RATES, fused.adam, render.trace.visible)
+        model.table.adam_step(step, RATES, fused.adam_columns, render.trace.visible)
         model.table.clear_gradients()
     with clock.part("statistics"):
         stats.observe(render.trace, view.camera.width, view.camera.height)

@@ -16,7 +16,7 @@ from torch import Tensor
 from mudg import native
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.core import fused, losses
-from mudg.core.table import torch_adam
+from mudg.core.table import AdamColumn, torch_adam
 
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
 
@@ -285,6 +285,26 @@ def test_adam_moves_every_element_alike_wherever_it_lies(pool: Any) -> None:
     fused.adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4, visible)
     for dense, sparse in zip(values, rows):
         assert (sparse[visible] == dense[0]).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 1.0])
+def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str, share: float) -> None:
+    """Bit for bit; narrow and wide columns; invisible rows are not looked at."""
+    generator = torch.Generator().manual_seed(2)
+    rows, visible = 1037, torch.rand(1037, generator=generator) < share
+    shapes = [(rows,), (rows, 3), (rows, 4), (rows, 15, 3), (rows, 16), (rows, 17)]
+    together = [[torch.rand(shape, generator=generator) for _ in range(4)] for shape in shapes]
+    for values in together:
+        values[1][~visible] = float("nan")
+    alone = [[t[visible].clone() for t in values] for values in together]
+    before = [[t.clone() for t in values] for values in together]
+    fused.adam_columns([AdamColumn(*values, rate=0.1 * i) for i, values in enumerate(together, 1)], 3, visible)
+    for i, values in enumerate(alone, 1):
+        fused.adam(values[0], values[1], values[2], values[3], 0.1 * i, 3)
+    for values, expected, old in zip(together, alone, before):
+        for k in (0, 2, 3):
+            assert torch.equal(values[k][visible], expected[k])
+            assert torch.equal(values[k][~visible], old[k][~visible])
 
 
 @needs_native

@@ -15,7 +15,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
 from mudg.core.edit import without_tracks
-from mudg.core.table import Table, torch_adam
+from mudg.core.raster_request import harmonics
+from mudg.core.table import Table, torch_adam_columns
 from mudg.models import nodes
 from mudg.models.nodes import RigidNode, SceneModel, SkyNode, StaticNode, compose
 
@@ -173,16 +174,18 @@ def test_composed_rotations_turn_the_axes_with_the_box():
 
 def test_colour_bands():
     scene = model(degree=2)
-    assert compose(scene, 0.3).sh.shape == (12, 9, 3)
-    assert torch.equal(compose(scene, 0.3, sh_degree=1).sh[:, 1:], scene.table["sh_rest"][:, :3])
-    assert compose(scene, 0.3, sh_degree=0).sh.shape == (12, 1, 3)
+    full, lowest = compose(scene, 0.3), compose(scene, 0.3, sh_degree=0)
+    assert torch.equal(harmonics(full), torch.cat([scene.table["sh_dc"], scene.table["sh_rest"]], 1))
+    assert torch.equal(harmonics(compose(scene, 0.3, sh_degree=1))[:, 1:], scene.table["sh_rest"][:, :3])
+    assert lowest.sh.shape == (12, 1, 3)
+    assert lowest.sh_rest is None
     assert compose(scene, 0.3, semantics=False).extra is None
 
 
 def test_gradients_reach_every_column_of_present_rows():
     scene = model(degree=1)
     g = compose(scene, 0.3)
-    sum(x.square().sum() for x in (g.means, g.quats, g.scales, g.opacity, g.sh, g.extra)).backward()
+    sum(x.square().sum() for x in (g.means, g.quats, g.scales, g.opacity, g.sh, g.sh_rest, g.extra)).backward()
     for name, gradient in scene.table.gradients().items():
         assert (gradient[:9].flatten(1).abs().sum(1) if gradient.ndim > 1 else gradient[:9].abs()).min() > 0, name
     assert set(scene.table.gradients()) == set(scene.table.columns)
@@ -340,7 +343,7 @@ def test_adam_kernel_equals_torch_optim():
     for step in range(1, 6):
         gradient = torch.randn(20, 3, generator=g)
         table["x"].grad, reference.grad = gradient.clone(), gradient.clone()
-        table.adam_step(step, {"x": 0.02}, torch_adam)
+        table.adam_step(step, {"x": 0.02}, torch_adam_columns)
         optimiser.step()
     assert torch.allclose(table["x"], reference, atol=1e-6)
 
@@ -351,7 +354,7 @@ def test_sparse_adam_leaves_unseen_rows_alone():
     before = {name: value.clone() for name, value in before.items()}
     for value in table.columns.values():
         value.grad = torch.ones_like(value)
-    table.adam_step(1, {"a": 0.1, "b": 0.1}, torch_adam, visible=torch.tensor([True, False, True, False]))
+    table.adam_step(1, {"a": 0.1, "b": 0.1}, torch_adam_columns, visible=torch.tensor([True, False, True, False]))
     for name, value in table.state().items():
         same = (value == before[name]).reshape(4, -1).all(1).tolist()
         assert same[1], name

@@ -271,6 +271,36 @@ def test_results_do_not_depend_on_the_number_of_threads(restore_threads: None) -
             assert torch.equal(mine, theirs)
 
 
+@needs_native
+def test_the_parallel_depth_sort_is_stable(restore_threads: None) -> None:
+    """Enough Gaussians for several parts of the sort, many at equal depth: one picture for any number of threads."""
+    p, view = _parameters(60_000, channels=1), _axis_view(96, 80)
+    p["scales"] *= 0.1
+    p["means"][:, 2] = p["means"][:, 2].round()
+    drawn = []
+    for threads in (1, 2, 3, 9):
+        native.set_threads(threads)
+        drawn.append(rasterize(_gaussians(p), view, CPU))
+    assert len(torch.unique(p["means"][drawn[0].trace.visible, 2])) < 50 < int(drawn[0].trace.visible.sum())
+    for other in drawn[1:]:
+        assert torch.equal(drawn[0].rgb, other.rgb)
+        assert torch.equal(drawn[0].depth, other.depth)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_in_two_tensors_give_the_same_picture_and_gradients(config: RasterConfig, degree: int) -> None:
+    p, view = _parameters(300, degree=degree), _view()
+    joined, parted = _leaves(p), _leaves(p)
+    first, rest = (t.detach().clone().requires_grad_() for t in (p["sh"][:, :1], p["sh"][:, 1:]))
+    one = rasterize(_gaussians(joined), view, config)
+    two = rasterize(replace(_gaussians(parted), sh=first, sh_rest=rest), view, config)
+    for drawn in (one, two):
+        (drawn.rgb.square().sum() + drawn.depth.sum()).backward()
+    assert torch.equal(one.rgb, two.rgb)
+    assert torch.equal(joined["sh"].grad, torch.cat([first.grad, rest.grad], 1))
+    assert torch.equal(joined["means"].grad, parted["means"].grad)
+
+
 def test_the_order_of_the_gaussians_does_not_matter(config: RasterConfig) -> None:
     p, view = _parameters(300), _view()
     order = torch.randperm(300, generator=torch.Generator().manual_seed(1))

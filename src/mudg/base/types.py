@@ -472,6 +472,8 @@ class Gaussians:
     Args:
         means: f32[N, 3] metres. quats: f32[N, 4] (w, x, y, z), need not be normalised. scales: f32[N, 3] metres.
         opacity: f32[N]. sh: f32[N, K, 3] spherical harmonics, K = (degree + 1)^2.
+        sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a tensor of their own (``sh`` is then
+            f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms without a copy.
         extra: f32[N, C] feature channels rendered like colours, or None. node: i32[N] index of the scene node.
     """
 
@@ -482,6 +484,7 @@ class Gaussians:
     sh: Tensor
     extra: Tensor | None
     node: Tensor
+    sh_rest: Tensor | None = None
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -489,7 +492,9 @@ class Gaussians:
         _check_tensor(self.quats, "gaussians.quats", (n, 4))
         _check_tensor(self.scales, "gaussians.scales", (n, 3))
         _check_tensor(self.opacity, "gaussians.opacity", (n,))
-        _check_tensor(self.sh, "gaussians.sh", (n, None, 3))
+        _check_tensor(self.sh, "gaussians.sh", (n, None if self.sh_rest is None else 1, 3))
+        if self.sh_rest is not None:
+            _check_tensor(self.sh_rest, "gaussians.sh_rest", (n, None, 3))
         if self.extra is not None:
             _check_tensor(self.extra, "gaussians.extra", (n, None))
         _check_tensor(self.node, "gaussians.node", (n,))

@@ -1,12 +1,13 @@
 """Training steps that touch much memory, done in one native pass: the photometric loss with its gradient, and Adam.
 
-Both have a plain-torch twin (``core.losses.photometric``, ``core.table.torch_adam``), which is used, and named once, where
+Both have a plain-torch twin (``core.losses.photometric``, ``core.table.torch_adam_columns``), which is used, and named once, where
 the native library is missing or the tensors are not float32 on the CPU.
 """
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.core import losses
-from mudg.core.table import BETA1, BETA2, EPSILON, torch_adam
+from mudg.core.table import BETA1, BETA2, EPSILON, AdamColumn, torch_adam_columns
 
 
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
@@ -55,34 +56,68 @@ def adam(
         InputError: shapes differ, or ``visible`` is not bool[N].
         UsageError: ``step`` below 1.
     """
-    tensors = (parameter, gradient, moment1, moment2)
-    if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0:
-        raise InputError("adam: parameter, gradient and moments must share one shape [N, ...]",
-                         got=str([tuple(t.shape) for t in tensors]))  # fmt: skip
-    if visible is not None and (visible.shape != parameter.shape[:1] or visible.dtype != torch.bool):
-        raise InputError("adam: visible must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
-                         got=f"{visible.dtype}{list(visible.shape)}")  # fmt: skip
+    adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, visible)
+
+
+def adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | None = None) -> None:
+    """``adam`` on several columns with the same rows in one pass (the kernel of ``Table.adam_step``).
+
+    Args:
+        columns: any number, N rows each; contiguous for the native path.
+        visible: bool[N]: only these rows move, parameters and moments; None = all.
+
+    Raises:
+        InputError: shapes differ, or ``visible`` is not bool[N].
+        UsageError: ``step`` below 1.
+    """
     if step < 1:
         raise UsageError("Adam steps count from 1", got=str(step))
+    if not columns:
+        return
+    for one in columns:
+        _check_column(one, columns[0].parameter, visible)
+    tensors = tuple(t for one in columns for t in (one.parameter, one.gradient, one.moment1, one.moment2))
+    in_place = tuple(t for one in columns for t in (one.parameter, one.moment1, one.moment2))
     library = _library_for(tensors)
-    in_place = (parameter, moment1, moment2)
     if library is None or not all(t.is_contiguous() for t in in_place):
         with torch.no_grad():
-            torch_adam(parameter, gradient, moment1, moment2, rate, step, visible)
+            torch_adam_columns(columns, step, visible)
         return
-    rows = parameter.shape[0]
-    columns = parameter.numel() // rows if rows else 0
-    source = gradient.detach().contiguous()
+    rows = columns[0].parameter.shape[0]
+    gradients = [one.gradient.detach().contiguous() for one in columns]
+    table = (_Column * len(columns))(*(
+        _Column(one.parameter.data_ptr(), gradient.data_ptr(), one.moment1.data_ptr(), one.moment2.data_ptr(),
+                one.parameter.numel() // rows if rows else 0, one.rate)
+        for one, gradient in zip(columns, gradients, strict=True)
+    ))  # fmt: skip
     mask = None if visible is None else visible.contiguous()
-    pointer, integer, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    real, integer = ctypes.c_double, ctypes.c_int64
     library.mudg_adam(
-        pointer(parameter.data_ptr()), pointer(source.data_ptr()), pointer(moment1.data_ptr()),
-        pointer(moment2.data_ptr()), integer(rows), integer(columns),
-        pointer(None if mask is None else mask.data_ptr()), real(rate), real(BETA1), real(BETA2), real(EPSILON),
-        integer(step),
+        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None if mask is None else mask.data_ptr()),
+        real(BETA1), real(BETA2), real(EPSILON), integer(step),
     )  # fmt: skip
     # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
     torch.autograd.graph.increment_version(in_place)
+
+
+class _Column(ctypes.Structure):
+    """Mirror of AdamColumn in native/kernels.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("parameter", "gradient", "moment1", "moment2")),
+        ("width", ctypes.c_int64), ("rate", ctypes.c_double), ("step_size", ctypes.c_float),
+    ]  # fmt: skip
+
+
+def _check_column(column: AdamColumn, first: Tensor, visible: Tensor | None) -> None:
+    parameter = column.parameter
+    tensors = (parameter, column.gradient, column.moment1, column.moment2)
+    if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0 or parameter.shape[0] != first.shape[0]:
+        raise InputError("adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
+                         got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
+    if visible is not None and (visible.shape != parameter.shape[:1] or visible.dtype != torch.bool):
+        raise InputError("adam: visible must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
+                         got=f"{visible.dtype}{list(visible.shape)}")  # fmt: skip
 
 
 class _Photometric(torch.autograd.Function):
@@ -104,7 +139,8 @@ class _Photometric(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient * upstream, None, None, None
+        # The usual case, a loss term of weight 1, needs no copy.
+        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None
 
 
 def _library_for(tensors: tuple[Tensor, ...]) -> ctypes.CDLL | None:

@@ -87,7 +87,7 @@ def rasterize(
     """Draw Gaussians into a view, or into several at once; everything returned is differentiable.
 
     Args:
-        gaussians: activated parameters; gradients flow to means, quats, scales, opacity, sh and extra.
+        gaussians: activated parameters; gradients flow to means, quats, scales, opacity, sh (sh_rest), extra.
         view: the camera, and the pose unless ``world_from_cam`` is given. A sequence of V views (one image size, any
             cameras and poses) gives every result a leading dimension V; gradients are summed over the views.
         config: see ``RasterConfig``.
@@ -158,14 +158,16 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
 
 def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     """Check what the dataclass does not; return the harmonics' degree."""
-    coefficients = gaussians.sh.shape[1]
+    coefficients = gaussians.sh.shape[1] + (0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1])
     allowed = math.isqrt(coefficients) - 1
     degree = allowed if config.sh_degree is None else config.sh_degree
     if not 0 <= degree <= min(allowed, MAX_SH_DEGREE):
         raise InputError("spherical harmonics do not have enough coefficients for their degree", where="gaussians.sh",
-                         expected=f"[N, {(max(degree, 0) + 1) ** 2}, 3]", got=str(list(gaussians.sh.shape)))  # fmt: skip
+                         expected=f"[N, {(max(degree, 0) + 1) ** 2}, 3]", got=f"[{len(gaussians)}, {coefficients}, 3]")  # fmt: skip
     parts = {"means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales,
              "opacity": gaussians.opacity, "sh": gaussians.sh}  # fmt: skip
+    if gaussians.sh_rest is not None:
+        parts["sh_rest"] = gaussians.sh_rest
     if gaussians.extra is not None:
         parts["extra"] = gaussians.extra
         if gaussians.extra.shape[1] > MAX_EXTRA_CHANNELS:

@@ -34,7 +34,7 @@ class _Scene(ctypes.Structure):
                                   "antialias", "want_abs_gradient")),
         *((name, _F) for name in ("near_m", "far_m", "blur_px2", "alpha_max", "fx", "fy", "cx", "cy")),
         ("rotation", _F * 9), ("center_high", _F * 3), ("center_low", _F * 3), ("background", _F * 3),
-        *((name, _P) for name in ("means", "quats", "scales", "opacities", "sh", "extra")),
+        *((name, _P) for name in ("means", "quats", "scales", "opacities", "sh", "extra", "sh_rest")),
     ]  # fmt: skip
 
 
@@ -48,7 +48,7 @@ class _ImageGradient(ctypes.Structure):
 
 class _Gradient(ctypes.Structure):
     _fields_ = [
-        *((name, _P) for name in ("means", "quats", "scales", "opacities", "sh", "extra", "means2d", "abs_means2d")),
+        *((name, _P) for name in ("means", "quats", "scales", "opacities", "sh", "extra", "means2d", "abs_means2d", "sh_rest")),
         ("rotation", _F * 9), ("center", _F * 3), ("background", _F * 3),
     ]  # fmt: skip
 
@@ -145,7 +145,8 @@ def render(request: Request) -> Render:
     if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
         raise InputError("the native rasteriser works on float32 CPU tensors", where="gaussians.means",
                          expected="torch.float32 on cpu", got=f"{gaussians.means.dtype} on {gaussians.means.device}")  # fmt: skip
-    parts = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacity, gaussians.sh, gaussians.extra)
+    parts = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacity, gaussians.sh, gaussians.extra,
+             gaussians.sh_rest)  # fmt: skip
     tensors = (*parts, *request.backgrounds, *request.poses)
     keeps_graph = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     means2d, leaves = trace_leaves(request, gaussians.means, keeps_graph)
@@ -165,7 +166,8 @@ def _draw(request: Request, index: int, means2d: Tensor, abs_grad2d: Tensor | No
         keeps_graph=keeps_graph, radii=torch.empty(len(g), 2, dtype=torch.int32), abs_grad2d=abs_grad2d,
     )  # fmt: skip
     rgb, depth, alpha, extra = _Rasterize.apply(
-        g.means, g.quats, g.scales, g.opacity, g.sh, g.extra, request.backgrounds[index], request.pose(index), means2d, call
+        g.means, g.quats, g.scales, g.opacity, g.sh, g.extra, g.sh_rest, request.backgrounds[index],
+        request.pose(index), means2d, call,
     )
     return Drawn(rgb, depth, alpha, None if g.extra is None else extra, call.radii)
 
@@ -186,10 +188,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacity: Tensor, sh: Tensor, extra: Tensor | None,
-        background: Tensor | None, world_from_cam: Tensor, means2d: Tensor, call: _Call,
+        sh_rest: Tensor | None, background: Tensor | None, world_from_cam: Tensor, means2d: Tensor, call: _Call,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
         global _last_handle
-        parts = [t.contiguous() if t is not None else None for t in (means, quats, scales, opacity, sh, extra)]
+        parts = [t.contiguous() if t is not None else None for t in (means, quats, scales, opacity, sh, extra, sh_rest)]
         height, width = call.camera.height, call.camera.width
         channels = 0 if extra is None else extra.shape[1]
         rgb, depth, alpha = torch.empty(3, height, width), torch.empty(1, height, width), torch.empty(1, height, width)
@@ -218,18 +220,20 @@ class _Rasterize(torch.autograd.Function):
         count = parts[0].shape[0]
         upstream = [None if g is None else g.contiguous() for g in (of_rgb, of_depth, of_alpha, of_extra)]
         out = [_recycled_like(t) for t in parts[:4]]
-        out += [_recycled_like(t) if t is not None and needed else None for t, needed in zip(parts[4:], needs[4:6])]
+        colors = needs[4] or needs[6]  # harmonics in two tensors are written together
+        asked = (colors, needs[5], colors)
+        out += [_recycled_like(t) if t is not None and needed else None for t, needed in zip(parts[4:], asked, strict=True)]
         of_means2d = torch.empty(count, 2)
         absolute = None if call.abs_grad2d is None else torch.empty(count, 2)
-        gradient = _Gradient(*(_at(t) for t in (*out, of_means2d, absolute)))
+        gradient = _Gradient(*(_at(t) for t in (*out[:6], of_means2d, absolute, out[6])))
         image = _ImageGradient(*(_at(g) for g in upstream))
         status = call.library.mudg_raster_backward(ctx.context.handle, ctypes.byref(image), ctypes.byref(gradient))
         if status != 0:
             _raise(status, ctx.context, parts)
         if absolute is not None and call.abs_grad2d is not None:
             call.abs_grad2d.add_(absolute)
-        of_background = torch.tensor(list(gradient.background), dtype=ctx.background_type) if needs[6] else None
-        of_pose = _pose_gradient(gradient, ctx.pose_type) if needs[7] else None
+        of_background = torch.tensor(list(gradient.background), dtype=ctx.background_type) if needs[7] else None
+        of_pose = _pose_gradient(gradient, ctx.pose_type) if needs[8] else None
         wanted = [g if needed else None for g, needed in zip(out, needs)]
         return (*wanted, of_background, of_pose, of_means2d, None)
 
@@ -243,7 +247,7 @@ def _pose_gradient(gradient: _Gradient, dtype: torch.dtype) -> Tensor:
 
 
 def _scene(parts: list[Tensor | None], background: Tensor | None, world_from_cam: Tensor, call: _Call) -> _Scene:
-    means, _, _, _, sh, extra = parts
+    means, _, _, _, sh, extra, sh_rest = parts
     config, camera = call.config, call.camera
     if means is None or sh is None:
         raise InputError("means and sh are needed")
@@ -255,7 +259,8 @@ def _scene(parts: list[Tensor | None], background: Tensor | None, world_from_cam
     low = (center - high.double()).float()
     color = [0.0] * 3 if background is None else background.detach().float().tolist()
     return _Scene(
-        means.shape[0], camera.width, camera.height, 0 if extra is None else extra.shape[1], sh.shape[1], call.sh_degree,
+        means.shape[0], camera.width, camera.height, 0 if extra is None else extra.shape[1],
+        sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1]), call.sh_degree,
         int(config.antialias), int(call.abs_grad2d is not None), config.near_m, config.far_m, config.blur_px2,
         config.alpha_max, camera.fx, camera.fy, camera.cx, camera.cy, (_F * 9)(*pose[:3, :3].T.flatten().tolist()),
         (_F * 3)(*high.tolist()), (_F * 3)(*low.tolist()), (_F * 3)(*color), *(_at(t) for t in parts),
@@ -266,7 +271,7 @@ def _raise(status: int, context: _Context, parts: list[Tensor | None] | tuple[Te
     if status == 3:
         found = _statistics(context.library, context.handle)
         row = int(found["first_not_finite"])
-        names = ("means", "quats", "scales", "opacity", "sh", "extra")
+        names = ("means", "quats", "scales", "opacity", "sh", "extra", "sh_rest")
         bad = [n for n, t in zip(names, parts, strict=True) if t is not None and not torch.isfinite(t[row]).all()]
         raise NumericsError(
             "a Gaussian is not finite", where=f"Gaussian {row}: {', '.join(bad) or 'its colour overflows'}",

@@ -19,7 +19,7 @@ from torch import Tensor
 from mudg.base import log
 from mudg.base.errors import NumericsError, ResourceError
 from mudg.base.types import RasterTrace, Render
-from mudg.core.raster_request import Request
+from mudg.core.raster_request import Request, harmonics
 
 MINIMUM_VERSION: Final = (1, 5, 3)
 ALPHA_MAX: Final = 0.999
@@ -51,8 +51,9 @@ def render(request: Request, module: ModuleType | None = None) -> Render:
     last_row = poses.new_tensor([0, 0, 0, 1.0]).expand(len(poses), 1, 4)
     cam_from_world = torch.cat([torch.cat([rotation, -rotation @ center[:, :, None]], 2), last_row], 1)
     directions = torch.nn.functional.normalize(g.means - center[:, None], dim=2)
-    harmonics = g.sh.expand(len(poses), *g.sh.shape)
-    rgb = (gsplat.spherical_harmonics(request.sh_degree, directions, harmonics) + 0.5).clamp_min(0)
+    sh = harmonics(g)
+    sh_per_view = sh.expand(len(poses), *sh.shape)
+    rgb = (gsplat.spherical_harmonics(request.sh_degree, directions, sh_per_view) + 0.5).clamp_min(0)
     colors = rgb if g.extra is None else torch.cat([rgb, g.extra.expand(len(poses), *g.extra.shape)], 2)
     intrinsics = torch.stack([torch.from_numpy(view.camera.matrix) for view in request.views]).to(g.means)
     image, alpha, meta = gsplat.rasterization(

@@ -52,6 +52,11 @@ class Drawn:
     radii: Tensor
 
 
+def harmonics(gaussians: Gaussians) -> Tensor:
+    """All spherical harmonics in one tensor, [N, K, 3]; a copy if they are kept in two."""
+    return gaussians.sh if gaussians.sh_rest is None else torch.cat([gaussians.sh, gaussians.sh_rest], 1)
+
+
 def trace_leaves(request: Request, like: Tensor, requires_grad: bool) -> tuple[Tensor, tuple[Tensor, ...]]:
     """The leaf ``means2d`` of the trace ([N, 2], or [V, N, 2] for a batch), and the part of it that belongs to each view."""
     count, views = len(request.gaussians), len(request.views)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mudg.base.errors import NumericsError
 from mudg.base.types import Camera, Gaussians, Render
-from mudg.core.raster_request import Drawn, Request, joined, trace_leaves
+from mudg.core.raster_request import Drawn, Request, harmonics, joined, trace_leaves
 
 if TYPE_CHECKING:
     from mudg.core.raster import RasterConfig
@@ -62,7 +62,8 @@ def _draw(request: Request, index: int, probe: Tensor, absolute: Tensor | None) 
     g, camera, config = request.gaussians, request.views[index].camera, request.config
     pose, background = request.pose(index).to(g.means), request.backgrounds[index]
     splats = project(g, pose, camera, config)
-    colors = sh_colors(g.sh, g.means - pose[:3, 3], request.sh_degree)
+    sh = harmonics(g)
+    colors = sh_colors(sh, g.means - pose[:3, 3], request.sh_degree)
     size = (camera.width, camera.height)
     with torch.no_grad():
         touched = (splats.depth < config.far_m) & (splats.opacity >= ALPHA_MIN)
@@ -73,7 +74,7 @@ def _draw(request: Request, index: int, probe: Tensor, absolute: Tensor | None) 
         order = order[torch.argsort(splats.depth[order], stable=True)]
         radii = torch.where(touched[:, None], splats.extents.clamp(0, 1e9).ceil().clamp_min(1), 0).int()
     channels = torch.cat([colors, splats.depth[:, None], *([] if g.extra is None else [g.extra])], 1)[order]
-    if not (torch.isfinite(channels).all() and torch.isfinite(g.sh[order]).all()):
+    if not (torch.isfinite(channels).all() and torch.isfinite(sh[order]).all()):
         raise NumericsError("the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra")
     blended, alpha = _blend_tiles(splats, probe, order, channels, absolute, size, config.alpha_max)
     rgb, depth_sum, extra = blended[:3], blended[3:4], blended[4:]

@@ -6,15 +6,28 @@ row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from mudg.base.errors import InputError
 
-AdamKernel = Callable[[Tensor, Tensor, Tensor, Tensor, float, int, Tensor | None], None]
-"""(parameter, gradient, moment1, moment2, rate, step from 1, visible rows or None): update in place."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdamColumn:
+    """One column of a step of Adam: four tensors of one shape [N, ...] (all but ``gradient`` are updated) and the learning rate."""
+
+    parameter: Tensor
+    gradient: Tensor
+    moment1: Tensor
+    moment2: Tensor
+    rate: float
+
+
+AdamKernel = Callable[[Sequence[AdamColumn], int, Tensor | None], None]
+"""(columns with the same rows, step from 1, visible rows or None): update in place."""
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -101,12 +114,14 @@ class Table:
         Args:
             step: number of this step, from 1 (bias correction).
             rates: learning rate per column; a column that is not named stays as it is.
-            kernel: ``torch_adam`` or the native one.
+            kernel: ``torch_adam_columns`` or ``fused.adam_columns``.
             visible: bool[N]: update these rows only, parameters and moments (others wait); None = all.
         """
-        for name, value in self.columns.items():
-            if value.grad is not None and rates.get(name, 0.0) > 0:
-                kernel(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name], step, visible)
+        kernel(
+            [AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
+             for name, value in self.columns.items() if value.grad is not None and rates.get(name, 0.0) > 0],
+            step, visible,
+        )  # fmt: skip
 
     # -- state ------------------------------------------------------------------------------------------------------
 
@@ -135,10 +150,16 @@ class Table:
         return table
 
 
+def torch_adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | None = None) -> None:
+    """``torch_adam`` on each column; the plain-torch kernel of ``Table.adam_step``."""
+    for one in columns:
+        torch_adam(one.parameter, one.gradient, one.moment1, one.moment2, one.rate, step, visible)
+
+
 def torch_adam(
     parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int, visible: Tensor | None
 ) -> None:
-    """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place; the plain-torch kernel of ``adam_step``."""
+    """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place, on one column."""
     if visible is not None:
         rows = visible.nonzero()[:, 0]
         p, m, v = parameter[rows], moment1[rows], moment2[rows]

@@ -84,7 +84,8 @@ class DensifyStats:
             raise ValueError("the render was made without absolute gradients")
         half_size = torch.tensor([width / 2, height / 2])
         visible = trace.visible
-        self.gradient += torch.linalg.vector_norm(trace.abs_grad2d * half_size, dim=1) * visible
+        length = torch.view_as_complex(trace.abs_grad2d * half_size).abs()  # far faster than a norm over rows of two
+        self.gradient += length * visible
         self.seen += visible
 
     def state(self) -> dict[str, Tensor]:

@@ -386,15 +386,13 @@ def compose(model: SceneModel, time_s: float, sh_degree: int | None = None, sema
     if 0.0 in present:
         gate = torch.tensor(present, dtype=opacity.dtype).repeat_interleave(torch.tensor(counts))
         opacity = opacity * gate
-    sh = table["sh_dc"]
-    if degree > 0:
-        sh = torch.cat([sh, table["sh_rest"][:, : (degree + 1) ** 2 - 1]], 1)
     return Gaussians(
         means=torch.cat(means) if len(means) > 1 else means[0],
         quats=torch.cat(quats) if len(quats) > 1 else quats[0],
         scales=torch.exp(table["log_scales"]),
         opacity=opacity,
-        sh=sh,
+        sh=table["sh_dc"],
+        sh_rest=table["sh_rest"][:, : (degree + 1) ** 2 - 1] if degree > 0 else None,
         extra=table["semantics"] if semantics and model.classes else None,
         node=table.labels["node"],
     )

@@ -1,4 +1,4 @@
-// One step of Adam (Kingma & Ba 2015) over an array, or over the visible rows of a table.
+// One step of Adam (Kingma & Ba 2015) over the columns of a table, or over its visible rows.
 #pragma once
 
 #include "kernels.h"
@@ -10,60 +10,119 @@ namespace {
 // Moments below this are set to zero: they have no effect, and arithmetic on denormal numbers is slow.
 constexpr float kTinyMoment = 1e-37f;
 
+constexpr int kAdamBlock = 256;           // rows whose runs of visible ones are noted at a time
+constexpr std::int64_t kAdamNarrow = 16;  // columns up to this width are gone through in whole vectors
+constexpr std::size_t kAdamGrain = 16384;  // elements per piece of work
+
 struct AdamLanes {
   Floats parameter, moment1, moment2;
 };
-MUDG_INLINE AdamLanes adam_lanes(const AdamJob& job, Floats parameter, Floats gradient, Floats moment1,
-                                 Floats moment2) {
+MUDG_INLINE AdamLanes adam_lanes(const AdamJob& job, Floats step_size, Floats parameter, Floats gradient,
+                                 Floats moment1, Floats moment2) {
   const Floats tiny = splat(kTinyMoment);
   moment1 = mul_add(splat(1.0f - job.beta1), gradient - moment1, moment1);
   moment2 = mul_add(splat(1.0f - job.beta2), gradient * gradient, splat(job.beta2) * moment2);
   moment1 = keep(abs_of(moment1) >= tiny, moment1);
   moment2 = keep(moment2 >= tiny, moment2);
   const Floats root = mul_add(sqrt_of(moment2), splat(job.inv_root_bias2), splat(job.epsilon));
-  return {parameter - splat(job.step_size) * moment1 / root, moment1, moment2};
+  return {parameter - step_size * moment1 / root, moment1, moment2};
 }
 
-MUDG_INLINE void adam_range(const AdamJob& job, std::size_t begin, std::size_t end) {
+MUDG_INLINE void adam_range(const AdamJob& job, const AdamColumn& column, std::size_t begin, std::size_t end) {
+  const Floats step_size = splat(column.step_size);
+  float *parameter = column.parameter, *moment1 = column.moment1, *moment2 = column.moment2;
   std::size_t i = begin;
   for (; i + kLanes <= end; i += kLanes) {
-    const AdamLanes next = adam_lanes(job, load_unaligned(job.parameter + i), load_unaligned(job.gradient + i),
-                                      load_unaligned(job.moment1 + i), load_unaligned(job.moment2 + i));
-    store_unaligned(job.parameter + i, next.parameter);
-    store_unaligned(job.moment1 + i, next.moment1);
-    store_unaligned(job.moment2 + i, next.moment2);
+    const Floats gradient = load_unaligned(column.gradient + i);
+    const AdamLanes next = adam_lanes(job, step_size, load_unaligned(parameter + i), gradient,
+                                      load_unaligned(moment1 + i), load_unaligned(moment2 + i));
+    store_unaligned(parameter + i, next.parameter);
+    store_unaligned(moment1 + i, next.moment1);
+    store_unaligned(moment2 + i, next.moment2);
   }
   if (i == end) return;
-  const std::size_t bytes =
-      (end - i) * sizeof(float);  // the rest through copies, so that every element sees the same arithmetic
-  alignas(64) float p[kLanes] = {}, g[kLanes] = {}, m[kLanes] = {}, v[kLanes] = {};
-  std::memcpy(p, job.parameter + i, bytes);
-  std::memcpy(g, job.gradient + i, bytes);
-  std::memcpy(m, job.moment1 + i, bytes);
-  std::memcpy(v, job.moment2 + i, bytes);
-  const AdamLanes next = adam_lanes(job, load(p), load(g), load(m), load(v));
-  store(p, next.parameter);
-  store(m, next.moment1);
-  store(v, next.moment2);
-  std::memcpy(job.parameter + i, p, bytes);
-  std::memcpy(job.moment1 + i, m, bytes);
-  std::memcpy(job.moment2 + i, v, bytes);
+  const int left = static_cast<int>(end - i);
+  const Floats gradient = load_first(column.gradient + i, left);
+  const AdamLanes next = adam_lanes(job, step_size, load_first(parameter + i, left), gradient,
+                                    load_first(moment1 + i, left), load_first(moment2 + i, left));
+  store_first(parameter + i, left, next.parameter);
+  store_first(moment1 + i, left, next.moment1);
+  store_first(moment2 + i, left, next.moment2);
 }
 
-void adam(const AdamJob& job) {
-  const std::size_t columns = job.columns;
-  const std::int64_t grain = static_cast<std::int64_t>(larger<std::size_t>(1, 16384 / columns));
-  parallel_for(job.rows, grain, [&](std::int64_t begin, std::int64_t end, int) {
-    if (job.visible == nullptr) return adam_range(job, begin * columns, end * columns);
+// The rows [begin, end) of a narrow column, of which some are visible: whole vectors in which the lanes of the other
+// rows keep their values. Runs of few elements, one after the other, would each wait for the store before.
+MUDG_INLINE void adam_narrow(const AdamJob& job, const AdamColumn& column, std::int64_t begin, std::int64_t end) {
+  alignas(64) float shown[kAdamBlock * kAdamNarrow + kLanes];
+  const std::size_t width = static_cast<std::size_t>(column.width);
+  for (std::int64_t row = begin; row < end; ++row)
+    store_unaligned(shown + static_cast<std::size_t>(row - begin) * width, splat(job.visible[row] ? 1.0f : 0.0f));
+  const Floats step_size = splat(column.step_size), half = splat(0.5f);
+  const std::size_t start = static_cast<std::size_t>(begin) * width;
+  const std::size_t count = static_cast<std::size_t>(end - begin) * width;
+  for (std::size_t i = 0; i < count; i += kLanes) {
+    const Mask moves = load(shown + i) > half;
+    if (bits(moves) == 0) continue;
+    float *parameter = column.parameter + start + i, *moment1 = column.moment1 + start + i;
+    float* moment2 = column.moment2 + start + i;
+    const float* gradient = column.gradient + start + i;
+    if (i + kLanes <= count) {
+      const Floats p = load_unaligned(parameter), m = load_unaligned(moment1), v = load_unaligned(moment2);
+      const AdamLanes next = adam_lanes(job, step_size, p, load_unaligned(gradient), m, v);
+      store_unaligned(parameter, select(moves, next.parameter, p));
+      store_unaligned(moment1, select(moves, next.moment1, m));
+      store_unaligned(moment2, select(moves, next.moment2, v));
+    } else {
+      const int left = static_cast<int>(count - i);
+      const Floats p = load_first(parameter, left), m = load_first(moment1, left), v = load_first(moment2, left);
+      const AdamLanes next = adam_lanes(job, step_size, p, load_first(gradient, left), m, v);
+      store_first(parameter, left, select(moves, next.parameter, p));
+      store_first(moment1, left, select(moves, next.moment1, m));
+      store_first(moment2, left, select(moves, next.moment2, v));
+    }
+  }
+}
+
+// All columns of a few rows: the runs of visible rows are looked for once, not once per column.
+MUDG_INLINE void adam_block(const AdamJob& job, std::int64_t begin, std::int64_t end) {
+  std::int64_t first[kAdamBlock / 2 + 1], after[kAdamBlock / 2 + 1];
+  int runs = 0;
+  if (job.visible == nullptr) {
+    first[0] = begin;
+    after[0] = end;
+    runs = 1;
+  } else {
     for (std::int64_t row = begin; row < end;) {
       if (!job.visible[row]) {
         ++row;
         continue;
       }
-      const std::int64_t first = row;
+      first[runs] = row;
       while (row < end && job.visible[row]) ++row;
-      adam_range(job, first * columns, row * columns);
+      after[runs++] = row;
     }
+  }
+  const bool mixed = runs > 1;
+  for (int c = 0; c < job.column_count; ++c) {
+    const AdamColumn& column = job.columns[c];
+    const std::int64_t width = column.width;
+    if (mixed && width <= kAdamNarrow) {
+      adam_narrow(job, column, begin, end);
+      continue;
+    }
+    for (int run = 0; run < runs; ++run) {
+      const auto from = static_cast<std::size_t>(first[run] * width), to = static_cast<std::size_t>(after[run] * width);
+      adam_range(job, column, from, to);
+    }
+  }
+}
+
+void adam(const AdamJob& job) {
+  std::size_t width = 1;
+  for (int c = 0; c < job.column_count; ++c) width += static_cast<std::size_t>(job.columns[c].width);
+  const std::int64_t grain = static_cast<std::int64_t>(larger<std::size_t>(1, kAdamGrain / width));
+  parallel_for(job.rows, grain, [&](std::int64_t begin, std::int64_t end, int) {
+    for (std::int64_t row = begin; row < end; row += kAdamBlock) adam_block(job, row, smaller(end, row + kAdamBlock));
   });
 }
 

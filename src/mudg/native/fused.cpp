@@ -33,7 +33,7 @@ MUDG_API double mudg_photometric(const float* x, const float* y, int planes, int
   job.padded_width = (width + 15) / 16 * 16;
   job.row_stride = job.padded_width + 2 * mudg::kPhotometricApron;
   job.worker_stride =
-      static_cast<std::size_t>(5) * job.row_stride + static_cast<std::size_t>(55) * job.padded_width + 64;
+      static_cast<std::size_t>(4) * job.row_stride + static_cast<std::size_t>(44) * job.padded_width + 64;
   job.workers = mudg::thread_count();
   const std::size_t strips = static_cast<std::size_t>((height + mudg::kPhotometricStrip - 1) / mudg::kPhotometricStrip);
   const bool ok = scratch.maps.reserve(static_cast<std::size_t>(3) * planes * height * job.row_stride) &&
@@ -46,25 +46,22 @@ MUDG_API double mudg_photometric(const float* x, const float* y, int planes, int
   return mudg::kernels().photometric(job);
 }
 
-// One Adam step in place on a table f32[rows][columns]; visible u8[rows] or null. `step` counts from 1.
-MUDG_API void mudg_adam(float* parameter, const float* gradient, float* moment1, float* moment2, std::int64_t rows,
-                        std::int64_t columns, const std::uint8_t* visible, double rate, double beta1, double beta2,
-                        double epsilon, std::int64_t step) {
+// One Adam step in place on the columns of a table; visible u8[rows] or null. `step` counts from 1.
+MUDG_API void mudg_adam(mudg::AdamColumn* columns, int column_count, std::int64_t rows, const std::uint8_t* visible,
+                        double beta1, double beta2, double epsilon, std::int64_t step) {
+  const double count = static_cast<double>(step);
+  for (int c = 0; c < column_count; ++c)
+    columns[c].step_size = static_cast<float>(columns[c].rate / (1.0 - std::pow(beta1, count)));
   mudg::AdamJob job{};
-  job.parameter = parameter;
-  job.gradient = gradient;
-  job.moment1 = moment1;
-  job.moment2 = moment2;
+  job.columns = columns;
+  job.column_count = column_count;
   job.rows = rows;
-  job.columns = static_cast<std::size_t>(columns);
   job.visible = visible;
   job.beta1 = static_cast<float>(beta1);
   job.beta2 = static_cast<float>(beta2);
   job.epsilon = static_cast<float>(epsilon);
-  const double count = static_cast<double>(step);
-  job.step_size = static_cast<float>(rate / (1.0 - std::pow(beta1, count)));
   job.inv_root_bias2 = static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(beta2, count)));
-  if (rows > 0 && columns > 0) mudg::kernels().adam(job);
+  if (rows > 0) mudg::kernels().adam(job);
 }
 
 }  // extern "C"

@@ -10,7 +10,7 @@ namespace mudg {
 
 // The photometric loss (loss.h) on planar images [planes][height][width].
 constexpr int kPhotometricApron = 16;  // zeros left and right of a row of a derivative map
-constexpr int kPhotometricStrip = 32;  // rows per piece of work
+constexpr int kPhotometricStrip = 48;  // rows per piece of work
 struct PhotometricJob {
   const float *x, *y;
   int planes, height, width;
@@ -25,16 +25,21 @@ struct PhotometricJob {
   double* partial;  // [planes * strips]
 };
 
-// One Adam step (adam.h) on a table [rows][columns].
-struct AdamJob {
+// One Adam step (adam.h) on a table: columns [rows][width] that share their rows. Mirrored in core/fused.py.
+struct AdamColumn {
   float* parameter;
   const float* gradient;
   float *moment1, *moment2;
+  std::int64_t width;
+  double rate;
+  float step_size;  // rate / (1 - beta1^step), filled in by mudg_adam
+};
+struct AdamJob {
+  const AdamColumn* columns;
+  int column_count;
   std::int64_t rows;
-  std::size_t columns;
   const std::uint8_t* visible;  // [rows], null: all
   float beta1, beta2, epsilon;
-  float step_size;       // rate / (1 - beta1^step)
   float inv_root_bias2;  // 1 / sqrt(1 - beta2^step)
 };
 

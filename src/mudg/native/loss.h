@@ -2,8 +2,8 @@
 //
 // SSIM as usual: 11x11 Gaussian window of sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2. The window is
 // separable: rows are blurred into a ring of eleven, which is then blurred across. The first sweep leaves the
-// derivatives of SSIM with respect to the three blurred quantities that depend on x (mean, E[x^2], E[x y]); the second
-// blurs those once more and assembles the gradient.
+// derivatives of SSIM with respect to the three blurred quantities that depend on x (mean, E[x^2 + y^2], E[x y]); the
+// second blurs those once more and assembles the gradient.
 #pragma once
 
 #include "kernels.h"
@@ -49,19 +49,19 @@ struct RowRing {
   }
 };
 
-// Blurs x, y, x^2, y^2, x y of one image row into the ring. `raw` holds five padded rows whose aprons are zero.
+// Blurs x, y, x^2 + y^2, x y of one image row into the ring (SSIM needs the variances' sum only). `raw` holds four
+// padded rows whose aprons are zero.
 MUDG_INLINE void blur_inputs(const PhotometricJob& job, const float* x, const float* y, float* raw,
-                             const RowRing<5>& ring, int at) {
+                             const RowRing<4>& ring, int at) {
   const int padded = job.row_stride;
   float* inside = raw + kPhotometricApron;
   for (int i = 0; i < job.width; ++i) {
     inside[i] = x[i];
     inside[padded + i] = y[i];
-    inside[2 * padded + i] = x[i] * x[i];
-    inside[3 * padded + i] = y[i] * y[i];
-    inside[4 * padded + i] = x[i] * y[i];
+    inside[2 * padded + i] = x[i] * x[i] + y[i] * y[i];
+    inside[3 * padded + i] = x[i] * y[i];
   }
-  for (int q = 0; q < 5; ++q) {
+  for (int q = 0; q < 4; ++q) {
     float* out = ring.row(at, q);
     for (int i = 0; i < ring.width; i += kLanes) store_unaligned(out + i, blur_row(inside + q * padded + i));
   }
@@ -71,13 +71,13 @@ MUDG_INLINE void blur_inputs(const PhotometricJob& job, const float* x, const fl
 struct SsimTerms {
   Floats value, of_mean, of_square, of_product;
 };
-MUDG_INLINE SsimTerms ssim_terms(Floats mean_x, Floats mean_y, Floats square_x, Floats square_y, Floats product) {
+MUDG_INLINE SsimTerms ssim_terms(Floats mean_x, Floats mean_y, Floats squares, Floats product) {
   const Floats two = splat(2.0f), c1 = splat(1e-4f), c2 = splat(9e-4f);
-  const Floats variance_x = square_x - mean_x * mean_x, variance_y = square_y - mean_y * mean_y;
+  const Floats variances = neg_mul_add(mean_x, mean_x, neg_mul_add(mean_y, mean_y, squares));  // of x plus of y
   const Floats covariance = product - mean_x * mean_y;
   const Floats a = mul_add(mean_x * mean_y, two, c1), b = mul_add(covariance, two, c2);
   const Floats inv_c = splat(1.0f) / mul_add(mean_x, mean_x, mul_add(mean_y, mean_y, c1));
-  const Floats inv_d = splat(1.0f) / (variance_x + variance_y + c2);
+  const Floats inv_d = splat(1.0f) / (variances + c2);
   const Floats value = a * b * inv_c * inv_d;
   const Floats of_mean = two * (mean_y * (b - a) * inv_c * inv_d + mean_x * value * (inv_d - inv_c));
   return {value, of_mean, splat(0.0f) - value * inv_d, two * a * inv_c * inv_d};
@@ -86,8 +86,8 @@ MUDG_INLINE SsimTerms ssim_terms(Floats mean_x, Floats mean_y, Floats square_x, 
 // First sweep over a strip of rows of one plane: SSIM and its derivative maps. Returns the sum of SSIM.
 double ssim_strip(const PhotometricJob& job, int plane, int y0, int y1, float* scratch) {
   const std::size_t offset = static_cast<std::size_t>(plane) * job.height;
-  const RowRing<5> ring = {scratch + 5 * job.row_stride, job.padded_width};
-  std::memset(scratch, 0, sizeof(float) * 5 * job.row_stride);
+  const RowRing<4> ring = {scratch + 4 * job.row_stride, job.padded_width};
+  std::memset(scratch, 0, sizeof(float) * 4 * job.row_stride);
   const auto fetch = [&](int y) {
     if (y < 0 || y >= job.height) return ring.clear(y);
     const std::size_t at = (offset + y) * job.width;
@@ -97,8 +97,8 @@ double ssim_strip(const PhotometricJob& job, int plane, int y0, int y1, float* s
   double total = 0.0;
   for (int y = y0; y < y1; ++y) {
     fetch(y + kReach);
-    const float* rows[5][kTaps];
-    for (int q = 0; q < 5; ++q) ring.around(y, q, rows[q]);
+    const float* rows[4][kTaps];
+    for (int q = 0; q < 4; ++q) ring.around(y, q, rows[q]);
     float* maps[3];
     for (int m = 0; m < 3; ++m) {
       maps[m] = job.maps + (static_cast<std::size_t>(m) * job.planes * job.height + offset + y) * job.row_stride;
@@ -108,7 +108,7 @@ double ssim_strip(const PhotometricJob& job, int plane, int y0, int y1, float* s
     Floats sums = splat(0.0f);
     for (int i = 0; i < job.padded_width; i += kLanes) {
       const SsimTerms s = ssim_terms(blur_column(rows[0], i), blur_column(rows[1], i), blur_column(rows[2], i),
-                                     blur_column(rows[3], i), blur_column(rows[4], i));
+                                     blur_column(rows[3], i));
       const Mask inside = first_lanes(job.width - i);
       sums = sums + keep(inside, s.value);
       store_unaligned(maps[0] + kPhotometricApron + i, keep(inside, s.of_mean));

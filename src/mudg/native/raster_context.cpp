@@ -84,7 +84,7 @@ std::size_t RasterContext::bytes() const {
                       clamped.bytes() + entry_worker.bytes() + depth_key.bytes() + entry_offset.bytes() +
                       order.bytes() + sort_key.bytes() + sort_key2.bytes() + sort_order.bytes() + entry_counts.bytes() +
                       first_record.bytes() + tile_start.bytes() + tile_cursor.bytes() + last_item.bytes() +
-                      items.bytes() + camera_parts.bytes();
+                      items.bytes() + camera_parts.bytes() + range_groups.bytes() + sort_counts.bytes();
   for (int worker = 0; worker < kMaxThreads; ++worker) {
     total += tile_counts[worker].bytes() + state.workers[worker].capacity * sizeof(TileEntry);
   }

@@ -28,13 +28,15 @@ struct RasterContext {
   bool prepare(const RasterScene& scene);  // sizes and per-Gaussian memory; false: no memory
   RasterStatus sort_by_depth();            // raster_binning.cpp
   RasterStatus bin_into_tiles();           // raster_binning.cpp
+  void mark_ranges(const int* range_begin, int ranges);
+  void bin_block(const std::uint32_t* gaussians, int count, int low, unsigned width);
   bool prepare_backward();
   std::size_t bytes() const;
 
   Buffer<float> splats, final_transmittance, expected_depth, records, tile_background;
-  Buffer<std::uint8_t> clamped, entry_worker;
+  Buffer<std::uint8_t> clamped, entry_worker, range_groups;
   Buffer<std::uint32_t> depth_key, entry_offset, order, sort_key, sort_order, sort_key2;
-  Buffer<std::int32_t> entry_counts, first_record, tile_start, tile_cursor, last_item;
+  Buffer<std::int32_t> entry_counts, first_record, tile_start, tile_cursor, last_item, sort_counts;
   Buffer<TileItem> items;
   Buffer<double> camera_parts;
   Buffer<std::int32_t> tile_counts[kMaxThreads];

@@ -98,8 +98,8 @@ MUDG_INLINE bool write_splat(RasterState& state, const SplatLanes& lanes, int l,
   row[kOpacity] = lanes.opacity[l];
   row[kDepth] = lanes.depth[l];
   float* channel = row + kFirstChannel;
-  sh_color(s.sh + static_cast<std::size_t>(g) * s.sh_coefficients * 3, &lanes.basis[0][l], kLanes,
-           (s.sh_degree + 1) * (s.sh_degree + 1), channel);
+  const auto harmonics = harmonics_of(s, s.sh, s.sh_rest, static_cast<std::size_t>(g));
+  sh_color(harmonics.first, harmonics.rest, &lanes.basis[0][l], kLanes, (s.sh_degree + 1) * (s.sh_degree + 1), channel);
   float poison = (channel[0] * 0.0f + channel[1] * 0.0f) + channel[2] * 0.0f;
   std::uint8_t clamped = 0;
   for (int c = 0; c < 3; ++c) {

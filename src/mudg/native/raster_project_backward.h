@@ -58,8 +58,11 @@ MUDG_INLINE bool sum_records(const RasterState& state, int g, float mean_x, floa
 
 MUDG_INLINE void zero_rows(const RasterScene& s, const RasterGradient& gradient, int g) {
   const std::size_t row = static_cast<std::size_t>(g);
-  if (gradient.sh != nullptr)
-    std::memset(gradient.sh + row * s.sh_coefficients * 3, 0, sizeof(float) * 3 * s.sh_coefficients);
+  if (gradient.sh != nullptr) {
+    const auto of_sh = harmonics_of(s, gradient.sh, gradient.sh_rest, row);
+    of_sh.first[0] = of_sh.first[1] = of_sh.first[2] = 0.0f;
+    std::memset(of_sh.rest, 0, sizeof(float) * 3 * (s.sh_coefficients - 1));
+  }
   if (gradient.extra != nullptr)
     std::memset(gradient.extra + row * s.extra_channels, 0, sizeof(float) * s.extra_channels);
   if (gradient.means2d != nullptr) gradient.means2d[2 * row] = gradient.means2d[2 * row + 1] = 0.0f;
@@ -85,21 +88,29 @@ MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& 
   alignas(64) float of_columns[kMaxSh][kLanes] = {};
   for (unsigned left = live; left != 0; left &= left - 1) {
     const int l = __builtin_ctz(left);
-    const std::size_t row = static_cast<std::size_t>(first + l) * s.sh_coefficients * 3;
-    const float* sh = s.sh + row;
+    const std::size_t row = static_cast<std::size_t>(first + l);
+    const auto sh = harmonics_of(s, s.sh, s.sh_rest, row);
     const float red = group.rgb[0][l], green = group.rgb[1][l], blue = group.rgb[2][l];
     float values[kMaxSh], of_values[kMaxSh];
-    for (int k = 0; k < active; ++k) of_values[k] = sh[3 * k] * red + sh[3 * k + 1] * green + sh[3 * k + 2] * blue;
+    of_values[0] = sh.first[0] * red + sh.first[1] * green + sh.first[2] * blue;
+    for (int k = 1; k < active; ++k) {
+      const float* rest = sh.rest + 3 * (k - 1);
+      of_values[k] = rest[0] * red + rest[1] * green + rest[2] * blue;
+    }
     for (int k = 0; k < active; ++k) of_columns[k][l] = of_values[k];
     if (gradient.sh == nullptr) continue;
-    float* of_sh = gradient.sh + row;
+    const auto of_sh = harmonics_of(s, gradient.sh, gradient.sh_rest, row);
     for (int k = 0; k < active; ++k) values[k] = columns[k][l];
-    for (int k = 0; k < active; ++k) {
-      of_sh[3 * k] = values[k] * red;
-      of_sh[3 * k + 1] = values[k] * green;
-      of_sh[3 * k + 2] = values[k] * blue;
+    of_sh.first[0] = values[0] * red;
+    of_sh.first[1] = values[0] * green;
+    of_sh.first[2] = values[0] * blue;
+    for (int k = 1; k < active; ++k) {
+      float* of_rest = of_sh.rest + 3 * (k - 1);
+      of_rest[0] = values[k] * red;
+      of_rest[1] = values[k] * green;
+      of_rest[2] = values[k] * blue;
     }
-    for (int k = 3 * active; k < 3 * s.sh_coefficients; ++k) of_sh[k] = 0.0f;
+    for (int k = 3 * (active - 1); k < 3 * (s.sh_coefficients - 1); ++k) of_sh.rest[k] = 0.0f;
   }
   if (s.sh_degree == 0) return;
   for (int k = 0; k < active; ++k) of_basis[k] = load(of_columns[k]);
@@ -112,12 +123,17 @@ MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& 
 // Brings closer what the gathering of Gaussian g will read and write.
 MUDG_INLINE void prefetch_gaussian(const RasterState& state, const RasterGradient& gradient, int g) {
   const RasterScene& s = state.scene;
-  const std::size_t harmonics = static_cast<std::size_t>(s.sh_coefficients) * 3;
+  const std::size_t row = static_cast<std::size_t>(g);
+  const int rest = 3 * (s.sh_coefficients - 1);
   if (gradient.sh != nullptr) {
-    for (std::size_t at = 0; at < harmonics; at += 16) __builtin_prefetch(gradient.sh + g * harmonics + at, 1, 2);
+    const auto of_sh = harmonics_of(s, gradient.sh, gradient.sh_rest, row);
+    __builtin_prefetch(of_sh.first, 1, 2);
+    for (int at = 0; at < rest; at += 16) __builtin_prefetch(of_sh.rest + at, 1, 2);
   }
   if (state.entry_counts[g] == 0) return;
-  for (std::size_t at = 0; at < harmonics; at += 16) __builtin_prefetch(s.sh + g * harmonics + at, 0, 2);
+  const auto sh = harmonics_of(s, s.sh, s.sh_rest, row);
+  __builtin_prefetch(sh.first, 0, 2);
+  for (int at = 0; at < rest; at += 16) __builtin_prefetch(sh.rest + at, 0, 2);
   __builtin_prefetch(state.splats + static_cast<std::size_t>(g) * state.splat_stride, 0, 2);
   const std::size_t stride = static_cast<std::size_t>(state.record_stride);
   const float* record = state.records + state.first_record[g] * stride;

@@ -67,32 +67,41 @@ MUDG_INLINE void sh_basis_backward(int degree, Floats x, Floats y, Floats z, con
                  c_dz * (x * weight[13] + y * weight[11]) + d * (cos2 * weight[14] + sin2 * weight[10]);
 }
 
-// color[3] = 0.5 + sum_k basis[k * stride] * sh[k], sh as rows of three.
+// color[3] = 0.5 + sum_k basis[k * stride] * row k, rows of three: `first`, then those of `rest`.
 #if defined(__AVX2__)
-MUDG_INLINE void sh_color(const float* sh, const float* basis, int stride, int count, float* color) {
-  // Four rows at a time, each loaded with one float too many: the last row is left to the scalar loop.
+MUDG_INLINE void sh_color(const float* first, const float* rest, const float* basis, int stride, int count,
+                          float* color) {
+  // Four rows at a time, those of `rest` loaded with one float too many: the last row is left to the scalar loop.
+  const float* sh = rest - 3;
   __m128 sums[4] = {_mm_set1_ps(0.5f), _mm_setzero_ps(), _mm_setzero_ps(), _mm_setzero_ps()};
   int k = 0;
   for (; k + 5 <= count; k += 4) {
     for (int j = 0; j < 4; ++j) {
+      if (k + j == 0) {
+        sums[0] = _mm_fmadd_ps(_mm_set1_ps(basis[0]), _mm_setr_ps(first[0], first[1], first[2], 0.0f), sums[0]);
+        continue;
+      }
       sums[j] = _mm_fmadd_ps(_mm_set1_ps(basis[(k + j) * stride]), _mm_loadu_ps(sh + 3 * (k + j)), sums[j]);
     }
   }
   alignas(16) float total[4];
   _mm_store_ps(total, _mm_add_ps(_mm_add_ps(sums[0], sums[1]), _mm_add_ps(sums[2], sums[3])));
   for (; k < count; ++k) {
-    for (int c = 0; c < 3; ++c) total[c] += basis[k * stride] * sh[3 * k + c];
+    const float* row = k == 0 ? first : sh + 3 * k;
+    for (int c = 0; c < 3; ++c) total[c] += basis[k * stride] * row[c];
   }
   for (int c = 0; c < 3; ++c) color[c] = total[c];
 }
 #else
-MUDG_INLINE void sh_color(const float* sh, const float* basis, int stride, int count, float* color) {
+MUDG_INLINE void sh_color(const float* first, const float* rest, const float* basis, int stride, int count,
+                          float* color) {
   float red = 0.5f, green = 0.5f, blue = 0.5f;
   for (int k = 0; k < count; ++k) {
     const float weight = basis[k * stride];
-    red += weight * sh[3 * k];
-    green += weight * sh[3 * k + 1];
-    blue += weight * sh[3 * k + 2];
+    const float* row = k == 0 ? first : rest + 3 * (k - 1);
+    red += weight * row[0];
+    green += weight * row[1];
+    blue += weight * row[2];
   }
   color[0] = red;
   color[1] = green;

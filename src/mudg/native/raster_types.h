@@ -56,6 +56,7 @@ struct RasterScene {
   float center_high[3], center_low[3];  // camera centre in the world as a sum of two floats
   float background[3];
   const float *means, *quats, *scales, *opacities, *sh, *extra;  // [N,3] [N,4] [N,3] [N] [N,K,3] [N,C]
+  const float* sh_rest;  // null, or harmonics from the second on [N,K-1,3]; `sh` is then [N,1,3]
 };
 
 struct RasterImage {
@@ -71,8 +72,22 @@ struct RasterImageGradient {
 struct RasterGradient {
   float *means, *quats, *scales, *opacities;  // never null
   float *sh, *extra, *means2d, *abs_means2d;  // null: not wanted
+  float* sh_rest;                             // as in the scene; written whenever `sh` is
   float rotation[9], center[3], background[3];
 };
+
+// The harmonics of one Gaussian, or their gradient: the first one, and those that follow it.
+template <class Number>
+struct Harmonics {
+  Number *first, *rest;
+};
+template <class Number>
+inline __attribute__((always_inline)) Harmonics<Number> harmonics_of(const RasterScene& scene, Number* sh,
+                                                                     Number* sh_rest, std::size_t gaussian) {
+  const std::size_t coefficients = static_cast<std::size_t>(scene.sh_coefficients);
+  if (scene.sh_rest != nullptr) return {sh + 3 * gaussian, sh_rest + 3 * gaussian * (coefficients - 1)};
+  return {sh + 3 * gaussian * coefficients, sh + 3 * gaussian * coefficients + 3};
+}
 
 enum class RasterStatus : int { kOk = 0, kOutOfMemory = 1, kTooManyEntries = 2, kNotFinite = 3 };
 

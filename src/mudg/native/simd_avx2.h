@@ -34,6 +34,17 @@ MUDG_INLINE void store_unaligned(float* p, Floats x) {
   _mm256_storeu_ps(p, x.a);
   _mm256_storeu_ps(p + 8, x.b);
 }
+// The first `count` lanes only; lanes that are not loaded are 0.
+MUDG_INLINE __m256i first_eight(int count) {
+  return _mm256_cmpgt_epi32(_mm256_set1_epi32(count), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+}
+MUDG_INLINE Floats load_first(const float* p, int count) {
+  return {_mm256_maskload_ps(p, first_eight(count)), _mm256_maskload_ps(p + 8, first_eight(count - 8))};
+}
+MUDG_INLINE void store_first(float* p, int count, Floats x) {
+  _mm256_maskstore_ps(p, first_eight(count), x.a);
+  _mm256_maskstore_ps(p + 8, first_eight(count - 8), x.b);
+}
 MUDG_INLINE Ints load_int(const int* p) {
   return {_mm256_load_si256(reinterpret_cast<const __m256i*>(p)),
           _mm256_load_si256(reinterpret_cast<const __m256i*>(p + 8))};

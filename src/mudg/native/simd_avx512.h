@@ -22,6 +22,13 @@ MUDG_INLINE Floats load(const float* p) { return {_mm512_load_ps(p)}; }
 MUDG_INLINE Floats load_unaligned(const float* p) { return {_mm512_loadu_ps(p)}; }
 MUDG_INLINE void store(float* p, Floats a) { _mm512_store_ps(p, a.v); }
 MUDG_INLINE void store_unaligned(float* p, Floats a) { _mm512_storeu_ps(p, a.v); }
+// The first `count` lanes only; lanes that are not loaded are 0.
+MUDG_INLINE Floats load_first(const float* p, int count) {
+  return {_mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << count) - 1u), p)};
+}
+MUDG_INLINE void store_first(float* p, int count, Floats a) {
+  _mm512_mask_storeu_ps(p, static_cast<__mmask16>((1u << count) - 1u), a.v);
+}
 MUDG_INLINE Ints load_int(const int* p) { return {_mm512_load_si512(p)}; }
 MUDG_INLINE void store_int(int* p, Ints a) { _mm512_store_si512(p, a.v); }
 

@@ -51,6 +51,15 @@ MUDG_INLINE Floats load_unaligned(const float* p) {
 MUDG_INLINE Floats load(const float* p) { return load_unaligned(p); }
 MUDG_INLINE void store_unaligned(float* p, Floats a) { std::memcpy(p, a.q, 64); }
 MUDG_INLINE void store(float* p, Floats a) { store_unaligned(p, a); }
+// The first `count` lanes only; lanes that are not loaded are 0.
+MUDG_INLINE Floats load_first(const float* p, int count) {
+  float all[16] = {};
+  std::memcpy(all, p, sizeof(float) * static_cast<std::size_t>(count));
+  return load_unaligned(all);
+}
+MUDG_INLINE void store_first(float* p, int count, Floats a) {
+  std::memcpy(p, a.q, sizeof(float) * static_cast<std::size_t>(count));
+}
 MUDG_INLINE Ints load_int(const int* p) {
   return {{load_quad(p), load_quad(p + 4), load_quad(p + 8), load_quad(p + 12)}};
 }

@@ -335,9 +335,9 @@ def adam_step(model: SceneModel, step: int, config: FitConfig, visible: Tensor) 
         visible: bool[N], the Gaussians this step's view shows; with ``config.selective_adam`` the others rest.
     """
     rates = learning_rates(step, config.iterations)
-    model.table.adam_step(step, rates, kernels.adam, visible if config.selective_adam else None)
+    model.table.adam_step(step, rates, kernels.adam_columns, visible if config.selective_adam else None)
     for table in model.node_tables().values():
-        table.adam_step(step, rates, kernels.adam)
+        table.adam_step(step, rates, kernels.adam_columns)
     for table in (model.table, *model.node_tables().values()):
         table.clear_gradients()
 
