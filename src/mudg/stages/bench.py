@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from mudg.base import log, store
@@ -125,7 +126,7 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
     depth = torch.stack([torch.from_numpy(t.depth.copy())[None] for t in truths]).clamp(max=1000.0)
     ids = torch.stack([torch.from_numpy(t.semantics.astype("int64")) for t in truths])
-    poses = torch.stack([torch.from_numpy(v.world_from_cam) for v in views])
+    poses = torch.from_numpy(np.stack([v.world_from_cam for v in views]))
     camera = views[0].resized(rules.width, rules.height).camera
     lens = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]] * len(views), dtype=torch.float64)
     pairs = learn_score.changes(torch.stack(frames), rgb, depth, ids, poses, lens)
