@@ -1,11 +1,12 @@
 """Seconds of the small diffusion model: one network pass, one decoding, one whole clip of eight frames, on one thread.
 
-    OMP_NUM_THREADS=1 python bench/mdm.py [--model embedded] [--steps 4]
+    OMP_NUM_THREADS=1 python bench/mdm.py [--model embedded] [--steps 2] [--profile]
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from collections.abc import Callable
 
@@ -42,15 +43,18 @@ def main() -> None:
     """Print a small table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--model", default="embedded")
-    parser.add_argument("--steps", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=2)
+    parser.add_argument("--profile", action="store_true", help="also where the time of a clip goes (bfloat16)")
     options = parser.parse_args()
     torch.set_num_threads(1)
     model = mdm.load(options.model)
-    condition = made_up_condition(model.config.window, 128, 192)
+    height = max(1, round((model.config.area_px / 1.5) ** 0.5 / model.config.pixel_multiple)) * model.config.pixel_multiple
+    width = model.config.area_px // height
+    condition = made_up_condition(model.config.window, height, width)
     latents = model.sample(condition, steps=1).latents
     encoded = model.encode_condition(condition)
     print(  # noqa: T201
-        f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M parameters, {model.config.window} frames of 192x128"
+        f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M parameters, {model.config.window} frames of {width}x{height}"
     )
     for bf16 in (False, True):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
@@ -65,6 +69,12 @@ def main() -> None:
         print(  # noqa: T201
             f"{name:9s} pass {pass_s:.3f} s  decoding {decode:.3f} s  clip of {options.steps} steps {more:.2f} s (CPU)"
         )
+    if options.profile:
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+            model.sample(condition, steps=options.steps, bf16=True)
+        print(profile.key_averages().table(sort_by="self_cpu_time_total", row_limit=12, max_name_column_width=40))  # noqa: T201
+    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(f"largest memory of this process {peak_gb:.2f} GB")  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -137,6 +137,23 @@ def measure(size: str, channels: int, repeats: int, with_torch: bool, clock: Cal
     return rows
 
 
+def scaling(size: str, channels: int, repeats: int) -> tuple[float, float]:
+    """Milliseconds with one and with two threads, wall time, in turn; medians."""
+    count, shape = size.split(":")
+    width, height = (int(side) for side in shape.split("x"))
+    gaussians, view = street(int(count), width, height, channels)
+    upstream = [torch.ones(c, height, width) for c in (3, 1, 1, *([channels] if channels else []))]
+    times: dict[int, list[float]] = {1: [], 2: []}
+    for turn in range(repeats + 1):
+        for threads, taken in times.items():
+            native.set_threads(threads)
+            started = time.perf_counter()
+            once(gaussians, view, RasterConfig(backend="cpu"), upstream)
+            if turn:
+                taken.append(1e3 * (time.perf_counter() - started))
+    return statistics.median(times[1]), statistics.median(times[2])
+
+
 def say(line: str) -> None:
     """One line of the result, at once."""
     sys.stdout.write(line + "\n")
@@ -257,12 +274,19 @@ def main() -> None:
     parser.add_argument("--roofline", action="store_true", help="compare the best variant with this processor's limits")
     parser.add_argument("--check", action="store_true", help="compare ratios with raster_ratios.json")
     parser.add_argument("--store", action="store_true", help="write raster_ratios.json from this run")
+    parser.add_argument("--scaling", action="store_true", help="one against two threads, in turn, nothing else")
     parser.add_argument("--first-call", action="store_true", help="time import and first picture, nothing else")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     options = parser.parse_args()
     native.require("this benchmark")
     if options.first_call:
         say(subprocess.run([sys.executable, "-c", FIRST_CALL], capture_output=True, text=True, check=True).stdout.strip())
+        return
+    if options.scaling:
+        torch.set_num_threads(1)
+        for size in options.sizes:
+            one, two = scaling(size, options.channels, options.repeats)
+            say(f"{size:>16}  1 thread {one:7.1f} ms  2 threads {two:7.1f} ms  {one / two:.2f} times as fast")
         return
     if options.check or options.store:
         options.sizes = CHECK_SIZES

@@ -10,7 +10,7 @@ from toy_clips import WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.data import clip_shards
+from mudg.data import city_clips, clip_shards
 from mudg.models import mdm
 from mudg.stages import learn, learn_clips, learn_score
 
@@ -126,7 +126,7 @@ def test_clips_that_never_come_are_an_error(tmp_path):
 
 
 def test_perfect_samples_score_perfectly(clips):
-    batch = clip_shards.read_batch(clips, [(learn_clips.HELD_OUT, 0, range(WINDOW))])
+    batch = clip_shards.read_batch(clips, [(city_clips.HELD_OUT, 0, range(WINDOW))])
     depth = batch.depth[0].clamp(max=100.0)
     sample = mdm.Sample(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
     row, counts = learn_score.score_clip(batch, sample)

@@ -12,12 +12,12 @@ from toy_scene import ToyStreet
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Source
 from mudg.data import clip_shards, log_clips
+from mudg.data.city_clips import HELD_OUT
 from mudg.data.log_clips import LogClipRules, LogSource
 from mudg.data.scenefile import SceneWriter, read_image, read_label, read_points, read_scene
 from mudg.models import mdm
 from mudg.stages import fuse, learn
 from mudg.stages.config import FuseConfig
-from mudg.stages.learn_clips import HELD_OUT
 
 RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
 FRAMES = 16

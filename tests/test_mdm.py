@@ -9,7 +9,7 @@ import torch
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
-from mudg.models import mdm, refine, unet
+from mudg.models import mdm, unet, vae
 from mudg.models.mdm import MDM, MDMConfig
 from mudg.models.vae import CodecConfig
 
@@ -191,7 +191,7 @@ def test_training_and_inference_attention_agree():
 
 def test_temporal_shift_moves_one_eighth_each_way():
     x = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 16, 2, 2)
-    moved = refine.temporal_shift(x, 3)
+    moved = vae.temporal_shift(x, 3)
     assert moved[:, :2].amax((1, 2, 3)).tolist() == [0, 0, 1]
     assert moved[:, 2:4].amax((1, 2, 3)).tolist() == [1, 2, 2]
     assert torch.equal(moved[:, 4:], x[:, 4:])

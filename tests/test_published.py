@@ -254,6 +254,38 @@ def test_cuts_of_the_work_do_not_change_the_sample(model):
     assert not torch.equal(model.sample(condition, steps=3, seed=5, index=2).rgb, first.rgb)
 
 
+def test_sampling_may_start_from_the_condition_and_runs_the_late_steps_only(model):
+    condition = some_condition()
+    seen = []
+    predict = model.predict
+    model.predict = lambda x, planes, t, *rest: (seen.append(int(t[0])), predict(x, planes, t, *rest))[1]
+    try:
+        model.sampling = Sampling(guidance=1.0)
+        start = model.condition_latents(condition)
+        assert {m: tuple(z.shape) for m, z in start.items()} == dict.fromkeys(("rgb", "depth", "semantics"), (4, 4, 4, 6))
+        model.sample(condition, steps=10, start=start, strength=0.3)
+        assert sorted(set(seen), reverse=True) == [299, 199, 99]
+        with pytest.raises(UsageError, match="start from"):
+            model.sample(condition, steps=2, strength=0.5)
+    finally:
+        model.sampling = Sampling()
+        del model.predict
+
+
+def test_depth_is_aligned_to_the_points_and_more_samples_only_change_the_confidence(model):
+    condition = some_condition()
+    plain = model.sample(condition, steps=2, align=False)
+    aligned = model.sample(condition, steps=2)
+    assert plain.depth_fits == ()
+    assert len(aligned.depth_fits) == 4
+    for before, after, fit in zip(plain.depth, aligned.depth, aligned.depth_fits):
+        expected = (fit.scale * before + fit.shift_m).clamp(min=0.1) if fit.used else before
+        assert torch.allclose(after, expected)
+    several = model.sample(condition, steps=2, n_samples=2)
+    assert torch.equal(several.rgb, aligned.rgb)
+    assert not torch.equal(several.confidence, aligned.confidence)
+
+
 def test_guidance_is_that_of_the_schedule_module(model):
     """The guided velocity equals `noise.guide` of two plain passes with the contexts written out here."""
     with torch.no_grad():
@@ -475,7 +507,7 @@ def test_the_released_resizing(street):
     view = scene.frames_of("front")[0].view
     native = ConditionRules(48, 32, published=True)
     sparse = project_sparse(cloud, scene.tracks, view.resized(48, 32), native)
-    recorded = synthesize.recorded_images(scene, held_out=False, classes=False)
+    recorded = synthesize.recorded_images(scene, SynthesizeConfig(given_classes=False))
     made, _ = build_conditions(cloud, scene.tracks, [view], recorded, ConditionRules(12, 8, 48, 32, published=True))
     assert torch.equal(made.color[0], (sparse.rgb * sparse.valid)[:, ::4, ::4])
     depth = sparse.depth * sparse.valid
@@ -489,7 +521,7 @@ def test_the_reference_fits_only_where_it_was_taken(street):
     from mudg.data.scenefile import read_scene
 
     scene = read_scene(street / "scene")
-    recorded = synthesize.recorded_images(scene, held_out=True, classes=False)
+    recorded = synthesize.recorded_images(scene, SynthesizeConfig(held_out_images=True, given_classes=False))
     view = scene.frames_of("front")[1].view
     moved = view.world_from_cam.copy()
     moved[:3, 3] += [0.0, 1.0, 0.0]

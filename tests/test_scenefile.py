@@ -22,7 +22,16 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.scene_files import open_files
 from mudg.data.scene_schema import ref_problem, scene_to_json_text
-from mudg.data.scenefile import SceneWriter, check_scene, read_image, read_label, read_points, read_scene, write_zip
+from mudg.data.scenefile import (
+    SceneWriter,
+    check_scene,
+    read_image,
+    read_label,
+    read_points,
+    read_scene,
+    read_trusted_classes,
+    write_zip,
+)
 
 CAMERA = Camera("front", 32, 20, 30.0, 31.0, 16.0, 10.0, (0.1, -0.02), 0.005)
 
@@ -106,6 +115,11 @@ def test_everything_comes_back_exactly(tmp_path: Path) -> None:
             found, array = found[~bad], array[~bad]
         assert found.dtype == array.dtype
         assert (found == array).all(), name
+    trusted = read_trusted_classes(scene, frame, 0.4)
+    doubtful = read_label(scene, frame, "semantics_confidence") < 0.4
+    assert trusted is not None
+    assert (trusted[doubtful] == 255).all()
+    assert (trusted[~doubtful] == labels["semantics"][~doubtful]).all()
 
 
 def test_jpeg_option_and_ready_made_image_bytes(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import torch
 
 from mudg.base.types import Camera, Clip, Condition, View
 from mudg.data import clip_shards
+from mudg.data.city_clips import HELD_OUT
 from mudg.stages.config import LearnConfig
-from mudg.stages.learn_clips import HELD_OUT
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
 

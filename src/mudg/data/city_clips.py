@@ -21,20 +21,24 @@ import torch
 
 from mudg import native
 from mudg.base import geometry, seeds
+from mudg.base.log import progress
 from mudg.base.types import Clip, Condition, FusedCloud, View
 from mudg.core.fusion import FusionRules, Shot, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
-from mudg.data.clip_shards import pack_clips, write_shard
+from mudg.data.clip_shards import pack_clips, shard_path, write_shard
 from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
 
 HELD_OUT = 1_000_000
-"""City numbers from here on are for scoring: standard rig, all cameras, shifts of exactly 2, 3 and 4 m, whatever the seed."""
+"""Numbers of cities, and of clips of logs, from here on are for scoring, never for training. Such cities have the standard
+rig, all cameras, and shifts of exactly 2, 3 and 4 m, whatever the seed."""
 
 DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
 """Cities to look at while choosing; also what `learn` watches."""
 REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 """Cities whose scores are reported and on which nothing is chosen."""
+
+LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
 
 FRAMES = 12
 FIRST = 2
@@ -196,6 +200,13 @@ def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
     depth = torch.stack([torch.from_numpy(np.ascontiguousarray(t.depth))[None] for t in truths])
     ids = torch.stack([torch.from_numpy(t.semantics.astype(np.int64)) for t in truths])
     return Clip(condition, rgb.float(), depth, torch.isfinite(depth), ids)
+
+
+def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path) -> None:
+    """Make the shards of those cities that have none in `folder` yet, one after another."""
+    missing = [city for city in cities if not shard_path(folder, city).is_file()]
+    for city in progress(missing, len(missing), "generating cities"):
+        write_city(rules, city, folder)
 
 
 def write_city(rules: CityClipRules, city: int, folder: Path) -> int:

@@ -41,7 +41,7 @@ from mudg.data.clips import (
     resize_image,
 )
 from mudg.data.cloudfile import read_fused
-from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+from mudg.data.scenefile import read_image, read_label, read_points, read_scene, read_trusted_classes
 
 INDEX = "log_clips.json"
 SKY = palette.ID["sky"]
@@ -160,18 +160,8 @@ class OpenLog:
 
     def _recorded(self, number: int) -> Recorded:
         frame = self._frames[number]
-        classes = _trusted_classes(self.scene, frame, self.rules.label_confidence)
+        classes = read_trusted_classes(self.scene, frame, self.rules.label_confidence)
         return Recorded(frame.view, read_image(self.scene, frame), classes)
-
-
-def _trusted_classes(scene: Scene, frame: Frame, least: float) -> NDArray[np.uint8] | None:
-    """Class ids u8[H,W] of a frame, 255 where unlabelled or doubtful; None without labels."""
-    if "semantics" not in frame.labels:
-        return None
-    ids = read_label(scene, frame, "semantics")
-    if "semantics_confidence" in frame.labels:
-        ids = np.where(read_label(scene, frame, "semantics_confidence") >= least, ids, np.uint8(palette.UNLABELLED))
-    return ids.astype(np.uint8)
 
 
 def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:

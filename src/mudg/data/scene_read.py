@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from mudg.base import store
+from mudg.base import palette, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Frame, Ref, Scene, Sweep, SweepPoints
 from mudg.data import scene_schema as schema
@@ -206,6 +206,16 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
             remedy="run `mudg annotate`, which makes a scene with labels",
         )
     return _decode_label(name, open_files(scene.root).read(ref.path), f"{scene.root}: {ref.path}", frame.view.camera)
+
+
+def read_trusted_classes(scene: Scene, frame: Frame, least: float) -> NDArray[np.uint8] | None:
+    """Class ids u8[H,W] of a frame, 255 where unlabelled or where the labels' confidence is below `least`; None without labels."""
+    if "semantics" not in frame.labels:
+        return None
+    ids = read_label(scene, frame, "semantics")
+    if "semantics_confidence" in frame.labels:
+        ids = np.where(read_label(scene, frame, "semantics_confidence") >= least, ids, np.uint8(palette.UNLABELLED))
+    return ids.astype(np.uint8)
 
 
 def label_ref(name: str, frame_id: str) -> str:

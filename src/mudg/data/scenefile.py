@@ -14,7 +14,7 @@ not at all. The same tree as one stored zip is the portable form; every reader h
 from __future__ import annotations
 
 from mudg.data.scene_check import Finding, check_scene
-from mudg.data.scene_read import decode_image, read_image, read_label, read_points, read_scene
+from mudg.data.scene_read import decode_image, read_image, read_label, read_points, read_scene, read_trusted_classes
 from mudg.data.scene_write import SceneWriter, write_zip
 
 __all__ = [
@@ -26,5 +26,6 @@ __all__ = [
     "read_label",
     "read_points",
     "read_scene",
+    "read_trusted_classes",
     "write_zip",
 ]

@@ -473,7 +473,7 @@ class MDM(nn.Module):
         self,
         condition: Condition,
         *,
-        steps: int = 8,
+        steps: int = 2,
         seed: int = 0,
         index: int = 0,
         sampler: str = "ddim",
@@ -501,11 +501,7 @@ class MDM(nn.Module):
 
         Measured depth (`condition.valid`) replaces generated depth.
         """
-        if sampler not in noise.SAMPLERS:
-            raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
-        unknown = [m for m in modalities if m not in MODALITIES]
-        if unknown or not modalities:
-            raise UsageError("unknown or no modality", expected=", ".join(MODALITIES), got=str(list(modalities)))
+        check_request(sampler, modalities)
         encoded = self.encode_condition(condition)
         passes = self.passes if self.config.joint else tuple((m,) for m in MODALITIES if m in modalities)
         drawn: list[dict[Modality, Tensor]] = []
@@ -522,10 +518,10 @@ class MDM(nn.Module):
             stacked = torch.stack([d.get("rgb", next(iter(d.values()))) for d in drawn])
             change = stacked.std(0).mean(2, keepdim=True) * 2
         latents = {m: z[0] for m, z in drawn[0].items()}
-        confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             if self.refiner is None:
                 decoded = self.codec.decode({m: z for m, z in latents.items() if m in modalities})
+                confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
                 decoded, error = self._decode_refined(latents, encoded.pixels)
                 confidence = torch.exp(-error / TRUSTED_ERROR)
@@ -600,6 +596,14 @@ class MDM(nn.Module):
             )
         moved = torch.stack([(e - x[:, :, : sizes[0]]).abs().mean(2, keepdim=True) for e in estimates]).mean(0)
         return dict(zip(names, x.split(sizes, 2))), moved
+
+
+def check_request(sampler: str, modalities: Sequence[str]) -> None:
+    """UsageError unless there is such a sampler and at least one modality is asked for, all of them known."""
+    if sampler not in noise.SAMPLERS:
+        raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
+    if not modalities or any(m not in MODALITIES for m in modalities):
+        raise UsageError("unknown or no modality", expected=", ".join(MODALITIES), got=str(list(modalities)))
 
 
 def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
@@ -709,6 +713,12 @@ def load(path: Path | str = "embedded") -> MDM:
     return model.eval()
 
 
+def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
+    """Whether two networks differ at most in what `grown` can add, and in the size they were trained at."""
+    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": (), "area_px": 0}
+    return dataclasses.replace(one, **plain) == dataclasses.replace(other, **plain)
+
+
 def grown(before: MDM, config: MDMConfig) -> MDM:
     """A model of `config` with the weights of `before`, whose inputs and outputs are the first of its own.
 
@@ -718,8 +728,7 @@ def grown(before: MDM, config: MDMConfig) -> MDM:
     Raises:
         UsageError: the two differ in more than `given_classes`, the refiner and the size trained at.
     """
-    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": (), "area_px": 0}
-    if dataclasses.replace(before.config, **plain) != dataclasses.replace(config, **plain):
+    if not same_denoiser(before.config, config):
         raise UsageError(
             "the model to continue from is of another kind", expected=str(config), got=str(before.config),
             remedy="give its widths, blocks, attention, patch and window",

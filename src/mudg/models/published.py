@@ -28,7 +28,7 @@ from mudg.core.align import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
 from mudg.models.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, ImageTower, TowerConfig
 from mudg.models.kl_vae import Autoencoder, AutoencoderConfig
-from mudg.models.mdm import LABELS, Losses, Sample, confidence_of, depth_agreement
+from mudg.models.mdm import LABELS, Losses, Sample, check_request, confidence_of, depth_agreement
 from mudg.models.resampler import Resampler, ResamplerConfig
 from mudg.models.vae import MODALITIES, Modality
 from mudg.models.video_unet import SeededDropout, VideoUNet, VideoUNetConfig, temporal_layers
@@ -410,10 +410,7 @@ class PublishedMDM(nn.Module):
         align       bring each frame's depth to the measured scale (`core.align`); otherwise depth is what the model says
         Other arguments as in `MDM.sample`.
         """
-        if sampler not in noise.SAMPLERS:
-            raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
-        if not modalities or any(m not in MODALITIES for m in modalities):
-            raise UsageError("unknown or no modality", expected=", ".join(MODALITIES), got=str(list(modalities)))
+        check_request(sampler, modalities)
         self.check_frames(len(condition.views))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16 and self.dtype == torch.float32):
             before = known.get("rgb") if known else None
@@ -484,7 +481,7 @@ class PublishedMDM(nn.Module):
         if start is not None:
             indices = noise.partial_steps(indices, len(self.schedule), strength)
             given = torch.stack([start[m].to(self.device) for m in names])
-            begin = self.schedule.add_noise(given, begin, torch.full((len(names),), indices[0]))
+            begin = self.schedule.add_noise(given, begin, torch.full((len(names),), indices[0], device=self.device))
         elif strength != 1.0:
             raise UsageError("strength needs something to start from", got=str(strength), remedy="strength = 1")
 

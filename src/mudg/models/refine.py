@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import palette
-from mudg.models.vae import CLASSES, MODALITIES, ChannelNorm, Modality, PatchCodec
+from mudg.models.vae import CLASSES, MODALITIES, ChannelNorm, DecoderBlock, Modality, PatchCodec
 
 UNKNOWN = 255
 SKY = palette.ID["sky"]
@@ -60,21 +60,6 @@ class Refined:
     log_error: Tensor
 
 
-def temporal_shift(x: Tensor, frames: int, share: int = 8) -> Tensor:
-    """Move 1/share of the channels one frame later and as many one frame earlier; ends keep their own.
-
-    `x` [B*T,C,h,w]. The following convolution then mixes neighbouring frames at no cost (Lin et al., "TSM").
-    """
-    n, c, h, w = x.shape
-    if frames == 1:
-        return x
-    k = c // share
-    y = x.permute(0, 2, 3, 1).unflatten(0, (n // frames, frames))
-    late = torch.cat([y[:, :1, ..., :k], y[:, :-1, ..., :k]], 1)
-    early = torch.cat([y[:, 1:, ..., k : 2 * k], y[:, -1:, ..., k : 2 * k]], 1)
-    return torch.cat([late, early, y[..., 2 * k :]], -1).flatten(0, 1).permute(0, 3, 1, 2)
-
-
 def one_hot(ids: Tensor) -> Tensor:
     """u8[N,1,H,W] -> f32[N,19,H,W]; all zero where unknown."""
     places = torch.arange(CLASSES, dtype=torch.uint8, device=ids.device).view(1, -1, 1, 1)
@@ -84,22 +69,6 @@ def one_hot(ids: Tensor) -> Tensor:
 def shares(ids: Tensor) -> Tensor:
     """Share of each class among all 2x2 pixels of a cell, u8[N,1,H,W] -> f32[N,19,H/2,W/2]; unknown pixels count for none."""
     return functional.avg_pool2d(one_hot(ids), 2)
-
-
-class RefineBlock(nn.Module):
-    """norm - temporal shift - conv - SiLU - conv around a residual."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.norm = ChannelNorm(width)
-        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
-        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
-        nn.init.zeros_(self.conv2.weight)
-        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
-
-    def forward(self, x: Tensor, frames: int) -> Tensor:
-        """[B*T,width,h,w] -> the same."""
-        return x + self.conv2(functional.silu(self.conv1(temporal_shift(self.norm(x), frames))))
 
 
 class Refiner(nn.Module):
@@ -116,12 +85,12 @@ class Refiner(nn.Module):
         fine, coarse = widths
         inside = channels + 12 + 4 + 12 + 12 + 4 + 4 + 4 + 2 * CLASSES
         self.enter = nn.Conv2d(inside, fine, 3, padding=1)
-        self.before = nn.ModuleList(RefineBlock(fine) for _ in range(blocks[0]))
+        self.before = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
         self.shrink = nn.Conv2d(fine, coarse, 2, stride=2)
-        self.middle = nn.ModuleList(RefineBlock(coarse) for _ in range(blocks[1]))
+        self.middle = nn.ModuleList(DecoderBlock(coarse) for _ in range(blocks[1]))
         self.grow = nn.Conv2d(coarse, 4 * fine, 1)
         self.join = nn.Conv2d(2 * fine, fine, 1)
-        self.after = nn.ModuleList(RefineBlock(fine) for _ in range(blocks[0]))
+        self.after = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
         self.norm = ChannelNorm(fine)
         self.leave = nn.Conv2d(fine, sum(self.SIZES), 1)
         self.reset()

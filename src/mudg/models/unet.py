@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.models.refine import temporal_shift
-from mudg.models.vae import ChannelNorm
+from mudg.models.vae import ChannelNorm, temporal_shift
 
 
 class UNetShape(Protocol):

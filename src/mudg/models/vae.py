@@ -112,8 +112,23 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
+def temporal_shift(x: Tensor, frames: int, share: int = 8) -> Tensor:
+    """Move 1/share of the channels one frame later and as many one frame earlier; ends keep their own.
+
+    `x` [B*T,C,h,w]. The following convolution then mixes neighbouring frames at no cost (Lin et al., "TSM").
+    """
+    n, c, h, w = x.shape
+    if frames == 1:
+        return x
+    k = c // share
+    y = x.permute(0, 2, 3, 1).unflatten(0, (n // frames, frames))
+    late = torch.cat([y[:, :1, ..., :k], y[:, :-1, ..., :k]], 1)
+    early = torch.cat([y[:, 1:, ..., k : 2 * k], y[:, -1:, ..., k : 2 * k]], 1)
+    return torch.cat([late, early, y[..., 2 * k :]], -1).flatten(0, 1).permute(0, 3, 1, 2)
+
+
 class DecoderBlock(nn.Module):
-    """norm - conv - SiLU - conv around a residual, all at latent resolution."""
+    """norm - temporal shift - conv - SiLU - conv around a residual."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -122,9 +137,9 @@ class DecoderBlock(nn.Module):
         self.conv2 = nn.Conv2d(width, width, 3, padding=1)
         nn.init.zeros_(self.conv2.weight)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """[N,width,h,w] -> the same."""
-        return x + self.conv2(functional.silu(self.conv1(self.norm(x))))
+    def forward(self, x: Tensor, frames: int = 1) -> Tensor:
+        """[N,width,h,w] -> the same; `frames` neighbouring ones belong together."""
+        return x + self.conv2(functional.silu(self.conv1(temporal_shift(self.norm(x), frames))))
 
 
 class PatchCodec(nn.Module):

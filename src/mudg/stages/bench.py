@@ -21,18 +21,18 @@ import torch
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
-from mudg.data import city_clips, clip_shards
+from mudg.data import city_clips
 from mudg.data.city_clips import CityClipRules
 from mudg.data.clips import ConditionRules, Source, build_condition
 from mudg.models import mdm
 from mudg.models.mdm import MDM
 from mudg.stages import bench_ablation, learn_score
-from mudg.stages.config import BenchConfig
+from mudg.stages.config import BenchConfig, SynthesizeConfig
 from mudg.stages.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
 _VERSION = 1
-SEAM_FRAMES, SEAM_SHIFT_M, OVERLAP = 26, 3.0, 2
+SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
 
 def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -> Path:
@@ -55,25 +55,12 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
     return directory.path
 
 
-def cities_of(config: BenchConfig) -> list[int]:
-    """The cities to score."""
-    listed = city_clips.REPORTED if config.cities == "reported" else city_clips.DEVELOPMENT
-    return list(listed[: config.count])
-
-
-def make_clips(rules: CityClipRules, cities: list[int], folder: Path) -> None:
-    """Generate the clips that are not there yet."""
-    missing = [city for city in cities if not clip_shards.shard_path(folder, city).is_file()]
-    for city in log.progress(missing, len(missing), "generating cities"):
-        city_clips.write_city(rules, city, folder)
-
-
 def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     model = mdm.load(config.model)
     bf16 = choose_bf16(config.precision)
-    cities, rules = cities_of(config), CityClipRules(window=model.config.window)
-    make_clips(rules, cities, out / "clips")
-    result: dict[str, Any] = {"cities": cities, "model": mdm.digest(config.model), "bf16": bf16, "rows": []}
+    cities, rules = city_clips.LISTS[config.cities][: config.count], CityClipRules(window=model.config.window)
+    city_clips.write_missing(rules, cities, out / "clips")
+    result: dict[str, Any] = {"cities": list(cities), "model": mdm.digest(config.model), "bf16": bf16, "rows": []}
     lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
     with log.task("scoring", 2 * len(config.steps)) as bar:
         for given in (True, False):
@@ -82,7 +69,7 @@ def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
                 started = time.perf_counter()
                 scores = learn_score.score(
                     model, cities, out / "clips", steps=steps, seed=config.seed, bf16=bf16, eta=config.eta,
-                    sampler=config.sampler, given_classes=given, picture=picture,
+                    sampler=config.sampler, prepare=None if given else learn_score.without_classes, picture=picture,
                 )  # fmt: skip
                 seconds = (time.perf_counter() - started) / scores["clips"]
                 row = {"steps": steps, "given_classes": given, "seconds_per_clip": round(seconds, 2), "scores": scores}
@@ -99,10 +86,10 @@ def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
 def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     """Change of static surfaces across the seams of overlapping windows, against that inside windows.
 
-    A video of `SEAM_FRAMES` frames 3 m beside the path of one city is made in windows as synthesize makes them. Returned
+    A video of `SEAM_FRAMES` frames 3 m beside the path of one city is made in windows as synthesize makes them by default. Returned
     per place: the mean of (change made / change of the truth) over pairs of frames; and the pairs themselves.
     """
-    city = cities_of(config)[0]
+    city, usual = city_clips.LISTS[config.cities][0], SynthesizeConfig()
     rules = CityClipRules(window=model.config.window)
     record = city_clips.make_log(rules, city, frames=SEAM_FRAMES)
     views = [city_clips.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
@@ -111,14 +98,14 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     sources: dict[int, Source] = {}
     frames: list[torch.Tensor] = []
     tail: dict[Any, torch.Tensor] = {}
-    spans = windows(len(views), model.config.window, OVERLAP)
+    spans = windows(len(views), model.config.window, usual.overlap)
     for number, span in enumerate(spans):
         condition = build_condition(
             record.cloud, record.world.tracks(), [views[i] for i in span], record.recorded, ConditionRules(*sizes), sources
         )
         shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
-        made = model.sample(condition, steps=4, seed=config.seed, index=number, known=known, bf16=bf16)
+        made = model.sample(condition, steps=usual.steps, seed=config.seed, index=number, known=known, bf16=bf16)
         if made.rgb is None:
             raise UsageError("the model makes no colour", where=config.model)
         frames += list(made.rgb[shared if tail else 0 :])
@@ -131,18 +118,18 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     lens = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]] * len(views), dtype=torch.float64)
     pairs = learn_score.changes(torch.stack(frames), rgb, depth, ids, poses, lens)
     ratios = [m / t if t > 0 else math.nan for m, t in pairs]
-    seams = {span.start + OVERLAP - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
+    seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
     mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731
     across = mean([r for i, r in enumerate(ratios) if i in seams])
     within = mean([r for i, r in enumerate(ratios) if i not in seams])
-    return {"city": city, "across": round(across, 4), "inside": round(within, 4), "seams": sorted(seams),
+    return {"city": city, "across": round(across, 4), "inside": round(within, 4), "steps": usual.steps, "seams": sorted(seams),
             "pairs": [round(r, 4) for r in ratios]}  # fmt: skip
 
 
 def _seam_text(found: dict[str, Any]) -> str:
     return (
         f"Seam: static surfaces change {found['across']:.3f} times as much as in the truth across the seams of windows, "
-        f"{found['inside']:.3f} times inside them (city {found['city']}, {SEAM_FRAMES} frames, 3 m, 4 steps)."
+        f"{found['inside']:.3f} times inside them (city {found['city']}, {SEAM_FRAMES} frames, 3 m, {found['steps']} steps)."
     )
 
 

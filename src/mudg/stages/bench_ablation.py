@@ -21,14 +21,17 @@ from typing import Any
 
 import torch
 
-from mudg.base import log, seeds
-from mudg.data import city_clips, clip_shards
+from mudg.base import log
+from mudg.base.errors import NumericsError
+from mudg.data import city_clips
 from mudg.data.city_clips import CityClipRules
 from mudg.data.clip_shards import Batch
 from mudg.models import mdm
 from mudg.models.mdm import MDM, MDMConfig
 from mudg.stages import learn, learn_score
 from mudg.stages.config import BenchConfig, LearnConfig
+from mudg.stages.learn_models import mdm_loss
+from mudg.stages.learn_published import Part
 from mudg.stages.precision import choose_bf16
 
 WIDTH, HEIGHT = 96, 64
@@ -52,10 +55,10 @@ def points_only(batch: Batch) -> Batch:
     if batch.point_color is None:
         raise ValueError("the clips were made without point colours")
     seen = batch.valid.float()
-    color, unknown = batch.point_color * seen, torch.full_like(batch.ids, 255)
+    color = batch.point_color * seen
     return dataclasses.replace(
-        batch, color=color, sparse_depth=batch.sparse_depth * seen, warped=torch.zeros_like(batch.warped), backdrop=color,
-        ids=unknown, backdrop_ids=unknown,
+        learn_score.without_classes(batch), color=color, sparse_depth=batch.sparse_depth * seen,
+        warped=torch.zeros_like(batch.warped), backdrop=color,
     )  # fmt: skip
 
 
@@ -79,12 +82,10 @@ VARIANTS: dict[str, Variant] = {
 
 def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     """Train and score all variants; returns the numbers and a table."""
-    folder, cities = out / "clips", _cities(config)
+    folder, cities = out / "clips", city_clips.LISTS[config.cities][: config.count]
     training = _learn_config(config, folder)
     rules = CityClipRules(WIDTH, HEIGHT, clips=4, seed=config.seed, point_colors=True)
-    missing = [c for c in [*cities, *range(config.ablation_cities)] if not clip_shards.shard_path(folder, c).is_file()]
-    for city in log.progress(missing, len(missing), "generating cities"):
-        city_clips.write_city(rules, city, folder)
+    city_clips.write_missing(rules, [*cities, *range(config.ablation_cities)], folder)
     bf16 = choose_bf16(config.precision)
     rows: dict[str, Any] = {}
     for name, variant in VARIANTS.items():
@@ -94,18 +95,13 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
             picture=out / f"{name.replace(' ', '_')}.png",
         )["average"]  # fmt: skip
         log.info(f"{name}: PSNR {rows[name]['psnr']:.2f} dB, AbsRel {rows[name]['abs_rel']:.3f}, mIoU {rows[name]['miou']:.3f}")
-    return {"cities": cities, "training_steps": config.ablation_steps, "rows": rows}, _table(rows, config)
-
-
-def _cities(config: BenchConfig) -> list[int]:
-    listed = city_clips.REPORTED if config.cities == "reported" else city_clips.DEVELOPMENT
-    return list(listed[: config.count])
+    return {"cities": list(cities), "training_steps": config.ablation_steps, "rows": rows}, _table(rows, config)
 
 
 def _learn_config(config: BenchConfig, folder: Path) -> LearnConfig:
     return LearnConfig(
         seed=config.seed, cities=config.ablation_cities, first_cities=config.ablation_cities, clips=str(folder), workers=0,
-        width=WIDTH, height=HEIGHT, steps=config.ablation_steps, lr=1e-3, full_window_share=0.2, reference_dropout=0.0,
+        width=WIDTH, height=HEIGHT, steps=config.ablation_steps, lr=1e-3, full_window_share=0.2, refined_share=1.0, reference_dropout=0.0,
     )  # fmt: skip
 
 
@@ -126,20 +122,13 @@ def _trained(name: str, variant: Variant, config: LearnConfig, bf16: bool) -> MD
             frames = learn.frames_at(config, step)
             count = max(1, config.batch_frames // frames)
             batch = variant.prepare(learn.draw_batch(config, Path(config.clips), step, count, frames, "ablation batch"))
-            with torch.no_grad():
-                truth = model.encode_truth(batch.rgb, batch.depth, batch.semantics)
-                encoded = model.encode_planes(batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop,
-                                              batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
-                pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics)
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-                losses = model.loss(truth, encoded, seeds.torch_generator(config.seed, step, "ablation noise"),
-                                    shares=mdm.truth_shares(batch.semantics), pixels=pixels)  # fmt: skip
+                losses = mdm_loss(model.loss, model, config, Part(batch, step, 0, count), torch.ones(mdm.CLASSES))
             optimizer.zero_grad(set_to_none=True)
             losses.total.backward()
-            if not math.isfinite(float(torch.nn.utils.clip_grad_norm_(trained, 1.0))):
-                optimizer.zero_grad(set_to_none=True)  # a step that is lost alike in every repetition
-                log.warn(f"{name}: the gradient of step {step} is not finite, the step is left out")
-                continue
+            norm = float(torch.nn.utils.clip_grad_norm_(trained, 1.0))
+            if not math.isfinite(norm):
+                raise NumericsError("the gradient is not finite", where=f"{name}, step {step}", got=str(norm))
             optimizer.step()
             bar.update(f"loss {float(losses.total.detach()):.3f}")
             bar.advance()

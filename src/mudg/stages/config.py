@@ -178,8 +178,8 @@ class LearnConfig:
     log_every: int = Field(default=50, ge=1)
     """Steps per line of log.jsonl."""
     sample_every: int = Field(default=400, ge=1)
-    sample_steps: int = Field(default=4, ge=1)
-    score_steps: int = Field(default=8, ge=1)
+    sample_steps: int = Field(default=2, ge=1)
+    score_steps: int = Field(default=2, ge=1)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -228,6 +228,8 @@ class SynthesizeConfig:
     """Samples per clip; the first is kept, the spread of all lowers the confidence. Costs that many times the passes."""
     given_classes: bool = True
     """Let the classes of labelled points and recorded images into the condition, where the scene has labels."""
+    label_confidence: float = Field(default=0.5, ge=0, le=1)
+    """Labels of recorded images with less confidence than this are not given."""
     align_depth: bool = True
     """Bring generated depth to the scale of the LiDAR points in the same view (scale and shift per frame)."""
     overlap: int = Field(default=2, ge=0)

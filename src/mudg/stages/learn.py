@@ -183,19 +183,13 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     now = {"window": config.window, "area_px": wanted.area_px}
     resized = MDM(replace(before.config, **now))
     resized.load_state_dict(before.state_dict())
-    if wanted != resized.config and not _is_kind_of(resized.config, wanted) and _says_nothing(config):
+    if wanted != resized.config and not mdm.same_denoiser(resized.config, wanted) and _says_nothing(config):
         log.info("learn: the network is that of the model to continue from")
         wanted = resized.config
     if wanted == resized.config:
         return resized, set()
     grows_refiner = bool(wanted.refine_widths) and before.refiner is None
     return mdm.grown(resized, wanted), {"refiner"} if grows_refiner else set()
-
-
-def _is_kind_of(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in what `mdm.grown` can add."""
-    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": ()}
-    return replace(one, **plain) == replace(other, **plain)
 
 
 def _says_nothing(config: LearnConfig) -> bool:

@@ -22,13 +22,10 @@ from mudg.models import mdm
 from mudg.stages.config import LearnConfig
 from mudg.stages.synthesize import model_size
 
-HELD_OUT = 1_000_000
-"""Numbers of cities, and of clips of logs, from here on are never trained on."""
-
 
 def held_out(config: LearnConfig) -> list[int]:
     """Numbers of the shards used for scoring only."""
-    return [HELD_OUT + n for n in range(config.held_out)]
+    return [city_clips.HELD_OUT + n for n in range(config.held_out)]
 
 
 def cities_at(config: LearnConfig, step: int) -> int:
@@ -128,7 +125,7 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
 def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tuple[int, int]:
     """Make the missing clips of all logs; returns how many there are to train on and to score."""
     sources = [log_clips.log_source(text) for text in config.scenes]
-    rows, counts = log_clips.plan(sources, rules, HELD_OUT)
+    rows, counts = log_clips.plan(sources, rules, city_clips.HELD_OUT)
     log_clips.claim(folder, rules, sources)
     jobs: list[tuple[LogSource, LogClipRules, list[tuple[int, LogWindow]], Path]] = []
     for source in dict.fromkeys(sources):

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from mudg.base import palette, store
-from mudg.base.types import Condition
+from mudg.base.types import Camera, Condition, View
 from mudg.core import metrics
 from mudg.data import clip_shards
 from mudg.data.clip_shards import Batch
@@ -45,14 +45,12 @@ def score(
     bf16: bool,
     eta: float = 1.0,
     sampler: str = "ddim",
-    given_classes: bool = True,
     prepare: Callable[[Batch], Batch] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
 
-    Without `given_classes` the condition's classes are withheld, as for a log without labels. `prepare` changes each batch
-    of one clip before it is used.
+    `prepare` changes each batch of one clip before it is used, for example `without_classes`.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": steps}. Keys as in
     `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
@@ -65,9 +63,6 @@ def score(
             frames = range(model.config.window)
             batch = clip_shards.read_batch(folder, [(city, clip, frames)])
             batch = batch if prepare is None else prepare(batch)
-            if not given_classes:
-                unknown = torch.full_like(batch.ids, 255)
-                batch = dataclasses.replace(batch, ids=unknown, backdrop_ids=unknown)
             sample = model.sample(
                 condition_of(batch), steps=steps, seed=seed, index=city * 16 + clip, sampler=sampler, eta=eta, bf16=bf16
             )
@@ -86,10 +81,14 @@ def score(
     return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": steps}
 
 
+def without_classes(batch: Batch) -> Batch:
+    """The batch as of a log without labels: no class comes with the condition."""
+    unknown = torch.full_like(batch.ids, palette.UNLABELLED)
+    return dataclasses.replace(batch, ids=unknown, backdrop_ids=unknown)
+
+
 def condition_of(batch: Batch, index: int = 0) -> Condition:
     """The condition of one clip of a batch; its views are stand-ins (the model does not read poses)."""
-    from mudg.base.types import Camera, View
-
     frames, _, height, width = batch.color.shape[1:]
     camera = Camera("clip", width, height, float(width), float(width), width / 2, height / 2)
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))

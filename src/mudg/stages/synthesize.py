@@ -34,7 +34,7 @@ from mudg.core import trajectory
 from mudg.data.clips import ConditionRules, Recorded, Source, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter
-from mudg.data.scenefile import read_image, read_label, read_scene
+from mudg.data.scenefile import read_image, read_scene, read_trusted_classes
 from mudg.models import mdm
 from mudg.models.mdm import MDM, Sample
 from mudg.models.published import PublishedMDM
@@ -198,17 +198,11 @@ def model_size(width: int, height: int, multiple: int, area: int, width_px: int 
     return chosen
 
 
-def recorded_images(scene: Scene, held_out: bool, classes: bool) -> list[Recorded]:
-    """Recorded images that may be warped in, of all cameras, with their semantic labels if `classes`."""
-    frames = scene.frames if held_out else scene.frames_in("train")
-    return [
-        Recorded(
-            frame.view,
-            read_image(scene, frame),
-            read_label(scene, frame, "semantics") if classes and "semantics" in frame.labels else None,
-        )
-        for frame in frames
-    ]
+def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Recorded]:
+    """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
+    frames = scene.frames if config.held_out_images else scene.frames_in("train")
+    classes = lambda frame: read_trusted_classes(scene, frame, config.label_confidence) if config.given_classes else None  # noqa: E731
+    return [Recorded(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
 
 
 def without_classes(cloud: FusedCloud) -> FusedCloud:
@@ -237,7 +231,7 @@ def make_trajectory(job: Job) -> int:
         width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
         fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
         rules = ConditionRules(width, height, *fine)
-    recorded = recorded_images(scene, config.held_out_images, config.given_classes)
+    recorded = recorded_images(scene, config)
     maker = ViewMaker(model, scene, cloud, recorded, rules, config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
