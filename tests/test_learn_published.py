@@ -212,7 +212,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     window = log_clips.log_windows(log.scene, rules)[0]
     held = replace(window, held_out=True)  # all points are kept
     clip = log_clips.make_clip(log, held, 0)
-    recorded = synthesize.recorded_images(log.scene, held_out=False, classes=False)
+    recorded = synthesize.recorded_images(log.scene, SynthesizeConfig(given_classes=False))
     views = [log.frame(name).view for name in window.frames]
     conditions = ConditionRules(48, 32, 72, 48, published=True)
     wanted = build_condition(log.cloud, log.scene.tracks, views, recorded, conditions)
