@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.core import metrics, trajectory
 from mudg.core.raster import RasterConfig
-from mudg.data.cloudfile import write_fused
+from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scenefile import read_scene
 from mudg.models.nodes import RigidNode
@@ -248,6 +250,53 @@ def test_view_order_is_a_function_of_seed_and_step_and_fair():
     assert all(sorted(drawn[i : i + 4]) == list("abcd") for i in range(0, 40, 4))
     virtual = [views.choose(7, step, 0.3) for step in range(400)]
     assert 0.2 < sum(v in "xy" for v in virtual) / 400 < 0.4
+
+
+def test_virtual_views_join_from_near_to_far():
+    views = fit_views.ViewSet(tuple(map(Named, "ab")), tuple(map(Named, "wxyz")), (2.0, 2.01, 3.0, 4.0))
+    draws = lambda reach: {views.choose(3, step, 1.0, reach_m=reach) for step in range(80)}  # noqa: E731
+    assert draws(2.0) == {"w", "x"}
+    assert draws(3.2) == {"w", "x", "y"}
+    assert draws(float("inf")) == set("wxyz")
+    config = settings("mudg_s", iterations=100, virtual_start=0.2, virtual_grow=0.4)
+    reach = [fit._virtual_reach_m(views, config, step) for step in (1, 20, 40, 60, 90)]
+    assert reach == pytest.approx([2.0, 2.0, 3.0, 4.0, 4.0])
+    assert fit._virtual_reach_m(views, settings("mudg_s"), 1) == float("inf")
+
+
+def test_offsets_are_distances_from_the_same_cameras_path():
+    named = lambda x, y, name: SimpleNamespace(  # noqa: E731
+        view=SimpleNamespace(center_world=np.array([x, y, 1.0]), camera=SimpleNamespace(name=name))
+    )
+    recorded = [named(x, 0.0, "front") for x in range(4)] + [named(0.0, 7.0, "left")]
+    virtual = [named(2.0, 3.0, "front"), named(0.0, 8.0, "left"), named(1.0, 2.0, "other")]
+    assert fit_views.offsets_from_path_m(recorded, virtual) == pytest.approx((3.0, 1.0, 2.0))
+    assert fit_views.offsets_from_path_m(recorded, ()) == ()
+
+
+def test_fused_points_give_depth_beside_the_path(world):
+    """Drawn at a shifted view, the static points and those of the moving car lie on the exact surfaces."""
+    scene = read_scene(world["scene"])
+    view = view_at(scene.frames_of("front")[3].view.time_s, camera(width=SIZE[0], height=SIZE[1]), left_m=0.6)
+    lidar = fit_views.fused_lidar(read_fused(world["fuse"]), scene.tracks)(view)
+    exact = truth(view)
+    relative = ((lidar.depth_m - exact.depth.reshape(-1)[lidar.pixel]).abs() / lidar.depth_m).nan_to_num(1.0)
+    assert len(lidar.pixel) > 200
+    assert relative.median() < 0.03
+    car = exact.semantics.reshape(-1)[lidar.pixel] == ID["car"]
+    assert car.sum() > 5 and relative[car].median() < 0.05
+
+
+@pytest.mark.parametrize("changes", [{"virtual_lidar_weight": 0.2}, {"virtual_ssim_weight": 0.0}, {"virtual_densify": True}])
+def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path, changes):
+    usual = settings("mudg_s", iterations=30, max_gaussians=2500, virtual_start=0.0, virtual_probability=0.6)
+    folders = [
+        fit.run(config, world["scene"], world["fuse"], tmp_path / name, observations=world["virtual"])
+        for name, config in (("usual", usual), ("changed", replace(usual, **changes)))
+    ]
+    assert fitted_bytes(folders[0]) != fitted_bytes(folders[1])
+    model = fit.load_model(folders[1])
+    assert all(torch.isfinite(value).all() for value in model.table.columns.values())
 
 
 def test_lidar_pixels_agree_with_exact_depth(world):

@@ -4,15 +4,20 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy import ndimage
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
+from mudg.core import trajectory
+from mudg.data.clips import ConditionRules, build_conditions
+from mudg.data.cloudfile import read_fused
 from mudg.data.observations import list_observation_sets, read_observations
+from mudg.data.scenefile import read_scene
 from mudg.models import mdm
 from mudg.models.mdm import MDM, MDMConfig
 from mudg.models.vae import CodecConfig
-from mudg.stages import fuse, synthesize
-from mudg.stages.config import FuseConfig, SynthesizeConfig
+from mudg.stages import fit, fuse, synthesize
+from mudg.stages.config import FitConfig, FuseConfig, SynthesizeConfig
 
 FRAMES = 7
 
@@ -172,3 +177,37 @@ def test_bad_requests(world, tmp_path):
         made(world, tmp_path / "c", shifts_m=())
     with pytest.raises(UsageError, match="same trajectory"):
         made(world, tmp_path / "d", shifts_m=(1.0, 1.01))
+
+
+def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
+    """Views change where nothing was measured, the scene's class stands there, and its renders may be started from."""
+    root, config = world
+    fitted = fit.run(
+        FitConfig(method="street_gaussians", iterations=4, initial_gaussians=900, max_gaussians=1500), root / "scene", root / "fused",
+        tmp_path / "fit",
+    )  # fmt: skip
+    scene, cloud = read_scene(root / "scene"), read_fused(root / "fused")
+    view = trajectory.shifted(scene, "front", 1.0).views[2]
+    rules = ConditionRules(96, 64)
+    look = synthesize.Renders(fitted)
+    plain = build_conditions(cloud, scene.tracks, [view], [], rules)[0]
+    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=look.at)[0]
+    assert bool(helped.valid[plain.valid].all())
+    assert int(helped.valid.sum()) > int(plain.valid.sum())
+    near = torch.from_numpy(ndimage.binary_dilation(plain.valid[0, 0].numpy(), iterations=rules.measured_reach_px))
+    new = helped.valid[0, 0] & ~plain.valid[0, 0]
+    assert not bool((new & near).any())
+    shown = look.at(view.resized(96, 64))
+    assert torch.equal(helped.depth[0, 0][new], shown.depth[new])
+    assert torch.equal(helped.semantics[0, 0][new], shown.semantics[new])
+    run = lambda name, **more: synthesize.run(  # noqa: E731
+        replace(config, **more), root / "scene", root / "fused", tmp_path / name, fitted=fitted
+    )
+    usual = frames_of(made(world, tmp_path / "plain") / "front_shift+1.0")
+    assert not all(torch.equal(a.rgb, b.rgb) for a, b in zip(usual, frames_of(run("helped") / "front_shift+1.0")))
+    assert len(frames_of(run("started", start="render", strength=0.5) / "front_shift+1.0")) == FRAMES
+    model = mdm.load(root / "model")
+    latents = look.latents(model, [view.resized(48, 32)])
+    assert torch.equal(latents["rgb"], model.codec.encode_rgb(look.observation(view.resized(48, 32)).rgb[None]))
+    with pytest.raises(UsageError, match="nothing to start from"):
+        made(world, tmp_path / "refused", start="render")

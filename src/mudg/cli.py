@@ -65,7 +65,8 @@ def _convert(args: f.Convert) -> dict[str, Any]:
 def _synthesize(args: f.Synthesize) -> dict[str, Any]:
     from mudg.stages import synthesize
 
-    return {"views": synthesize.run(args.settings, args.scene, args.fused, args.out, overwrite=args.overwrite)}
+    made = synthesize.run(args.settings, args.scene, args.fused, args.out, fitted=args.fitted, overwrite=args.overwrite)
+    return {"views": made}
 
 
 def _fit(args: f.Fit) -> dict[str, Any]:

@@ -98,6 +98,8 @@ class Synthesize(Output):
     """Scene made by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
     """Clouds made by fuse."""
+    fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Scene made by fit: its renders tell what stands where LiDAR measured nothing."""
     settings: Annotated[stage_config.SynthesizeConfig, arg(name="")] = stage_config.SynthesizeConfig()
 
 

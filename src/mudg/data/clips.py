@@ -18,7 +18,7 @@ The generated cities as training data are in `city_clips`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +60,8 @@ class ConditionRules:
     """Distance at which the nearest recorded image is put up as a backdrop."""
     occluder_m: float = 0.2
     """Side of the square with which points hide what lies behind them."""
+    measured_reach_px: int = 4
+    """A pixel this near to a measured one is left to it; farther ones may be filled `beyond` what was measured."""
     published: bool = False
     """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
 
@@ -87,6 +89,36 @@ class Sparse:
     valid: Tensor
     moving: Tensor
     semantics: Tensor
+
+
+Beyond = Callable[[View], Sparse]
+"""What is known of a view from elsewhere than its points; `valid` where anything is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """A fused cloud ready to be drawn, and what is known `beyond` it."""
+
+    cloud: FusedCloud
+    tracks: Sequence[Track]
+    rules: ConditionRules
+    beyond: Beyond | None
+
+    def at(self, view: View) -> Sparse:
+        """The points seen at a view, and what is known beyond them."""
+        sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
+        return sparse if self.beyond is None else fill_beyond(sparse, self.beyond(view), self.rules.measured_reach_px)
+
+
+def fill_beyond(measured: Sparse, other: Sparse, reach_px: int) -> Sparse:
+    """`measured`, and `other` where it is valid and nothing was measured within `reach_px` (steps to the four sides)."""
+    near = torch.from_numpy(ndimage.binary_dilation(measured.valid.numpy(), iterations=max(reach_px, 1)))
+    taken = other.valid & ~near
+    pick = lambda mine, theirs: torch.where(taken, theirs, mine)  # noqa: E731
+    return Sparse(
+        pick(measured.rgb, other.rgb), pick(measured.depth, other.depth), measured.valid | taken, pick(measured.moving, other.moving),
+        pick(measured.semantics, other.semantics),
+    )  # fmt: skip
 
 
 def remove_shine_through(depth: NDArray[np.float32], valid: NDArray[np.bool_], reach_px: int = 3) -> NDArray[np.bool_]:
@@ -197,18 +229,21 @@ def build_condition(
     recorded: Sequence[Recorded],
     rules: ConditionRules,
     sources: dict[int, Source] | None = None,
+    beyond: Beyond | None = None,
 ) -> Condition:
     """The model's condition for `views` (any path, any size; resized to the rules' size).
 
     cloud      fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time
     recorded   images of any cameras; the ones nearest in time to a view are warped into it; may be empty
     sources    cache of prepared images (index into `recorded` -> Source); pass the same dict again for further views
+    beyond     what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
+               within `rules.measured_reach_px` as if it were points (not with `published`)
     Returns colour and depth filled everywhere (zeros with `published`), `valid` where a point was seen and kept,
     `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as reference the recorded image of the first view's
     camera that is nearest in time (black if there is none).
     Raises InputError for an empty list of views.
     """
-    return build_conditions(cloud, tracks, views, recorded, rules, sources)[0]
+    return build_conditions(cloud, tracks, views, recorded, rules, sources, beyond)[0]
 
 
 def build_conditions(
@@ -218,6 +253,7 @@ def build_conditions(
     recorded: Sequence[Recorded],
     rules: ConditionRules,
     sources: dict[int, Source] | None = None,
+    beyond: Beyond | None = None,
 ) -> tuple[Condition, Condition]:
     """As `build_condition`, and the same condition on the fine grid (the same object if there is no finer one)."""
     if not views:
@@ -230,7 +266,8 @@ def build_conditions(
     sources = {} if sources is None else sources
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
-    looks = [_look(cloud, tracks, view, recorded, rules, sources) for view in fine_views]
+    points = Points(cloud, tracks, rules, beyond)
+    looks = [_look(points, view, recorded, rules, sources) for view in fine_views]
     color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*looks))
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
                      warped, backdrop, ids, far_ids)  # fmt: skip
@@ -240,7 +277,7 @@ def build_conditions(
     def reduced(x: Tensor) -> Tensor:
         return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
 
-    own = [project_sparse(cloud, tracks, view, rules) for view in small]
+    own = [points.at(view) for view in small]
     own_depth = torch.stack([_filled(sparse, rules)[1] for sparse in own])[:, None]
     own_valid = torch.stack([sparse.valid for sparse in own])[:, None]
     small_size = (rules.height, rules.width)
@@ -251,8 +288,7 @@ def build_conditions(
 
 
 def _look(
-    cloud: FusedCloud,
-    tracks: Sequence[Track],
+    points: Points,
     view: View,
     recorded: Sequence[Recorded],
     rules: ConditionRules,
@@ -263,10 +299,10 @@ def _look(
 
     def source(number: int) -> Source:
         if number not in sources:
-            sources[number] = _prepare_source(cloud, tracks, recorded[number], view, rules)
+            sources[number] = _prepare_source(points, recorded[number], view, rules)
         return sources[number]
 
-    sparse = project_sparse(cloud, tracks, view, rules)
+    sparse = points.at(view)
     colour, depth, moving, ids = _filled(sparse, rules)
     found = torch.zeros_like(sparse.valid)
     if not (rules.warp and recorded):
@@ -344,15 +380,13 @@ def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionR
     return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
 
 
-def _prepare_source(
-    cloud: FusedCloud, tracks: Sequence[Track], recorded: Recorded, target: View, rules: ConditionRules
-) -> Source:
+def _prepare_source(points: Points, recorded: Recorded, target: View, rules: ConditionRules) -> Source:
     """A recorded image brought to about as many pixels as the target view, with its depth."""
     camera = recorded.view.camera
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
-    _, depth, moving, _ = _filled(project_sparse(cloud, tracks, view, rules), rules)
+    _, depth, moving, _ = _filled(points.at(view), rules)
     return Source(
         view, _tensor(resize_image(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
     )

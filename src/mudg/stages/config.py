@@ -221,8 +221,9 @@ class SynthesizeConfig:
     """How the steps are taken. Each costs one pass of the network per step."""
     eta: float = Field(default=1.0, ge=0, le=1)
     """Noise that ddim adds between steps: 0 = deterministic, 1 = ancestral."""
-    start: Literal["noise", "condition"] = "noise"
-    """condition: start from the condition with noise on it, and run only the share `strength` of the schedule."""
+    start: Literal["noise", "condition", "render"] = "noise"
+    """condition, render: start from the condition, or from the fitted scene's renders, with noise on it, and run only the
+    share `strength` of the schedule."""
     strength: float = Field(default=1.0, gt=0, le=1)
     samples: int = Field(default=1, ge=1)
     """Samples per clip; the first is kept, the spread of all lowers the confidence. Costs that many times the passes."""
@@ -311,15 +312,28 @@ class FitConfig:
     """mudg_s: how often a virtual view is taken instead of a recorded one (theta)."""
     virtual_start: float = Field(default=0.15, ge=0, le=1)
     """mudg_s: share of the iterations before virtual views join."""
-    virtual_stop: float = Field(default=1.0, ge=0, le=1)
-    """mudg_s: share of the iterations after which only recorded views are taken again."""
-    virtual_seen_weight: float = Field(default=0.1, ge=0, le=1)
-    """mudg_s: weight of virtual pixels whose surface a recorded view saw, beside 1 for those that none saw."""
+    virtual_stop: float = Field(default=0.9, ge=0, le=1)
+    """mudg_s: share of the iterations after which only recorded views are taken again, which gives the recorded path back what
+    it lost."""
+    virtual_grow: float = Field(default=0.0, ge=0, le=1)
+    """mudg_s: share of the iterations over which virtual views farther and farther from the recorded path join (0 = all at once)."""
+    virtual_seen_weight: float = Field(default=1.0, ge=0, le=1)
+    """mudg_s: weight of virtual pixels whose surface a recorded view saw, beside 1 for those that none saw. Lower it for a
+    diffusion model that is worse than the scene fitted without it."""
+    virtual_confidence_power: float = Field(default=1.0, ge=0)
+    """mudg_s: every term of a virtual view is weighted by the observation's confidence to this power (0 = all pixels alike)."""
     virtual_gaussians: int = Field(default=8000, ge=0)
     """mudg_s: at most so many Gaussians start at surfaces that only virtual views show."""
+    virtual_densify: bool = False
+    """mudg_s: virtual views also decide where Gaussians are added."""
     virtual_color_weight: float = Field(default=1.0, ge=0)
+    virtual_ssim_weight: float = Field(default=0.3, ge=0, le=1)
+    """mudg_s: share of structural similarity in the colour term, as `ssim_weight` for recorded views."""
     virtual_perceptual_weight: float = Field(default=0.1, ge=0)
-    virtual_depth_weight: float = Field(default=0.1, ge=0)
+    virtual_depth_weight: float = Field(default=0.3, ge=0)
+    """mudg_s: dense depth that the diffusion model made, robust and relative."""
+    virtual_lidar_weight: float = Field(default=0.0, ge=0)
+    """mudg_s: depth of the fused LiDAR points drawn at the virtual views (best 95 % of them, relative error)."""
     virtual_semantic_weight: float = Field(default=0.02, ge=0)
     """Small: the shipped diffusion model tells classes less well than Gaussians that learned them from recorded frames."""
     checkpoint_every: int = Field(default=500, ge=1)

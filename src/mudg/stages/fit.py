@@ -42,7 +42,17 @@ from mudg.models.nodes import SceneModel, compose, composite_semantics, composit
 from mudg.stages.config import FitConfig
 from mudg.stages.fit_start import StartSettings, start_model
 from mudg.stages.fit_trust import unseen_maps, unseen_rows
-from mudg.stages.fit_views import Sample, ViewSet, classes_of, load_recorded, load_virtual, training_frames
+from mudg.stages.fit_views import (
+    Sample,
+    StoredView,
+    ViewSet,
+    classes_of,
+    fused_lidar,
+    load_recorded,
+    load_virtual,
+    offsets_from_path_m,
+    training_frames,
+)
 
 VERSION = 1
 PUBLISHED_STEPS = 30_000
@@ -130,7 +140,12 @@ def _prepare(config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Pa
     frames = training_frames(scene, config.cameras)
     classes = classes_of(scene, frames, virtual) if config.semantics else ()
     recorded = load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0)
-    views = ViewSet(recorded, load_virtual(virtual, classes) if virtual is not None else ())
+    fused = read_fused(fused_path)
+    shown: tuple[StoredView, ...] = ()
+    if virtual is not None:
+        measured = fused_lidar(fused, scene.tracks) if config.virtual_lidar_weight else None
+        shown = load_virtual(virtual, classes, measured)
+    views = ViewSet(recorded, shown, offsets_from_path_m(recorded, shown))
     schedule = densify_schedule(config)
     found = checkpoint.latest(out / "steps")
     if found is not None:
@@ -143,7 +158,7 @@ def _prepare(config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Pa
         config.initial_gaussians, config.voxel_m, config.far_m, config.sh_degree, recipe.objects, recipe.sky,
         config.learn_poses, config.seed,
     )  # fmt: skip
-    model = start_model(scene, read_fused(fused_path), recorded, classes, start)
+    model = start_model(scene, fused, recorded, classes, start)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
     return FitState(model, views, DensifyStats.zeros(len(model.table)), schedule, 0)
 
@@ -166,10 +181,11 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             if step > virtual_from and state.unseen is None and state.views.virtual:
                 state.unseen = admit_virtual_views(state, config, raster)
             probability = config.virtual_probability if virtual_from < step <= virtual_to else 0.0
-            sample = state.views.choose(config.seed, step, probability, state.unseen)
+            reach_m = _virtual_reach_m(state.views, config, step)
+            sample = state.views.choose(config.seed, step, probability, state.unseen, reach_m)
             observation = sample.observation
             recorded = observation.kind == "recorded"
-            growing = recorded and config.densify and step <= state.schedule.stop
+            growing = (recorded or config.virtual_densify) and config.densify and step <= state.schedule.stop
 
             gaussians = compose(state.model, observation.view.time_s, semantics=not recorded or step % config.semantic_every == 0)
             render = rasterize(gaussians, observation.view, raster, absgrad=growing)
@@ -197,6 +213,15 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             if interrupted.is_set():
                 folder.pause(state.summary())
                 raise KeyboardInterrupt
+
+
+def _virtual_reach_m(views: ViewSet, config: FitConfig, step: int) -> float:
+    """How far from the recorded path virtual views may be at a step, metres: grows from the nearest one to all of them."""
+    if not views.virtual or not config.virtual_grow:
+        return math.inf
+    nearest, farthest = min(views.offsets_m), max(views.offsets_m)
+    along = (step / config.iterations - config.virtual_start) / config.virtual_grow
+    return nearest + (farthest - nearest) * min(max(along, 0.0), 1.0)
 
 
 def admit_virtual_views(state: FitState, config: FitConfig, raster: RasterConfig) -> Tensor:
@@ -247,11 +272,16 @@ def virtual_terms(
 ) -> dict[str, Tensor]:
     """Weighted loss terms of a virtual view, every pixel weighted by the observation's confidence."""
     seen = sample.observation
-    weight = seen.confidence * seen.mask * torch.where(sample.unseen, 1.0, config.virtual_seen_weight)
+    sure = seen.confidence if config.virtual_confidence_power == 1 else seen.confidence**config.virtual_confidence_power
+    weight = sure * seen.mask * torch.where(sample.unseen, 1.0, config.virtual_seen_weight)
     rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
     terms: dict[str, Tensor] = {}
     if config.virtual_color_weight:
-        terms["virtual_color"] = config.virtual_color_weight * losses.confident_mean(losses.l1_map(rgb, seen.rgb), weight)
+        share = config.virtual_ssim_weight
+        loss = (1 - share) * losses.l1_map(rgb, seen.rgb)
+        if share:
+            loss = loss + share * (1 - losses.ssim_map(rgb, seen.rgb))
+        terms["virtual_color"] = config.virtual_color_weight * losses.confident_mean(loss, weight)
     if config.virtual_perceptual_weight:
         with torch.no_grad():
             target = perception(seen.rgb)
@@ -260,6 +290,9 @@ def virtual_terms(
         valid = torch.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth < FARTHEST_VIRTUAL_DEPTH_M)
         loss = losses.dense_depth_map(render.depth, torch.where(valid, seen.depth, 1.0))
         terms["virtual_depth"] = config.virtual_depth_weight * losses.confident_mean(loss, weight * valid)
+    if sample.lidar is not None and len(sample.lidar.pixel) and config.virtual_lidar_weight:
+        loss = losses.sparse_depth(render.depth, sample.lidar.pixel, sample.lidar.depth_m)
+        terms["virtual_lidar"] = config.virtual_lidar_weight * loss
     if sample.sky is not None and config.sky_weight and model.sky is not None:
         terms["virtual_sky"] = config.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, sample.sky), weight)
     if render.extra is not None and seen.semantics is not None and config.virtual_semantic_weight:

@@ -6,8 +6,9 @@ gets is a function of (run seed, step) alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,9 @@ from torch import Tensor
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import Frame, Observation, Scene, Sweep, View
+from mudg.base.types import Frame, FusedCloud, Observation, Scene, Sweep, Track, View
 from mudg.data import scenefile
+from mudg.data.clips import ConditionRules, project_sparse
 from mudg.data.observations import list_observation_sets, read_observations
 
 MAX_LIDAR_M = 100.0
@@ -28,6 +30,8 @@ NEAREST_SWEEP_S = 0.1
 OCCLUSION_CELL_PX = (8, 3)
 """Columns and rows of the neighbourhood in which a nearer point hides a farther one (rows: about one beam apart)."""
 OCCLUSION_MARGIN = 0.15
+NEXT_TO_M = 0.05
+"""Distances from the recorded path that differ by less are the same distance."""
 
 
 @dataclass(frozen=True)
@@ -95,22 +99,29 @@ class StoredView:
 
 @dataclass(frozen=True)
 class ViewSet:
-    """All views of a fit. ``virtual`` may be empty."""
+    """All views of a fit. ``virtual`` may be empty; ``offsets_m``: how far each of them is from the recorded path."""
 
     recorded: tuple[StoredView, ...]
     virtual: tuple[StoredView, ...]
+    offsets_m: tuple[float, ...] = ()
 
-    def choose(self, run_seed: int, step: int, virtual_probability: float, unseen: Tensor | None = None) -> Sample:
+    def choose(
+        self, run_seed: int, step: int, virtual_probability: float, unseen: Tensor | None = None, reach_m: float = math.inf
+    ) -> Sample:
         """The view of a step: virtual with the given probability (if there are any), else the next recorded one.
 
         Recorded views come in a fresh random order per round, so that every one is seen equally often.
 
         Args:
             unseen: u8[V, H, W], what only the virtual views see (see ``fit_trust``).
+            reach_m: virtual views farther than this from the recorded path are not taken yet.
         """
         generator = seeds.numpy_rng(run_seed, step, "view")
         if self.virtual and generator.random() < virtual_probability:
-            index = int(generator.integers(len(self.virtual)))
+            within = range(len(self.virtual))
+            if math.isfinite(reach_m):
+                within = [i for i, offset in enumerate(self.offsets_m) if offset <= reach_m + NEXT_TO_M]
+            index = within[int(generator.integers(len(within)))]
             return self.virtual[index].sample(None if unseen is None else unseen[index])
         turn, place = divmod(step, len(self.recorded))
         order = seeds.numpy_rng(run_seed, turn, "recorded order").permutation(len(self.recorded))
@@ -189,8 +200,10 @@ def load_recorded(
     return tuple(stored)
 
 
-def load_virtual(path: Path, classes: Sequence[int], trajectories: Sequence[str] = ()) -> tuple[StoredView, ...]:
-    """All observations below ``path`` (of the named trajectories; empty = all).
+def load_virtual(
+    path: Path, classes: Sequence[int], measured: Callable[[View], LidarPixels] | None = None
+) -> tuple[StoredView, ...]:
+    """All observations below ``path``, with the sparse depth that ``measured`` gives for a view.
 
     Raises:
         InputError: no observation folder there, or a recorded one among them.
@@ -200,12 +213,41 @@ def load_virtual(path: Path, classes: Sequence[int], trajectories: Sequence[str]
         raise InputError("no finished folders of observations here", where=str(path), remedy="run `mudg synthesize` first")
     stored = []
     for name, folder in sets.items():
-        if trajectories and name not in trajectories:
-            continue
         observations = read_observations(folder)
         for index in range(len(observations)):
-            stored.append(stored_observation(f"{name}/{index:06d}", observations[index], classes))
+            seen = observations[index]
+            lidar = None if measured is None else measured(seen.view)
+            stored.append(replace(stored_observation(f"{name}/{index:06d}", seen, classes), lidar=lidar))
     return tuple(stored)
+
+
+def offsets_from_path_m(recorded: Sequence[StoredView], virtual: Sequence[StoredView]) -> tuple[float, ...]:
+    """Distance of each virtual view from the nearest recorded one of the same camera (of any, if it recorded nothing)."""
+    if not virtual:
+        return ()
+    every = np.stack([view.view.center_world for view in recorded])
+    names = [view.view.camera.name for view in recorded]
+    found = []
+    for view in virtual:
+        own = [name == view.view.camera.name for name in names]
+        centres = every[own] if any(own) else every
+        found.append(float(np.linalg.norm(centres - view.view.center_world, axis=1).min()))
+    return tuple(found)
+
+
+def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
+    """A function view -> depths of the fused points seen there: the static ones, and those of objects where they are then.
+
+    Points behind others are left out as in the diffusion model's condition (``data.clips.project_sparse``).
+    """
+
+    def at(view: View) -> LidarPixels:
+        camera = view.camera
+        seen = project_sparse(cloud, tracks, view, ConditionRules(camera.width, camera.height, far_m=MAX_LIDAR_M))
+        pixel = seen.valid.reshape(-1).nonzero()[:, 0]
+        return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
+
+    return at
 
 
 def stored_observation(name: str, observation: Observation, classes: Sequence[int]) -> StoredView:

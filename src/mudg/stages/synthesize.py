@@ -26,12 +26,13 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import log, store
+from mudg.base import log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
 from mudg.core import trajectory
-from mudg.data.clips import ConditionRules, Recorded, Source, build_conditions
+from mudg.core.raster import RasterConfig
+from mudg.data.clips import ConditionRules, Recorded, Source, Sparse, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scenefile import read_image, read_scene, read_trusted_classes
@@ -41,6 +42,7 @@ from mudg.models.published import PublishedMDM
 from mudg.models.vae import Modality
 from mudg.stages import published_model
 from mudg.stages.config import SynthesizeConfig
+from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.learn_score import class_image, depth_image, rgb_image
 from mudg.stages.precision import choose_bf16
 
@@ -58,24 +60,35 @@ class Job:
     out: Path
     camera: str
     shift_m: float
+    fitted: Path | None = None
 
 
-def run(config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, overwrite: bool = False) -> Path:
+def run(
+    config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, fitted: Path | None = None, overwrite: bool = False
+) -> Path:
     """Generate all trajectories of the configuration; returns `out`, one folder of observations per trajectory inside.
 
     Args:
         config: see `SynthesizeConfig`.
         scene: scene directory or stored zip. fused: output of fuse for this scene.
         out: a finished result of the same configuration and inputs is verified and reused.
+        fitted: output of fit for this scene, whose renders tell what stands where no point was measured (above the LiDAR's
+            beams, beyond its range), and may be started from (`config.start`). Not used by published-type models.
 
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
     if published_model.is_published(config.model):
+        if fitted is not None:
+            raise UsageError("a published-type model takes points only", where="--fitted", remedy="leave it out")
         config = replace(config, processes=config.processes or 1)  # one copy of a large model in memory
     else:
         mdm.load(config.model)  # fails now rather than in every process
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": mdm.digest(config.model)}
+    if fitted is not None:
+        inputs["fitted"] = store.digest(fitted)
+    elif config.start == "render":
+        raise UsageError("nothing to start from", where="--start render", remedy="give the fitted scene with --fitted")
     directory = store.RunDir.open(out, "synthesize", to_dict(config), inputs, _VERSION, overwrite)
     if directory.complete:
         return directory.reused()
@@ -83,7 +96,7 @@ def run(config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, overwr
     cameras = config.cameras or tuple(loaded.cameras)[:1]
     if not cameras or not config.shifts_m:
         raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
-    jobs = [Job(config, Path(scene), Path(fused), Path(out), c, s) for c in cameras for s in config.shifts_m]
+    jobs = [Job(config, Path(scene), Path(fused), Path(out), c, s, fitted) for c in cameras for s in config.shifts_m]
     names = [trajectory_of(loaded, job).name for job in jobs]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
@@ -232,7 +245,8 @@ def make_trajectory(job: Job) -> int:
         fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
         rules = ConditionRules(width, height, *fine)
     recorded = recorded_images(scene, config)
-    maker = ViewMaker(model, scene, cloud, recorded, rules, config)
+    look = None if job.fitted is None else Renders(job.fitted)
+    maker = ViewMaker(model, scene, cloud, recorded, rules, config, look)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -284,6 +298,36 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     return int(files[-1].stem), {m: torch.from_numpy(a.copy()) for m, a in arrays.items()}  # type: ignore[misc]
 
 
+class Renders:
+    """What a fitted scene shows at a view, in the words of a condition; the last views are kept."""
+
+    def __init__(self, folder: Path) -> None:
+        self._model = load_model(folder)
+        self._raster = RasterConfig(near_m=NEAR_M)
+
+    def observation(self, view: View) -> Observation:
+        """Colour, depth (NaN in the sky and where nothing is) and classes."""
+        return render_view(self._model, view, self._raster)
+
+    def at(self, view: View) -> Sparse:
+        """Everything that is covered and not sky."""
+        seen = self.observation(view)
+        depth = torch.full(seen.rgb.shape[-2:], torch.nan) if seen.depth is None else seen.depth[0]
+        ids = torch.full(depth.shape, palette.UNLABELLED) if seen.semantics is None else seen.semantics
+        valid = torch.isfinite(depth)
+        return Sparse(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
+
+    def latents(self, model: MDM, views: Sequence[View]) -> dict[Modality, Tensor]:
+        """Renders of the views as latents to start from; what has no depth is as far as the model can say."""
+        seen = [self.observation(view) for view in views]
+        far = torch.tensor(model.config.codec.far_m)
+        depth = torch.stack([torch.where(torch.isfinite(o.depth), o.depth, far).clamp(max=far) for o in seen])  # type: ignore[arg-type, type-var]
+        unknown = torch.full(depth.shape[-2:], palette.UNLABELLED)
+        ids = torch.stack([unknown if o.semantics is None else o.semantics.long() for o in seen])
+        latents = model.encode_truth(torch.stack([o.rgb for o in seen])[None], depth[None], ids[None])
+        return {name: value[0] for name, value in latents.items()}
+
+
 class ViewMaker:
     """Conditions, samples and observations of one scene at one size."""
 
@@ -295,12 +339,14 @@ class ViewMaker:
         recorded: Sequence[Recorded],
         rules: ConditionRules,
         config: SynthesizeConfig,
+        renders: Renders | None = None,
     ) -> None:
         model.check_size(rules.height, rules.width)
         if not recorded:
             log.warn("synthesize: no recorded image may be used; holes take the nearest point's colour")
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
         self._rules, self._config = rules, config
+        self._renders = renders
         self._sources: dict[int, Source] = {}
         self._bf16 = choose_bf16(config.precision)
 
@@ -313,10 +359,11 @@ class ViewMaker:
     ) -> tuple[Sample, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
         condition, fine = build_conditions(
-            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources
-        )
+            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources,
+            None if self._renders is None else self._renders.at,
+        )  # fmt: skip
         config = self._config
-        start = self._model.condition_latents(condition) if config.start == "condition" else None
+        start = self._start(condition)
         sample = self._model.sample(
             condition, steps=config.steps, seed=config.seed, index=number, sampler=config.sampler, eta=config.eta,
             n_samples=config.samples, known=known, start=start, strength=config.strength, align=config.align_depth,
@@ -342,6 +389,15 @@ class ViewMaker:
             for i, view in enumerate(shown_views)
         ]
         return sample, condition, made
+
+
+    def _start(self, condition: Condition) -> dict[Modality, Tensor] | None:
+        """Latents that sampling starts from, None for noise."""
+        if self._config.start == "condition":
+            return self._model.condition_latents(condition)
+        if self._config.start == "render" and self._renders is not None and isinstance(self._model, MDM):
+            return self._renders.latents(self._model, condition.views)
+        return None
 
 
 def enlarge(
