@@ -329,10 +329,10 @@ class FitConfig:
     virtual_color_weight: float = Field(default=1.0, ge=0)
     virtual_ssim_weight: float = Field(default=0.3, ge=0, le=1)
     """mudg_s: share of structural similarity in the colour term, as `ssim_weight` for recorded views."""
-    virtual_perceptual_weight: float = Field(default=0.1, ge=0)
+    virtual_perceptual_weight: float = Field(default=0.3, ge=0)
     virtual_depth_weight: float = Field(default=0.3, ge=0)
     """mudg_s: dense depth that the diffusion model made, robust and relative."""
-    virtual_lidar_weight: float = Field(default=0.0, ge=0)
+    virtual_lidar_weight: float = Field(default=0.2, ge=0)
     """mudg_s: depth of the fused LiDAR points drawn at the virtual views (best 95 % of them, relative error)."""
     virtual_semantic_weight: float = Field(default=0.02, ge=0)
     """Small: the shipped diffusion model tells classes less well than Gaussians that learned them from recorded frames."""
