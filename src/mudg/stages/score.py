@@ -348,6 +348,8 @@ def _ahead(make: Callable[[int], Made], count: int) -> Iterator[Made]:
 def _values(of: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str, float | str]:
     """A number per metric, or why there is none: no truth, not produced by the method, not computed by this build."""
     values = metrics.results(dict(of))
+    if "perceptual" not in of:
+        values["perceptual"] = score_tables.NOT_ASKED  # its weights are part of every build
     for name, row in metrics.METRICS.items():
         if name in of and row.needs[0] not in truth_has:
             values[name] = score_tables.NO_TRUTH

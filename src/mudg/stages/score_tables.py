@@ -9,6 +9,7 @@ from mudg.base.types import Scene
 from mudg.methods import METHODS
 
 NO_TRUTH: Final = "no truth"
+NOT_ASKED: Final = "not asked for"
 TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
     "nearest_fill": "Fused points, holes filled",
