@@ -19,7 +19,7 @@ from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.data.city import CityConfig, CityWorld
 from mudg.models import mdm
-from mudg.models.featnets import CodecFeatures, PerceptualDistance
+from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
 from mudg.stages import score, score_tables
 from mudg.stages.config import ScoreConfig
 
@@ -117,6 +117,55 @@ def test_perceptual_distance_by_hand():
         metrics.perceptual_distance([a], [b[..., :1]])
 
 
+def lpips_state():
+    generator = torch.Generator().manual_seed(0)
+    state = {}
+    for stage, (place, out, into, size, _, _) in enumerate(LpipsFeatures.LAYERS):
+        kernel = torch.randn(out, into, size, size, generator=generator) / (into * size * size) ** 0.5
+        state[f"net.slice{stage + 1}.{place}.weight"] = kernel
+        state[f"net.slice{stage + 1}.{place}.bias"] = torch.randn(out, generator=generator) * 0.1
+        state[f"lin{stage}.model.1.weight"] = torch.rand(1, out, 1, 1, generator=generator)
+    return state
+
+
+def lpips_twin(made, truth, state):
+    """LPIPS in float64 from torch's layers and the paper's equation, written down a second time."""
+    conv = torch.nn.Conv2d
+    trunk = torch.nn.Sequential(
+        conv(3, 64, 11, 4, 2), torch.nn.ReLU(), torch.nn.MaxPool2d(3, 2), conv(64, 192, 5, padding=2), torch.nn.ReLU(),
+        torch.nn.MaxPool2d(3, 2), conv(192, 384, 3, padding=1), torch.nn.ReLU(), conv(384, 256, 3, padding=1), torch.nn.ReLU(),
+        conv(256, 256, 3, padding=1), torch.nn.ReLU(),
+    ).double()  # fmt: skip
+    trunk.load_state_dict({name.split(".", 2)[2]: v.double() for name, v in state.items() if name.startswith("net.")})
+    x = torch.stack([made, truth]).double() * 2 - 1
+    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor([0.458, 0.448, 0.450]).double().view(3, 1, 1)
+    total, stage = 0.0, 0
+    with torch.no_grad():
+        for layer in trunk:
+            x = layer(x)
+            if isinstance(layer, torch.nn.ReLU):
+                a, b = functional.normalize(x, dim=1)
+                total += float(((a - b) ** 2 * state[f"lin{stage}.model.1.weight"][0].double()).sum(0).mean())
+                stage += 1
+    return total
+
+
+def test_lpips_equals_its_float64_twin(pictures):
+    state, truth = lpips_state(), pictures[0][:, :96, :100]
+    network = LpipsFeatures(state)
+    apart = PerceptualDistance(network, network.channel_weights)(pair(rgb=blurred(truth, 1.0), truth_rgb=truth))
+    assert apart == pytest.approx(lpips_twin(blurred(truth, 1.0), truth, state), rel=1e-4)
+
+
+def test_incomplete_lpips_weights_are_refused_and_named(tmp_path):
+    state = lpips_state()
+    del state["lin3.model.1.weight"]
+    with pytest.raises(InputError, match="lin3.model.1.weight"):
+        LpipsFeatures(state, "file")
+    with pytest.raises(InputError, match="too small"):
+        LpipsFeatures(lpips_state())(torch.zeros(3, 20, 64))
+
+
 # ---- flicker and movers ----------------------------------------------------------------------------------------------
 
 
@@ -175,8 +224,13 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_movers(t
     assert values["a"]["perceptual"] == pytest.approx(0.0, abs=1e-6)
     assert values["b"]["perceptual"] > 0.05
     assert values["a"]["flicker"] == values["a"]["psnr_movers"] == score_tables.NO_TRUTH
-    off = store.read_json(score.run(ScoreConfig(perceptual_views=0), scene, views, tmp_path / "off") / "metrics.json")
-    assert off["results"][0]["values"]["perceptual"] == score_tables.NOT_ASKED
+    assert values["a"]["lpips"] == "not computed"
+    store.write_safetensors(tmp_path / "lpips.safetensors", {name: v.numpy() for name, v in lpips_state().items()})
+    config = ScoreConfig(perceptual_views=0, lpips_weights=str(tmp_path / "lpips.safetensors"))
+    other = store.read_json(score.run(config, scene, views, tmp_path / "other") / "metrics.json")
+    values = {r["method"]: r["values"] for r in other["results"]}
+    assert values["a"]["perceptual"] == score_tables.NOT_ASKED
+    assert values["a"]["lpips"] == pytest.approx(0.0, abs=1e-6) != values["b"]["lpips"]
 
 
 def test_evenly_spread_views():

@@ -17,12 +17,14 @@ The bank is differentiable, deterministic, and costs about as much as SSIM.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mudg.base.errors import InputError
 from mudg.core.metrics import Pair, perceptual_distance
 from mudg.models.vae import PatchCodec
 
@@ -110,6 +112,59 @@ class CodecFeatures(nn.Module):
                 features.append(x[0])
             image = F.avg_pool2d(image, 2)
         return features
+
+
+class LpipsFeatures(nn.Module):
+    """The AlexNet trunk of LPIPS 0.1 (Zhang et al. 2018) and its weights per channel, from tensors under the usual names.
+
+    Args:
+        state: ``net.slice{1..5}.{0,3,6,8,10}.{weight,bias}`` and ``lin{0..4}.model.1.weight``, as the lpips package names
+            them; other entries are left alone.
+        where: file name for errors.
+
+    Raises:
+        InputError: a tensor is missing or has another shape.
+    """
+
+    LAYERS: Final = ((0, 64, 3, 11, 4, 2), (3, 192, 64, 5, 1, 2), (6, 384, 192, 3, 1, 1), (8, 256, 384, 3, 1, 1), (10, 256, 256, 3, 1, 1))
+    """Place in the trunk, channels out and in, kernel, stride, padding."""
+    POOLED: Final = (1, 2)
+    """Layers before which 3x3 maxima are taken at every second place."""
+    SHIFT: Final = (-0.030, -0.088, -0.188)
+    SCALE: Final = (0.458, 0.448, 0.450)
+    SMALLEST_PX: Final = 31
+
+    def __init__(self, state: Mapping[str, Tensor], where: str = "LPIPS weights") -> None:
+        super().__init__()
+        self.kernels, self.biases, self.channel_weights = [], [], []
+        for stage, (place, out, into, size, _, _) in enumerate(self.LAYERS):
+            named = f"net.slice{stage + 1}.{place}"
+            self.kernels.append(_tensor(state, f"{named}.weight", (out, into, size, size), where))
+            self.biases.append(_tensor(state, f"{named}.bias", (out,), where))
+            self.channel_weights.append(_tensor(state, f"lin{stage}.model.1.weight", (1, out, 1, 1), where).flatten())
+
+    @torch.no_grad()
+    def forward(self, rgb: Tensor) -> list[Tensor]:
+        """Features ``[C, h, w]`` of the five stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
+        if min(rgb.shape[-2:]) < self.SMALLEST_PX:
+            size = f"{rgb.shape[-1]}x{rgb.shape[-2]}"
+            raise InputError("a picture is too small for LPIPS", expected=f"{self.SMALLEST_PX} pixels a side", got=size)
+        shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (self.SHIFT, self.SCALE))
+        x = (rgb[None].clamp(0, 1) * 2 - 1 - shift) / scale
+        features = []
+        for stage, (_, _, _, _, stride, padding) in enumerate(self.LAYERS):
+            x = F.max_pool2d(x, 3, 2) if stage in self.POOLED else x
+            x = F.relu(F.conv2d(x, self.kernels[stage], self.biases[stage], stride, padding))
+            features.append(x[0])
+        return features
+
+
+def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], where: str) -> Tensor:
+    found = state.get(name)
+    if found is None or tuple(found.shape) != shape:
+        got = "missing" if found is None else str(tuple(found.shape))
+        raise InputError("LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got)
+    return found.float()
 
 
 class PerceptualDistance:

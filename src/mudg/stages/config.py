@@ -377,6 +377,9 @@ class ScoreConfig:
     perceptual_views: int = Field(default=8, ge=0)
     """At so many views of every trajectory, evenly spread, also the perceptual distance, which costs more than all other metrics
     together (0 = never)."""
+    lpips_weights: str = ""
+    """Safetensors file with LPIPS weights (AlexNet, version 0.1, the lpips package's names), for LPIPS at the same views (empty = not
+    computed)."""
     error_pictures: bool = True
     """Write one picture of the colour error for the middle view of every trajectory."""
 

@@ -33,7 +33,7 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scenefile import read_scene
 from mudg.models import mdm
-from mudg.models.featnets import CodecFeatures, PerceptualDistance
+from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
 from mudg.stages import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.score_truth import (
@@ -114,6 +114,8 @@ def run(
     inputs = {"scene": store.digest(scene)} | {name: store.digest(folder) for name, folder in methods.items()}
     if fused is not None and config.baseline:
         inputs["fused"] = store.digest(fused)
+    if config.lpips_weights:
+        inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
     if truth is not None:
         inputs["truth"] = store.digest(truth)
     work = store.RunDir.open(out, "score", configuration.to_dict(config), inputs, version=_VERSION, overwrite=overwrite)
@@ -145,9 +147,14 @@ def run(
 
 def _distances(config: ScoreConfig) -> dict[str, Callable[[metrics.Pair], float | None]]:
     """The rows that need weights and have them."""
-    if not config.perceptual_views:
-        return {}
-    return {"perceptual": PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))}
+    found: dict[str, Callable[[metrics.Pair], float | None]] = {}
+    if config.perceptual_views:
+        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
+    if config.lpips_weights:
+        state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
+        network = LpipsFeatures(state, config.lpips_weights)
+        found["lpips"] = PerceptualDistance(network, network.channel_weights)
+    return found
 
 
 def summary_table(out: Path) -> str:
@@ -274,7 +281,7 @@ def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[]
     sums = {name: metrics.build_all(by.distances) for name in names}
     # Recorded training frames were seen by the fit and do not count; views off the path never were.
     counted = [n for n, frame in enumerate(course.frames) if frame is None or frame.id in by.held_out]
-    looked_at = set(evenly(counted, by.distance_views))
+    looked_at = set(evenly(counted, by.distance_views or len(counted)))
     truth_has: set[str] = set()
     scored = 0
     middle = len(course.views) // 2
