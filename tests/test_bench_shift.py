@@ -26,7 +26,9 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     assert (len(development), len(reported)) == (4, 8)
     assert not set(development) & set(reported)
     trained = {seeds.key(0, city, "city") & 0x7FFFFFFF for city in range(5000)}
-    scored = {city_clips.city_config(city_clips.CityClipRules(), c).seed for of in city_clips.LISTS.values() for c in of}
+    scored = {
+        city_clips.city_config(city_clips.CityClipRules(), c).seed for of in city_clips.LISTS.values() for c in of
+    }
     assert not (trained | scored) & set(development + reported)
 
 
@@ -50,7 +52,9 @@ def test_the_reported_list_is_what_the_rule_gives():
 def test_moving_instances_are_those_of_the_generator():
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     judged = set(city_logs.moving_instances(world))
-    still = {number for number, mover in enumerate(world.movers, start=1) if np.ptp(mover.keys[:, :2], axis=0).max() == 0}
+    still = {
+        number for number, mover in enumerate(world.movers, start=1) if np.ptp(mover.keys[:, :2], axis=0).max() == 0
+    }
     assert judged
     assert not judged & still
 
@@ -59,14 +63,17 @@ def test_moving_instances_are_those_of_the_generator():
 
 
 def test_variants_change_fields_of_the_fit():
-    rows = bench_shift.rows_of(BenchConfig(methods=("mudg_s",), variant=("a=virtual_probability:0.4,densify:false", "b=sh_degree:1")))
+    rows = bench_shift.rows_of(
+        BenchConfig(methods=("mudg_s",), variant=("a=virtual_probability:0.4,densify:false", "b=sh_degree:1"))
+    )
     a, b = rows[-2].fit, rows[-1].fit
     assert (a.virtual_probability, a.densify, a.iterations) == (0.4, False, 1000)
     assert dataclasses.replace(b, sh_degree=0) == rows[0].fit
 
 
 @pytest.mark.parametrize(
-    "text", ["a", "a=", "a=densify", "=densify:false", "a/b=densify:false", "a=densify:[", "a=no_such:1", "a=sh_degree:9"]
+    "text",
+    ["a", "a=", "a=densify", "=densify:false", "a/b=densify:false", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
 )
 def test_a_malformed_variant_is_refused(text):
     with pytest.raises(UsageError):
@@ -97,10 +104,22 @@ def made_up(psnr, abs_rel):
     logs = []
     for number in range(len(psnr["a"])):
         values = {
-            m: {p: {"psnr": psnr[m][number] + more, "abs_rel": abs_rel[m][number]} for p, more in (("0", 5), ("2", 0), ("4", 1))}
+            m: {
+                p: {"psnr": psnr[m][number] + more, "abs_rel": abs_rel[m][number]}
+                for p, more in (("0", 5), ("2", 0), ("4", 1))
+            }
             for m in psnr
         }
-        facts = {"log": number, "turn_deg": 1.0, "length_m": 2.0, "movers": 3, "mover_share": 0.1, "words": "x", "films": [], "seconds": {}}
+        facts = {
+            "log": number,
+            "turn_deg": 1.0,
+            "length_m": 2.0,
+            "movers": 3,
+            "mover_share": 0.1,
+            "words": "x",
+            "films": [],
+            "seconds": {},
+        }
         logs.append({**facts, "values": values})
     return logs
 
@@ -109,7 +128,9 @@ def test_differences_and_ratios_with_their_standard_errors_by_hand():
     logs = made_up({"a": [20.0, 22.0, 27.0], "b": [19.0, 20.0, 24.0]}, {"a": [0.1, 0.2, 0.3], "b": [0.2, 0.2, 0.2]})
     for entry in logs:
         entry["values"] = {m: bench_shift_tables._with_mean(of, ["2", "4"]) for m, of in entry["values"].items()}
-    difference = bench_shift_tables.compare(logs, bench_shift_tables.Comparison("", "a", "b", "shifted", "psnr", "difference"))
+    difference = bench_shift_tables.compare(
+        logs, bench_shift_tables.Comparison("", "a", "b", "shifted", "psnr", "difference")
+    )
     assert difference["value"] == pytest.approx(2.0)
     assert difference["standard_error"] == pytest.approx(np.std([1, 2, 3], ddof=1) / math.sqrt(3))
     ratio = bench_shift_tables.compare(logs, bench_shift_tables.Comparison("", "a", "b", "2", "abs_rel", "ratio"))
@@ -124,7 +145,15 @@ def test_what_a_log_lacks_is_left_out_and_named():
     logs = made_up({"a": [20.0, 22.0], "b": [19.0, 20.0]}, {"a": [0.1, 0.2], "b": [0.2, 0.2]})
     logs[1]["values"]["a"]["2"]["psnr"] = "no truth"
     rows = [{"name": "a", "title": "a", "fit": None}, {"name": "b", "title": "b", "fit": None}]
-    settings = {"list": "x", "iterations": 1, "seed": 0, "frames": 4, "size_px": [8, 8], "cameras": ["front"], "held_out_every": 4}
+    settings = {
+        "list": "x",
+        "iterations": 1,
+        "seed": 0,
+        "frames": 4,
+        "size_px": [8, 8],
+        "cameras": ["front"],
+        "held_out_every": 4,
+    }
     document = bench_shift_tables.document(logs, rows, [2.0, 4.0], settings)
     assert document["pooled"]["a"]["2"]["psnr"] == {"mean": 20.0, "standard_error": None, "logs": 1}
     assert document["logs"][1]["values"]["a"]["shifted"]["psnr"] == "no truth"

@@ -25,7 +25,9 @@ from mudg.stages.config import ScoreConfig
 
 
 def pair(**given) -> Pair:
-    empty = dict.fromkeys(("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics"))
+    empty = dict.fromkeys(
+        ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
+    )
     return Pair(**{**empty, **given})
 
 
@@ -35,7 +37,9 @@ def pictures():
     found = []
     for seed in (11, 12):
         world = CityWorld(CityConfig(seed=seed, n_frames=4, width=192, height=128, cameras=("front",)))
-        found.append(torch.from_numpy(world.render(world.frame_views("front")[2]).rgb.copy()).permute(2, 0, 1).contiguous())
+        found.append(
+            torch.from_numpy(world.render(world.frame_views("front")[2]).rgb.copy()).permute(2, 0, 1).contiguous()
+        )
     return found
 
 
@@ -88,7 +92,9 @@ def test_degradations_are_ordered_as_people_see_them_where_psnr_is_not(pictures,
     truth = pictures[0]
     darker, moved = truth * 0.9, torch.roll(truth, 1, 2)
     soft, wrong = blurred(truth, 2.0), scrambled(truth)
-    apart = {name: distance(x, truth) for name, x in (("darker", darker), ("moved", moved), ("soft", soft), ("wrong", wrong))}
+    apart = {
+        name: distance(x, truth) for name, x in (("darker", darker), ("moved", moved), ("soft", soft), ("wrong", wrong))
+    }
     assert apart["darker"] < apart["moved"] < apart["soft"] < apart["wrong"]
     assert apart["wrong"] > 3 * apart["soft"]  # the wrong texture is farther than none
     assert distance(pictures[1], truth) > 3 * apart["soft"]
@@ -111,7 +117,9 @@ def test_perceptual_distance_by_hand():
     # First place: the same direction; second: right angles, squared distance of unit vectors 2.
     assert metrics.perceptual_distance([a], [b]) == pytest.approx(1.0, abs=1e-5)
     assert metrics.perceptual_distance([a, a], [b, a]) == pytest.approx(0.5, abs=1e-5)
-    assert metrics.perceptual_distance([a, a], [b, a], weights=[torch.tensor([1.0, 0.0])] * 2) == pytest.approx(0.5, abs=1e-5)
+    assert metrics.perceptual_distance([a, a], [b, a], weights=[torch.tensor([1.0, 0.0])] * 2) == pytest.approx(
+        0.5, abs=1e-5
+    )
     assert metrics.perceptual_distance([a], [b], torch.tensor([[[True, False]]])) == pytest.approx(0.0, abs=1e-5)
     with pytest.raises(InputError, match="shape"):
         metrics.perceptual_distance([a], [b[..., :1]])
@@ -138,7 +146,9 @@ def lpips_twin(made, truth, state):
     ).double()  # fmt: skip
     trunk.load_state_dict({name.split(".", 2)[2]: v.double() for name, v in state.items() if name.startswith("net.")})
     x = torch.stack([made, truth]).double() * 2 - 1
-    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor([0.458, 0.448, 0.450]).double().view(3, 1, 1)
+    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor(
+        [0.458, 0.448, 0.450]
+    ).double().view(3, 1, 1)
     total, stage = 0.0, 0
     with torch.no_grad():
         for layer in trunk:
@@ -176,7 +186,13 @@ def still_pair(number, made_noise):
     view = View(Camera("front", 16, 12, 20.0, 20.0, 8.0, 6.0), np.eye(4), 0.1 * number)
     depth, ids = torch.full((1, 12, 16), 10.0), torch.full((12, 16), 2)
     depth[:, :3], ids[:3] = 0.0, 10  # sky: no depth
-    return pair(rgb=wall + sign * made_noise / 2, truth_rgb=wall + sign * 0.05, truth_depth=depth, truth_semantics=ids, view=view)
+    return pair(
+        rgb=wall + sign * made_noise / 2,
+        truth_rgb=wall + sign * 0.05,
+        truth_depth=depth,
+        truth_semantics=ids,
+        view=view,
+    )
 
 
 def test_flicker_is_change_of_static_surfaces_over_that_of_the_truth():

@@ -115,9 +115,7 @@ def turn_deg(config: CityConfig) -> float:
     return float(np.rad2deg(heading.max() - heading.min()))
 
 
-def choose(
-    first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE
-) -> tuple[int, ...]:
+def choose(first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> tuple[int, ...]:
     """The first seeds from `first_seed` on that satisfy the choice: half of `count` curved, the others not, in ascending order.
 
     Raises:

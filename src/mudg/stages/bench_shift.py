@@ -139,7 +139,11 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
             "unknown method", where="--methods", expected=", ".join(known), got=", ".join(sorted(wanted - set(known)))
         )
     plain = FitConfig(method=WITH, iterations=config.iterations, seed=config.seed)
-    rows = [Row(name, title_of(name), None if name in GENERATED else _with_method(plain, name)) for name in known if name in wanted]
+    rows = [
+        Row(name, title_of(name), None if name in GENERATED else _with_method(plain, name))
+        for name in known
+        if name in wanted
+    ]
     if config.ablation:
         rows += [
             Row(name, f"with {words}", replace(plain, **dict(weights))) for name, (words, weights) in ABLATION.items()
@@ -300,7 +304,9 @@ def _scores_of(job: LogJob, row: Row, views: Path) -> dict[str, Any]:
     settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS)
     scene, truth, scored = job.out / "scene", job.out / "truth", job.out / "score" / row.name
     _made(job, lambda o: score.run(settings, scene, {row.name: views}, scored, truth=truth, overwrite=o))
-    return {f"{entry['distance_m']:g}": entry["values"] for entry in store.read_json(scored / "metrics.json")["by_distance"]}
+    return {
+        f"{entry['distance_m']:g}": entry["values"] for entry in store.read_json(scored / "metrics.json")["by_distance"]
+    }
 
 
 def write_fill(scene: Path, fused: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:

@@ -6,6 +6,7 @@ The videos are files beside the page (``<log>/film/<trajectory>.mp4``); the page
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from importlib import resources
@@ -29,7 +30,10 @@ from mudg.stages.score_truth import resize_nearest, resize_rgb
 
 SHOWN: Final = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
 PANEL_WIDTH: Final = 320
-FPS, CRF = 10, 27
+FPS: Final = 10
+FIRST_CRF, LAST_CRF = 29, 41
+VIDEO_BYTES: Final = 900 * 1024
+"""A video larger than this is made anew in lower quality: eight logs of seven lines stay under 60 MB."""
 ROWS: Final = ("colour", "colour error", "depth")
 _VERSION = 1
 
@@ -56,12 +60,23 @@ def film(views: Mapping[str, Path], paths: Sequence[Trajectory], out: Path, *, o
             raise InputError("no truth to show", where=f"{views.get('truth')}: {path.name}")
         pictures = list(_atlases(sets, list(views), len(path)))
         if playable:
-            store.atomic_write(out / f"{path.name}.mp4", mp4_bytes(pictures, FPS, CRF, "veryfast"))
+            store.atomic_write(out / f"{path.name}.mp4", _video(pictures))
         poster = io.BytesIO()
-        Image.fromarray(pictures[len(pictures) // 2]).save(poster, "JPEG", quality=80)
+        middle = Image.fromarray(pictures[len(pictures) // 2])
+        middle.resize((middle.width // 2, middle.height // 2), Image.Resampling.BOX).save(poster, "JPEG", quality=75)
         store.atomic_write(out / f"{path.name}.jpg", poster.getvalue())
     folder.finish({"columns": list(views), "videos": playable})
     return out
+
+
+def _video(pictures: Sequence[NDArray[np.uint8]]) -> bytes:
+    """The pictures as a video of at most ``VIDEO_BYTES``, if the lowest quality allows."""
+    crf = FIRST_CRF
+    while len(content := mp4_bytes(pictures, FPS, crf, "veryfast")) > VIDEO_BYTES and crf < LAST_CRF:
+        crf = min(
+            LAST_CRF, crf + max(1, math.ceil(6 * math.log2(len(content) / VIDEO_BYTES)))
+        )  # 6 steps halve the size, about
+    return content
 
 
 def _atlases(sets: Mapping[str, ObservationSet], order: Sequence[str], frames: int) -> Iterator[NDArray[np.uint8]]:
@@ -110,7 +125,7 @@ def page(doc: Mapping[str, Any]) -> str:
     """The whole page from what ``bench.json`` holds."""
     css = (resources.files("mudg") / "assets" / "report" / "page.css").read_text(encoding="utf-8")
     settings = doc["settings"]
-    title = f"Beside the recorded path: {len(doc['logs'])} logs, {settings['list']} list"
+    title = f"Beside the recorded path: {tables.logs_text(doc)}, {settings['list']} list"
     lead = (
         f"Generated logs of {settings['frames']} frames with exact truth at every view; {settings['iterations']} iterations per fit. "
         "Means over logs and both sides of the path."

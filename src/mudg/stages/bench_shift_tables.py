@@ -170,7 +170,7 @@ def markdown(doc: Mapping[str, Any]) -> str:
     settings = doc["settings"]
     width, height = settings["size_px"]
     lines = [
-        f"# Beside the recorded path: {len(doc['logs'])} logs of the {settings['list']} list", "",
+        f"# Beside the recorded path: {logs_text(doc)} of the {settings['list']} list", "",
         f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
         f"frame held out; {settings['iterations']} iterations per fit, seed {settings['seed']}. Means over both sides and all logs, +- the "
         "standard error over logs. Flicker: 1 = as calm as the truth. Perceptual: features of the shipped codec, not LPIPS.", "",
@@ -194,6 +194,12 @@ def markdown(doc: Mapping[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def logs_text(doc: Mapping[str, Any]) -> str:
+    """How many logs, in words."""
+    count = len(doc["logs"])
+    return f"{count} log{'s' if count != 1 else ''}"
 
 
 def place_title(doc: Mapping[str, Any], place: str) -> str:
@@ -223,7 +229,12 @@ FACTS: Final = ("log", "turn, degrees", "length, m", "moving vehicles in view", 
 
 def facts_of(entry: Mapping[str, Any]) -> list[str]:
     """Cells of a log's row under ``FACTS``."""
-    numbers = [f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"]), f"{entry['mover_share']:.1%}"]
+    numbers = [
+        f"{entry['turn_deg']:.1f}",
+        f"{entry['length_m']:.0f}",
+        str(entry["movers"]),
+        f"{entry['mover_share']:.1%}",
+    ]
     return [str(entry["log"]), *numbers, entry["words"]]
 
 
