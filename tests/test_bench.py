@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from mudg.base.errors import UsageError
+from mudg.core import flicker
 from mudg.data import city_clips, clip_shards
 from mudg.models import mdm
 from mudg.models.mdm import MDM, MDMConfig
 from mudg.models.vae import CodecConfig
-from mudg.stages import bench, bench_ablation, learn_score
+from mudg.stages import bench, bench_ablation
 from mudg.stages.config import BenchConfig
 
 SMALL = MDMConfig(
@@ -37,7 +38,7 @@ def still_wall(frames=3, height=12, width=16):
 def test_a_moving_camera_alone_is_no_change():
     rgb, depth, ids, poses, lens = still_wall()
     blinking = rgb + torch.tensor([0.0, 0.1, 0.0]).view(3, 1, 1, 1)
-    for made, truth in learn_score.changes(blinking, rgb, depth, ids, poses, lens):
+    for made, truth in flicker.changes(blinking, rgb, depth, ids, poses, lens):
         assert truth == pytest.approx(0.0, abs=1e-3)
         assert made == pytest.approx(0.1 * 12 * 15, rel=1e-3)
 
@@ -46,10 +47,10 @@ def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
     rgb, depth, ids, poses, lens = still_wall()
     noise = torch.randn(rgb.shape, generator=torch.Generator().manual_seed(1))
     truth, made = rgb + 0.1 * noise, rgb + 0.3 * noise
-    assert learn_score.flicker(made, truth, depth, ids, poses, lens) == pytest.approx(3.0, rel=1e-3)
+    assert flicker.flicker(made, truth, depth, ids, poses, lens) == pytest.approx(3.0, rel=1e-3)
     cars = torch.full_like(ids, 13)
-    assert math.isnan(learn_score.flicker(made, truth, depth, cars, poses, lens))
-    assert math.isnan(learn_score.flicker(made[:1], truth[:1], depth[:1], ids[:1], poses, lens))
+    assert math.isnan(flicker.flicker(made, truth, depth, cars, poses, lens))
+    assert math.isnan(flicker.flicker(made[:1], truth[:1], depth[:1], ids[:1], poses, lens))
 
 
 @pytest.fixture(scope="module")

@@ -8,18 +8,23 @@ with ``build=None`` ("not computed"). Nothing is ever reported as zero for want 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.base.types import View
+from mudg.core import flicker
 from mudg.core.losses import ssim_map
 
 CLASS_COUNT: Final = len(CLASSES)
+SMALLEST_SHARE: Final = 1e-3
+"""Masks of moving objects that cover less of a picture than this do not count: a handful of pixels has no PSNR to speak of."""
 
 
 def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -50,6 +55,48 @@ def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
     if mask is not None:
         values = values[mask.expand_as(values)]
     return float(values.double().mean()) if values.numel() else math.nan
+
+
+def perceptual_distance(
+    prediction: Sequence[Tensor],
+    truth: Sequence[Tensor],
+    mask: Tensor | None = None,
+    weights: Sequence[Tensor] | None = None,
+) -> float:
+    """Distance of two pictures in the features of a network, as LPIPS measures it (Zhang et al. 2018, eq. 1).
+
+    Per stage: every place's feature vector is brought to length 1, the squared difference is summed over channels and averaged
+    over places; the stages are averaged (without ``weights``) or summed (with them, as LPIPS does).
+
+    Args:
+        prediction, truth: per stage ``[C_l, h_l, w_l]``.
+        mask: bool ``[1, H, W]``: pixels that count, averaged down to each stage (default all).
+        weights: per stage ``[C_l]`` for the squared differences (default 1).
+
+    Returns:
+        0 for equal pictures; NaN when nothing counts.
+
+    Raises:
+        InputError: the two have other shapes.
+    """
+    total = 0.0
+    for stage, (mine, theirs) in enumerate(zip(prediction, truth, strict=True)):
+        if mine.shape != theirs.shape:
+            raise InputError("features of two pictures differ in shape", where=f"stage {stage}",
+                             expected=str(tuple(theirs.shape)), got=str(tuple(mine.shape)))  # fmt: skip
+        squared = (_unit(mine) - _unit(theirs)) ** 2
+        places = squared.sum(0) if weights is None else (squared * weights[stage].view(-1, 1, 1)).sum(0)
+        if mask is None:
+            total += float(places.double().mean())
+            continue
+        share = F.adaptive_avg_pool2d(mask.float(), (mine.shape[-2], mine.shape[-1]))[0].double()
+        total += float((places * share).sum() / share.sum()) if bool(share.any()) else math.nan
+    return total / len(truth) if weights is None else total
+
+
+def _unit(features: Tensor) -> Tensor:
+    """Feature vectors ``[C, h, w]`` brought to length 1."""
+    return features / (features.square().sum(0, keepdim=True).sqrt() + 1e-6)
 
 
 @dataclass(frozen=True)
@@ -122,7 +169,8 @@ class Pair:
     """One predicted view with its truth. Absent modalities are None.
 
     rgb ``[3, H, W]`` in [0, 1]; depth ``[1, H, W]`` m; semantics i64 ``[H, W]``; truth_depth_valid bool ``[1, H, W]``;
-    mask bool ``[1, H, W]``: pixels that count at all (outside the ego vehicle).
+    mask bool ``[1, H, W]``: pixels that count at all (outside the ego vehicle); moving bool ``[1, H, W]``: true pixels of
+    moving objects, where they are known; view: camera and pose of both.
     """
 
     rgb: Tensor | None
@@ -133,6 +181,8 @@ class Pair:
     truth_depth_valid: Tensor | None
     truth_semantics: Tensor | None
     mask: Tensor | None = None
+    moving: Tensor | None = None
+    view: View | None = None
 
 
 class Metric(Protocol):
@@ -219,6 +269,43 @@ class Segmentation:
         return sum(iou.values()) / len(iou)
 
 
+class Flicker:
+    """Change of static surfaces from each frame to the next, over that in the truth, pooled over the trajectory (see
+    ``core.flicker``). Wants every frame of a trajectory in order, with exact colour, depth and classes."""
+
+    def __init__(self) -> None:
+        self._before: Pair | None = None
+        self._made = 0.0
+        self._true = 0.0
+
+    def update(self, pair: Pair) -> None:
+        """Add the next frame."""
+        before, self._before = self._before, pair
+        if before is not None and _dense(before) and _dense(pair):
+            of = (before, pair)
+            stack = lambda name: torch.stack([getattr(p, name) for p in of])  # noqa: E731
+            depth = stack("truth_depth")
+            depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0)
+            views = [p.view for p in of if p.view is not None]
+            poses = torch.stack([torch.from_numpy(v.world_from_cam.copy()) for v in views])
+            lens = torch.tensor(
+                [[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in views], dtype=torch.float64
+            )
+            made = stack("rgb").clamp(0, 1)
+            ((changed, truly),) = flicker.changes(
+                made, stack("truth_rgb"), depth, stack("truth_semantics"), poses, lens
+            )
+            self._made, self._true = self._made + changed, self._true + truly
+
+    def value(self) -> float | None:
+        """1 = as calm as the truth; None without two neighbouring frames or without static surfaces."""
+        return self._made / self._true if self._true > 0 else None
+
+
+def _dense(pair: Pair) -> bool:
+    return all(x is not None for x in (pair.rgb, pair.truth_rgb, pair.truth_depth, pair.truth_semantics, pair.view))
+
+
 def _psnr_of(pair: Pair) -> float | None:
     if pair.rgb is None or pair.truth_rgb is None:
         return None
@@ -229,6 +316,13 @@ def _ssim_of(pair: Pair) -> float | None:
     if pair.rgb is None or pair.truth_rgb is None:
         return None
     return ssim(pair.rgb, pair.truth_rgb, pair.mask)
+
+
+def _psnr_of_movers(pair: Pair) -> float | None:
+    if pair.rgb is None or pair.truth_rgb is None or pair.moving is None:
+        return None
+    counted = pair.moving if pair.mask is None else pair.moving & pair.mask
+    return psnr(pair.rgb, pair.truth_rgb, counted) if float(counted.float().mean()) >= SMALLEST_SHARE else None
 
 
 @dataclass(frozen=True)
@@ -245,6 +339,9 @@ class MetricRow:
 METRICS: Final[dict[str, MetricRow]] = {
     "psnr": MetricRow("PSNR", "dB", ("rgb",), "higher", lambda: FrameMean(_psnr_of)),
     "ssim": MetricRow("SSIM", "", ("rgb",), "higher", lambda: FrameMean(_ssim_of)),
+    "psnr_movers": MetricRow("PSNR of movers", "dB", ("movers", "rgb"), "higher", lambda: FrameMean(_psnr_of_movers)),
+    "perceptual": MetricRow("perceptual", "", ("rgb", "features of the shipped codec"), "lower", None),
+    "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "lower", Flicker),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
@@ -256,16 +353,17 @@ METRICS: Final[dict[str, MetricRow]] = {
 }
 
 
-def build_all() -> dict[str, Metric]:
-    """A fresh accumulator for every metric that can be computed."""
-    return {name: row.build() for name, row in METRICS.items() if row.build is not None}
+def build_all(distances: Mapping[str, Callable[[Pair], float | None]] | None = None) -> dict[str, Metric]:
+    """A fresh accumulator for every metric that can be computed; ``distances``: what computes a row that needs weights."""
+    own = {name: row.build() for name, row in METRICS.items() if row.build is not None}
+    return {**own, **{name: FrameMean(of) for name, of in (distances or {}).items()}}
 
 
-def results(metrics: dict[str, Metric]) -> dict[str, float | str]:
+def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:
     """Values of all rows of ``METRICS``: a number, "not produced" (input absent) or "not computed" (weights absent)."""
     table: dict[str, float | str] = {}
-    for name, row in METRICS.items():
-        if row.build is None:
+    for name in METRICS:
+        if name not in metrics:
             table[name] = "not computed"
             continue
         number = metrics[name].value()
@@ -274,6 +372,6 @@ def results(metrics: dict[str, Metric]) -> dict[str, float | str]:
 
 
 __all__ = [
-    "CLASS_COUNT", "METRICS", "UNLABELLED", "DepthError", "DepthErrors", "FrameMean", "Metric", "MetricRow", "Pair",
-    "Segmentation", "build_all", "confusion", "depth_errors", "iou_of", "psnr", "results", "ssim",
+    "CLASS_COUNT", "METRICS", "UNLABELLED", "DepthError", "DepthErrors", "Flicker", "FrameMean", "Metric", "MetricRow", "Pair",
+    "Segmentation", "build_all", "confusion", "depth_errors", "iou_of", "perceptual_distance", "psnr", "results", "ssim",
 ]  # fmt: skip

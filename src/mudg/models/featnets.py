@@ -1,4 +1,6 @@
-"""Feature extractors for perceptual comparison. Here: a fixed filter bank that needs no weights.
+"""Feature extractors for perceptual comparison: a fixed filter bank for fitting, and learned features for scoring.
+
+``CodecFeatures`` is the network of the shipped codec, and only scores: no fit is trained on it.
 
 ``FilterBank`` stands where LPIPS-style networks will stand: image in, list of feature maps out, compared by
 ``losses.feature_distance``. It is built from what early vision is known to do (Gabor-like energy at several scales and
@@ -10,16 +12,21 @@ orientations, divisive contrast normalisation, opponent colours) rather than lea
 * the responses' *energy*, pooled over a few pixels: two pictures of the same texture that differ by a pixel of
   misalignment are close, where L1 sees two different pictures and answers with blur.
 
-It is differentiable, deterministic, and costs about as much as SSIM.
+The bank is differentiable, deterministic, and costs about as much as SSIM.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from mudg.base.errors import InputError
+from mudg.core.metrics import Pair, perceptual_distance
+from mudg.models.vae import PatchCodec
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
 
@@ -69,6 +76,114 @@ class FilterBank(nn.Module):
 def _pool(values: Tensor, size: int) -> Tensor:
     """Box mean over ``size`` x ``size`` pixels, same size out, borders averaged over what is there."""
     return F.avg_pool2d(values, size, stride=1, padding=size // 2, count_include_pad=False)
+
+
+class CodecFeatures(nn.Module):
+    """Features of an image ``[3, H, W]`` in [0, 1]: what the codec's network makes of the image's own code.
+
+    The codec's encoder is one linear map of 2x2 pixels; all that it has learned about pictures beyond that lies in the network
+    behind the code, which was trained to put back what the code lost. Its stages (the first convolution and each residual
+    block) are the features, for the image and for it at 1/2 and 1/4 of its size. Depth and classes are withheld, as in a
+    part of the codec's training.
+
+    Returns (from ``forward``):
+        Per size, largest first, and per stage one tensor ``[C, h, w]``.
+    """
+
+    SIZES: Final = 3
+
+    def __init__(self, codec: PatchCodec) -> None:
+        super().__init__()
+        self.codec = codec
+
+    @torch.no_grad()
+    def forward(self, rgb: Tensor) -> list[Tensor]:
+        """Features of one image; sides that are no multiple of 8 are continued by their last pixels."""
+        height, width = rgb.shape[-2:]
+        image = F.pad(rgb[None].clamp(0, 1), (0, -width % 8, 0, -height % 8), mode="replicate")
+        features = []
+        for _ in range(self.SIZES):
+            code = self.codec.encode_rgb(image)
+            others = sum(count for modality, count in self.codec.channels.items() if modality != "rgb")
+            x = self.codec.enter(torch.cat([code, code.new_zeros(1, others, *code.shape[-2:])], 1))
+            features.append(x[0])
+            for block in self.codec.blocks:
+                x = block(x)
+                features.append(x[0])
+            image = F.avg_pool2d(image, 2)
+        return features
+
+
+class LpipsFeatures(nn.Module):
+    """The AlexNet trunk of LPIPS 0.1 (Zhang et al. 2018) and its weights per channel, from tensors under the usual names.
+
+    Args:
+        state: ``net.slice{1..5}.{0,3,6,8,10}.{weight,bias}`` and ``lin{0..4}.model.1.weight``, as the lpips package names
+            them; other entries are left alone.
+        where: file name for errors.
+
+    Raises:
+        InputError: a tensor is missing or has another shape.
+    """
+
+    LAYERS: Final = ((0, 64, 3, 11, 4, 2), (3, 192, 64, 5, 1, 2), (6, 384, 192, 3, 1, 1), (8, 256, 384, 3, 1, 1), (10, 256, 256, 3, 1, 1))
+    """Place in the trunk, channels out and in, kernel, stride, padding."""
+    POOLED: Final = (1, 2)
+    """Layers before which 3x3 maxima are taken at every second place."""
+    SHIFT: Final = (-0.030, -0.088, -0.188)
+    SCALE: Final = (0.458, 0.448, 0.450)
+    SMALLEST_PX: Final = 31
+
+    def __init__(self, state: Mapping[str, Tensor], where: str = "LPIPS weights") -> None:
+        super().__init__()
+        self.kernels, self.biases, self.channel_weights = [], [], []
+        for stage, (place, out, into, size, _, _) in enumerate(self.LAYERS):
+            named = f"net.slice{stage + 1}.{place}"
+            self.kernels.append(_tensor(state, f"{named}.weight", (out, into, size, size), where))
+            self.biases.append(_tensor(state, f"{named}.bias", (out,), where))
+            self.channel_weights.append(_tensor(state, f"lin{stage}.model.1.weight", (1, out, 1, 1), where).flatten())
+
+    @torch.no_grad()
+    def forward(self, rgb: Tensor) -> list[Tensor]:
+        """Features ``[C, h, w]`` of the five stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
+        if min(rgb.shape[-2:]) < self.SMALLEST_PX:
+            size = f"{rgb.shape[-1]}x{rgb.shape[-2]}"
+            raise InputError("a picture is too small for LPIPS", expected=f"{self.SMALLEST_PX} pixels a side", got=size)
+        shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (self.SHIFT, self.SCALE))
+        x = (rgb[None].clamp(0, 1) * 2 - 1 - shift) / scale
+        features = []
+        for stage, (_, _, _, _, stride, padding) in enumerate(self.LAYERS):
+            x = F.max_pool2d(x, 3, 2) if stage in self.POOLED else x
+            x = F.relu(F.conv2d(x, self.kernels[stage], self.biases[stage], stride, padding))
+            features.append(x[0])
+        return features
+
+
+def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], where: str) -> Tensor:
+    found = state.get(name)
+    if found is None or tuple(found.shape) != shape:
+        got = "missing" if found is None else str(tuple(found.shape))
+        raise InputError("LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got)
+    return found.float()
+
+
+class PerceptualDistance:
+    """``metrics.perceptual_distance`` of a pair's colours in the features of a network.
+
+    Truth is compared with one method after another: its features are kept until another truth comes.
+    """
+
+    def __init__(self, features: nn.Module, weights: list[Tensor] | None = None) -> None:
+        self._features, self._weights = features, weights
+        self._known: tuple[Tensor, list[Tensor]] | None = None
+
+    def __call__(self, pair: Pair) -> float | None:
+        """The distance, or None where colour is missing."""
+        if pair.rgb is None or pair.truth_rgb is None:
+            return None
+        if self._known is None or self._known[0] is not pair.truth_rgb:
+            self._known = (pair.truth_rgb, self._features(pair.truth_rgb))
+        return perceptual_distance(self._features(pair.rgb), self._known[1], pair.mask, self._weights)
 
 
 FEATNETS: Final = {"filter_bank": FilterBank}

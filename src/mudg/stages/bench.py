@@ -3,6 +3,7 @@
 mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
                without given classes, at several numbers of steps, and the seam between windows of a longer video
 mdm-ablation   what of its condition the model lives on (see `bench_ablation`)
+shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
 
 OUT/clips/ the generated clips   OUT/bench.json   OUT/bench.md   OUT/*.png pictures
 """
@@ -21,28 +22,32 @@ import torch
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
+from mudg.core import flicker
 from mudg.data import city_clips
 from mudg.data.city_clips import CityClipRules
 from mudg.data.clips import ConditionRules, Source, build_condition
 from mudg.models import mdm
 from mudg.models.mdm import MDM
-from mudg.stages import bench_ablation, learn_score
+from mudg.stages import bench_ablation, bench_shift, learn_score
 from mudg.stages.config import BenchConfig, SynthesizeConfig
 from mudg.stages.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
 _VERSION = 1
+SHIFT = "shift"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
 
 def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -> Path:
-    """Run one of `BENCHES`; returns the folder with `bench.json` and `bench.md`.
+    """Run one of `BENCHES`, or shift; returns the folder with `bench.json` and `bench.md`.
 
     Raises:
         UsageError: there is no such measurement.
     """
+    if name == SHIFT:  # made of verbs that each keep their own folder
+        return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
-        raise UsageError("no such measurement", expected=" or ".join(BENCHES), got=name)
+        raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
     inputs = {"model": mdm.digest(config.model)}
     directory = store.RunDir.open(out, f"bench {name}", to_dict(config), inputs, _VERSION, overwrite)
     if directory.complete:
@@ -116,7 +121,7 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     poses = torch.from_numpy(np.stack([v.world_from_cam for v in views]))
     camera = views[0].resized(rules.width, rules.height).camera
     lens = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]] * len(views), dtype=torch.float64)
-    pairs = learn_score.changes(torch.stack(frames), rgb, depth, ids, poses, lens)
+    pairs = flicker.changes(torch.stack(frames), rgb, depth, ids, poses, lens)
     ratios = [m / t if t > 0 else math.nan for m, t in pairs]
     seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
     mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731
@@ -137,4 +142,4 @@ BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = 
     "mdm": _mdm,
     "mdm-ablation": bench_ablation.measure,
 }
-"""Every measurement by name."""
+"""Every measurement of the diffusion model by name."""

@@ -184,7 +184,7 @@ class LearnConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class BenchConfig:
-    """Measure the diffusion model on generated cities that it was never trained on, against exact truth."""
+    """Measure the diffusion model, or whole scenes off the recorded path, on generated cities never trained on, against exact truth."""
 
     model: str = "embedded"
     """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
@@ -203,6 +203,22 @@ class BenchConfig:
     """mdm-ablation: training steps of each variant."""
     ablation_cities: int = Field(default=40, ge=1)
     """mdm-ablation: cities to train on."""
+    list: Literal["development", "reported"] = "development"
+    """shift: list of logs; nothing is chosen on the reported one."""
+    logs: int = Field(default=8, ge=1, le=8)
+    """shift: how many logs of the list (the development list has 4)."""
+    methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
+    """shift: methods to compare, of these five."""
+    iterations: int = Field(default=1000, ge=1)
+    """shift: steps of every fit."""
+    ablation: bool = False
+    """shift: also mudg_s with only some of its virtual terms: colour; colour and depth; colour and classes."""
+    variant: tuple[str, ...] = ()
+    """shift: also mudg_s with other settings of fit, each NAME=FIELD:VALUE,FIELD:VALUE."""
+    processes: int = Field(default=0, ge=0)
+    """shift: logs worked on at the same time, one thread each (0 = one per core)."""
+    videos: bool = True
+    """shift: also make the videos of the page."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -372,6 +388,12 @@ class ScoreConfig:
     """Width at which everything is compared; the height follows (0 = the size of the scene's camera)."""
     baseline: bool = True
     """Also score the sparse condition with its holes filled by the nearest point: the bar a model has to clear."""
+    perceptual_views: int = Field(default=8, ge=0)
+    """At so many views of every trajectory, evenly spread, also the perceptual distance, which costs more than all other metrics
+    together (0 = never)."""
+    lpips_weights: str = ""
+    """Safetensors file with LPIPS weights (AlexNet, version 0.1, the lpips package's names), for LPIPS at the same views (empty = not
+    computed)."""
     error_pictures: bool = True
     """Write one picture of the colour error for the middle view of every trajectory."""
 

@@ -17,7 +17,8 @@ from mudg.data.exporters.video import depth_colors
 from mudg.stages.score_tables import best_of, distance_title, number_text, title_of
 
 GROUPS: Final = (
-    ("Colour", ("psnr", "ssim")),
+    ("Colour", ("psnr", "ssim", "perceptual")),
+    ("Movement", ("psnr_movers", "flicker")),
     ("Depth", ("abs_rel", "rmse_m", "delta1")),
     ("Classes", ("miou", "accuracy")),
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,23 +25,33 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base import config as configuration
-from mudg.base import geometry, log, palette, store
+from mudg.base import log, palette, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
-from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+from mudg.data.scenefile import read_scene
+from mudg.models import mdm
+from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
 from mudg.stages import score_tables
 from mudg.stages.config import ScoreConfig
+from mudg.stages.score_truth import (
+    SAME_PLACE_M,
+    SAME_TIME_S,
+    TrueView,
+    Truth,
+    resize_nearest,
+    resize_rgb,
+    stored_truth,
+    truth_of,
+)
 
 Made = TypeVar("Made")
 BASELINE: Final = "nearest_fill"
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
 DEPTH_LIMIT_M: Final = 80.0
-SAME_SWEEP_S: Final = 0.05
-_SAME_TIME_S: Final = 1e-4
-_SAME_PLACE_M: Final = 1e-3
+_VERSION: Final = 2
 _NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
 
 
@@ -64,14 +74,6 @@ class Course:
     indices: Mapping[str, tuple[int, ...]]
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Where truth comes from: ``at(view, frame)`` is None where there is none."""
-
-    exact: bool
-    at: Callable[[View, Frame | None], Observation | None]
-
-
 Baseline = Callable[[View], Observation]
 
 
@@ -83,11 +85,15 @@ class Yardstick:
     baseline: Baseline | None
     held_out: frozenset[str]
     error_pictures: bool
+    distances: Mapping[str, Callable[[metrics.Pair], float | None]]
+    """What computes the rows of the table that need weights."""
+    distance_views: int
+    """At so many views of a trajectory, evenly spread."""
 
 
 def run(
     config: ScoreConfig, scene: Path, methods: Mapping[str, Path], out: Path, *, fused: Path | None = None,
-    overwrite: bool = False,
+    truth: Path | None = None, overwrite: bool = False,
 ) -> Path:  # fmt: skip
     """Score every trajectory of every method and write ``out``.
 
@@ -97,6 +103,7 @@ def run(
         methods: name -> folder of observation folders (output of render or synthesize).
         out: folder to write.
         fused: clouds made by fuse, for the baseline; without them there is none.
+        truth: folder of ``score_truth.write_truth`` for this scene, to be read instead of drawing the truth again.
         overwrite: replace what other settings or inputs left in ``out``.
 
     Raises:
@@ -107,15 +114,19 @@ def run(
     inputs = {"scene": store.digest(scene)} | {name: store.digest(folder) for name, folder in methods.items()}
     if fused is not None and config.baseline:
         inputs["fused"] = store.digest(fused)
-    work = store.RunDir.open(out, "score", configuration.to_dict(config), inputs, version=1, overwrite=overwrite)
+    if config.lpips_weights:
+        inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
+    if truth is not None:
+        inputs["truth"] = store.digest(truth)
+    work = store.RunDir.open(out, "score", configuration.to_dict(config), inputs, version=_VERSION, overwrite=overwrite)
     if work.complete:
         return work.reused()
     recorded = read_scene(scene)
-    truth = _truth_of(recorded)
+    true = truth_of(recorded) if truth is None else stored_truth(truth)
     courses = _courses(config, recorded, methods)
-    baseline = _baseline(recorded, fused) if fused is not None and config.baseline else None
+    baseline = baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None
     held_out = frozenset(f.id for f in recorded.frames_in("test")) or frozenset(f.id for f in recorded.frames)
-    yardstick = Yardstick(truth, baseline, held_out, config.error_pictures)
+    yardstick = Yardstick(true, baseline, held_out, config.error_pictures, _distances(config), config.perceptual_views)
     results: list[dict[str, Any]] = []
     with log.task("score", sum(len(course.views) for course in courses)) as bar:
         for course in courses:
@@ -127,11 +138,23 @@ def run(
         for name, row in metrics.METRICS.items()
     }
     record = courses_record(courses)
-    document = score_tables.document(recorded, truth.exact, record, names, results, rows, DEPTH_LIMIT_M)
+    document = score_tables.document(recorded, true.exact, record, names, results, rows, DEPTH_LIMIT_M)
     store.write_json(out / "metrics.json", document)
     store.write_text(out / "metrics.md", score_tables.markdown(document))
     work.finish({"trajectories": len(courses), "methods": names})
     return out
+
+
+def _distances(config: ScoreConfig) -> dict[str, Callable[[metrics.Pair], float | None]]:
+    """The rows that need weights and have them."""
+    found: dict[str, Callable[[metrics.Pair], float | None]] = {}
+    if config.perceptual_views:
+        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
+    if config.lpips_weights:
+        state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
+        network = LpipsFeatures(state, config.lpips_weights)
+        found["lpips"] = PerceptualDistance(network, network.channel_weights)
+    return found
 
 
 def summary_table(out: Path) -> str:
@@ -168,11 +191,11 @@ def _course(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Obs
     views: list[View] = []
     for view in next(iter(sets.values())).views:
         nearest = {m: int(np.argmin(np.abs(t - view.time_s))) for m, t in times.items() if len(t)}
-        if len(nearest) < len(sets) or any(abs(times[m][i] - view.time_s) > _SAME_TIME_S for m, i in nearest.items()):
+        if len(nearest) < len(sets) or any(abs(times[m][i] - view.time_s) > SAME_TIME_S for m, i in nearest.items()):
             continue
         for method, index in nearest.items():
             apart_m = float(np.linalg.norm(sets[method].views[index].center_world - view.center_world))
-            if apart_m > _SAME_PLACE_M:
+            if apart_m > SAME_PLACE_M:
                 raise InputError("two methods rendered one trajectory from different places",
                                  where=f"{name}: {method}, view {index}", got=f"{apart_m:.3f} m apart")  # fmt: skip
             indices[method].append(index)
@@ -205,61 +228,14 @@ def _sized(config: ScoreConfig, scene: Scene, view: View) -> View:
 
 
 def _frame_at(scene: Scene, camera: str, view: View) -> Frame | None:
-    return next((f for f in scene.frames_of(camera) if abs(f.view.time_s - view.time_s) <= _SAME_TIME_S), None)
+    return next((f for f in scene.frames_of(camera) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None)
 
 
-# ---- truth ----
+# ---- the baseline ----
 
 
-def _truth_of(scene: Scene) -> Truth:
-    if scene.source.recipe is not None:
-        from mudg.data.city import CityWorld
-
-        world = CityWorld.from_source(scene.source)
-        return Truth(True, lambda view, _frame: world.observation(view))
-    return Truth(False, lambda view, frame: None if frame is None else _recorded(scene, frame, view))
-
-
-def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
-    """A recorded frame at the common size, with measured depth and the labels the log came with, never guessed ones."""
-    height, width = view.camera.height, view.camera.width
-    rgb = torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255
-    semantics = None
-    if "semantics" in frame.labels and "semantics_confidence" not in frame.labels:  # else a labeller made them
-        labels = torch.from_numpy(read_label(scene, frame, "semantics").astype(np.int64))[None]
-        semantics = resize_nearest(labels, height, width)[0]
-    if "depth" in frame.labels and "depth_confidence" not in frame.labels:
-        measured = torch.from_numpy(read_label(scene, frame, "depth").copy())[None]
-        depth: Tensor | None = resize_nearest(measured, height, width)
-    else:
-        depth = _lidar_depth(scene, view)
-    keep = torch.ones(1, height, width, dtype=torch.bool)
-    if "ego" in frame.labels:
-        ego = torch.from_numpy(read_label(scene, frame, "ego").astype(bool))[None]
-        keep = ~resize_nearest(ego, height, width)
-    return Observation(
-        view=view, rgb=resize_rgb(rgb, height, width), depth=depth, semantics=semantics,
-        confidence=torch.ones(1, height, width), mask=keep, kind="recorded", source="camera",
-    )  # fmt: skip
-
-
-def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
-    """Depth f32[1, H, W] of the sweep taken with this frame (NaN where no point fell), or None without such a sweep."""
-    from mudg.stages.fit_views import visible_lidar
-
-    sweeps = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= SAME_SWEEP_S]
-    if not sweeps:
-        return None
-    points = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in sweeps]
-    seen = visible_lidar(view, np.concatenate(points).astype(np.float32))
-    depth = torch.full((view.camera.height * view.camera.width,), torch.nan)
-    depth[seen.pixel] = seen.depth_m
-    return depth.reshape(1, view.camera.height, view.camera.width)
-
-
-def _baseline(scene: Scene, fused: Path) -> Baseline:
+def baseline_of(scene: Scene, cloud: FusedCloud) -> Baseline:
     """The fused points drawn at a view, every hole taking the nearest point in the picture: no learning at all."""
-    cloud = read_fused(fused)
 
     def at(view: View) -> Observation:
         placed = ((track.id, track.pose_at(view.time_s)) for track in scene.tracks)
@@ -296,53 +272,44 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
     )  # fmt: skip
 
 
-def resize_rgb(rgb: Tensor, height: int, width: int) -> Tensor:
-    """Colour f32[3, H, W] to another size, bilinear with antialiasing; unchanged if the size is right already."""
-    if rgb.shape[-2:] == (height, width):
-        return rgb
-    return torch.nn.functional.interpolate(rgb[None], size=(height, width), mode="bilinear", antialias=True)[0]
-
-
-def resize_nearest(values: Tensor, height: int, width: int) -> Tensor:
-    """Depth, labels or masks [C, H, W] to another size by the nearest pixel centre; nothing is mixed."""
-    if values.shape[-2:] == (height, width):
-        return values
-    rows = ((torch.arange(height) + 0.5) * values.shape[-2] / height).long()
-    columns = ((torch.arange(width) + 0.5) * values.shape[-1] / width).long()
-    return values[:, rows][:, :, columns]
-
-
 # ---- one trajectory ----
 
 
 def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[], None]) -> list[dict[str, Any]]:
     """Score all methods on one trajectory; writes its truth, its baseline and its error pictures."""
     names = [*([BASELINE] if by.baseline is not None else []), *course.sets]
-    sums = {name: metrics.build_all() for name in names}
+    sums = {name: metrics.build_all(by.distances) for name in names}
+    # Recorded training frames were seen by the fit and do not count; views off the path never were.
+    counted = [n for n, frame in enumerate(course.frames) if frame is None or frame.id in by.held_out]
+    looked_at = set(evenly(counted, by.distance_views or len(counted)))
     truth_has: set[str] = set()
     scored = 0
     middle = len(course.views) // 2
     with contextlib.ExitStack() as stack:
         truths = fills = None
-        if by.truth.exact or all(frame is not None for frame in course.frames):
+        if not by.truth.stored and (by.truth.exact or all(frame is not None for frame in course.frames)):
             writer = ObservationWriter(out / "truth" / course.name, course.name, "truth", "recorded")
             truths = stack.enter_context(writer)
         if by.baseline is not None:
             fills = stack.enter_context(ObservationWriter(out / BASELINE / course.name, course.name, BASELINE))
         for number, (true, found) in enumerate(_ahead(lambda number: _seen(course, by, number), len(course.views))):
-            frame = course.frames[number]
             if fills is not None:
                 fills.add(found[BASELINE])
             if true is not None:
                 if truths is not None:
-                    truths.add(true)
-                # Recorded training frames were seen by the fit and do not count; views off the path never were.
-                if frame is None or frame.id in by.held_out:
+                    truths.add(true.seen)
+                pairs = {name: pair_of(seen, true.seen, true.moving) for name, seen in found.items()}
+                wanted = {"flicker"} if by.truth.exact else set()  # wants all frames, in order
+                if number in counted:
                     scored += 1
-                    truth_has |= {m for m in ("rgb", "depth", "semantics") if getattr(true, m) is not None}
-                    _update(sums, found, true)
+                    truth_has |= _contents(true, by.truth.exact)
+                    wanted |= (metrics.METRICS.keys() - by.distances.keys()) - {"flicker"}
+                    wanted |= by.distances.keys() if number in looked_at else set()
+                for name, pair in pairs.items():
+                    for metric in wanted & sums[name].keys():
+                        sums[name][metric].update(pair)
                 if by.error_pictures and number == middle:
-                    _write_error_picture(out / "errors" / f"{course.name}.png", found, true)
+                    _write_error_picture(out / "errors" / f"{course.name}.png", found, true.seen)
             advance()
     return [
         {"method": name, "trajectory": course.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
@@ -350,9 +317,25 @@ def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[]
     ]
 
 
-def _seen(course: Course, by: Yardstick, number: int) -> tuple[Observation | None, dict[str, Observation]]:
+def evenly(items: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the items, evenly spread, from the middle of each share."""
+    kept = min(count, len(items))
+    return [items[int((k + 0.5) * len(items) / kept)] for k in range(kept)]
+
+
+def _contents(true: TrueView, exact: bool) -> set[str]:
+    """What a true view can be asked for, in the words of ``MetricRow.needs``."""
+    has = {m for m in ("rgb", "depth", "semantics") if getattr(true.seen, m) is not None}
+    if exact:
+        has.add("every frame")
+    if true.moving is not None and float(true.moving.float().mean()) >= metrics.SMALLEST_SHARE:
+        has.add("movers")
+    return has
+
+
+def _seen(course: Course, by: Yardstick, number: int) -> tuple[TrueView | None, dict[str, Observation]]:
     """Truth and what each method has for one view."""
-    true = by.truth.at(course.views[number], course.frames[number])
+    true = by.truth.at(course.views[number], course.frames[number], course.name)
     found = {m: of[course.indices[m][number]] for m, of in course.sets.items()}
     return true, found if by.baseline is None else {BASELINE: by.baseline(course.views[number]), **found}
 
@@ -369,20 +352,13 @@ def _ahead(make: Callable[[int], Made], count: int) -> Iterator[Made]:
             yield waiting.popleft().result()
 
 
-def _update(
-    sums: Mapping[str, Mapping[str, metrics.Metric]], found: Mapping[str, Observation], true: Observation
-) -> None:
-    for name, seen in found.items():
-        pair = pair_of(seen, true)
-        for metric in sums[name].values():
-            metric.update(pair)
-
-
 def _values(of: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str, float | str]:
     """A number per metric, or why there is none: no truth, not produced by the method, not computed by this build."""
     values = metrics.results(dict(of))
+    if "perceptual" not in of:
+        values["perceptual"] = score_tables.NOT_ASKED  # its weights are part of every build
     for name, row in metrics.METRICS.items():
-        if row.build is not None and row.needs[0] not in truth_has:
+        if name in of and row.needs[0] not in truth_has:
             values[name] = score_tables.NO_TRUTH
     return {n: round(v, 6) if isinstance(v, float) else v for n, v in values.items()}
 
@@ -394,8 +370,11 @@ def _iou(of: Mapping[str, metrics.Metric]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in metrics.iou_of(segmentation.counts).items()}
 
 
-def pair_of(seen: Observation, true: Observation) -> metrics.Pair:
-    """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m)."""
+def pair_of(seen: Observation, true: Observation, moving: Tensor | None = None) -> metrics.Pair:
+    """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
+
+    ``moving`` bool[1, H, W]: where moving objects are in truth, if that is known.
+    """
     height, width = true.view.camera.height, true.view.camera.width
     depth = None
     if seen.depth is not None:
@@ -409,7 +388,7 @@ def pair_of(seen: Observation, true: Observation) -> metrics.Pair:
         rgb=resize_rgb(seen.rgb, height, width), depth=depth,
         semantics=None if seen.semantics is None else resize_nearest(seen.semantics[None], height, width)[0],
         truth_rgb=true.rgb, truth_depth=true.depth, truth_depth_valid=valid, truth_semantics=true.semantics,
-        mask=true.mask,
+        mask=true.mask, moving=moving, view=true.view,
     )  # fmt: skip
 
 

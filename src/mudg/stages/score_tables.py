@@ -9,13 +9,14 @@ from mudg.base.types import Scene
 from mudg.methods import METHODS
 
 NO_TRUTH: Final = "no truth"
+NOT_ASKED: Final = "not asked for"
 TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
     "nearest_fill": "Fused points, holes filled",
     **{name: method.title for name, method in METHODS.items()},
 }
-SHOWN: Final = ("psnr", "ssim", "abs_rel", "rmse_m", "delta1", "miou")
-_DIGITS: Final = {"psnr": 2, "rmse_m": 2, "fid": 1, "fvd": 1}
+SHOWN: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "delta1", "miou")
+_DIGITS: Final = {"psnr": 2, "psnr_movers": 2, "flicker": 2, "rmse_m": 2, "fid": 1, "fvd": 1}
 
 
 def title_of(method: str) -> str:

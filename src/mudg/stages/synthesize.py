@@ -127,7 +127,7 @@ def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
             return made
         log.info_once(f"synthesize: {processes} processes with one thread each")
         context = multiprocessing.get_context("spawn")
-        with _quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
+        with quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
             futures = {pool.submit(_make_in_process, job): name for job, name in zip(jobs, names)}
             try:
                 for future in concurrent.futures.as_completed(futures):
@@ -140,7 +140,7 @@ def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
     return made
 
 
-class _quiet_openmp:
+class quiet_openmp:
     """Environment for child processes: one thread, and waiting without spinning."""
 
     _wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": "1"}

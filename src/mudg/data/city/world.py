@@ -245,11 +245,12 @@ class CityWorld:
         return CityTruth(*self._handle.render(poses, self._phases(view.time_s), intrinsics, camera.width, camera.height,
                                               view.world_from_cam, per_axis, noise_key))  # fmt: skip
 
-    def observation(self, view: View) -> Observation:
-        """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used."""
+    def observation(self, view: View, truth: CityTruth | None = None) -> Observation:
+        """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what ``render``
+        gave for this view already."""
         import torch
 
-        truth = self.render(view)
+        truth = truth or self.render(view)
         rgb = torch.from_numpy(truth.rgb).permute(2, 0, 1).contiguous()
         depth = torch.from_numpy(np.where(truth.sky, np.float32(0), truth.depth))[None]
         semantics = torch.from_numpy(truth.semantics.astype(np.int64))

@@ -1,0 +1,133 @@
+"""Whole generated logs for scoring scenes off the recorded path, in two lists; no model was ever trained on them.
+
+A list is not picked by eye: `choose` walks the seeds upwards and keeps what satisfies `LogChoice`. In 2.3 s the generator's
+streets turn little (half of 220 cities by less than 1.1 degrees, one in twenty by 4.7, the most by 9.6), so that "curved" means 5 degrees
+here, and half of each list is curved.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Container
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mudg.base.errors import UsageError
+from mudg.core.fusion import FusionRules, judge_track
+from mudg.data.city import CityConfig, CityWorld
+from mudg.data.city.layout import plan_streets
+from mudg.data.city.traffic import ego_keys
+
+
+@dataclass(frozen=True)
+class LogRules:
+    """What a log is recorded with: frames at 10 Hz, image size in pixels, and the cameras; the LiDAR is the standard one."""
+
+    frames: int = 24
+    width: int = 384
+    height: int = 256
+    cameras: tuple[str, ...] = ("front", "front_left", "front_right")
+
+
+@dataclass(frozen=True)
+class LogChoice:
+    """Which logs enter a list.
+
+    Args:
+        movers: at least so many moving vehicles are in view of the front camera.
+        smallest_share: in view means: covers this share of the picture,
+        frames_share: in this share of the frames.
+        curved_deg: half of the list turns by at least this angle.
+    """
+
+    movers: int = 2
+    smallest_share: float = 1e-3
+    frames_share: float = 0.25
+    curved_deg: float = 5.0
+
+
+@dataclass(frozen=True)
+class LogFacts:
+    """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front camera, the
+    share of the picture they cover together on average, and the generator's line about the city."""
+
+    seed: int
+    turn_deg: float
+    length_m: float
+    movers: int
+    mover_share: float
+    words: str
+
+
+STANDARD: Final = LogRules()
+CHOICE: Final = LogChoice()
+VEHICLES: Final = frozenset({"car", "truck", "bus", "cyclist"})
+
+DEVELOPMENT: tuple[int, ...] = (2100000, 2100001, 2100004, 2100007)
+"""Logs to look at while choosing."""
+REPORTED: tuple[int, ...] = (2100100, 2100101, 2100102, 2100103, 2100151, 2100154, 2100157, 2100242)
+"""Logs whose scores are reported and on which nothing is chosen."""
+LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
+FIRST_SEEDS: dict[str, int] = {"development": 2_100_000, "reported": 2_100_100}
+"""Where `choose` starts. A list of the same length is what it gives."""
+
+
+def log_config(seed: int, rules: LogRules = STANDARD) -> CityConfig:
+    """The generator's configuration of a log."""
+    plain = CityConfig(seed=seed, n_frames=rules.frames, width=rules.width, height=rules.height)
+    return dataclasses.replace(plain, cameras=rules.cameras)
+
+
+def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> tuple[int, ...]:
+    """Instance ids of the objects that move during the log, by the test that also separates their clouds; `labels`: which count."""
+    rules = FusionRules()
+    moving = (t for t in world.tracks() if (labels is None or t.label in labels) and judge_track(t, rules).moving)
+    return tuple(world.instance_of(track.id) for track in moving)
+
+
+def facts(seed: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> LogFacts:
+    """What the log of a seed holds, from small pictures of every fourth frame."""
+    world = CityWorld(log_config(seed, rules))
+    views = [view.resized(96, 64) for view in world.frame_views("front")[::4]]
+    seen = np.stack([world.render(view, supersample=1).instance for view in views])
+    moving = moving_instances(world, VEHICLES)
+    shares = np.array([[float((picture == i).mean()) for picture in seen] for i in moving]).reshape(
+        len(moving), len(views)
+    )
+    in_view = (shares >= choice.smallest_share).mean(1) >= choice.frames_share
+    return LogFacts(
+        seed,
+        turn_deg(world.config),
+        world.plan.drive_length,
+        int(in_view.sum()),
+        float(shares.sum(0).mean()),
+        world.describe(),
+    )
+
+
+def turn_deg(config: CityConfig) -> float:
+    """Range of the vehicle's headings over a log, degrees."""
+    times, poses = ego_keys(config, plan_streets(config))
+    driven = (times >= 0) & (times <= (config.n_frames - 1) / config.rate_hz)
+    heading = np.unwrap(np.arctan2(poses[driven, 1, 0], poses[driven, 0, 0]))
+    return float(np.rad2deg(heading.max() - heading.min()))
+
+
+def choose(first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> tuple[int, ...]:
+    """The first seeds from `first_seed` on that satisfy the choice: half of `count` curved, the others not, in ascending order.
+
+    Raises:
+        UsageError: `count` is odd or not positive.
+    """
+    if count <= 0 or count % 2:
+        raise UsageError("half of a list of logs is curved", expected="an even, positive number", got=str(count))
+    kept: dict[bool, list[int]] = {True: [], False: []}
+    seed = first_seed
+    while min(map(len, kept.values())) < count // 2:
+        curved = turn_deg(log_config(seed, rules)) >= choice.curved_deg
+        if len(kept[curved]) < count // 2 and facts(seed, rules, choice).movers >= choice.movers:
+            kept[curved].append(seed)
+        seed += 1
+    return tuple(sorted(kept[True] + kept[False]))

@@ -1,0 +1,219 @@
+"""``mudg bench shift``: lists, tables with known answers, variants, and the command end to end on a tiny log."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from mudg.base import seeds, store
+from mudg.base.errors import InputError, UsageError
+from mudg.data import city_clips, city_logs
+from mudg.data.city import CityWorld
+from mudg.data.city_logs import LogRules
+from mudg.data.observations import list_observation_sets, read_observations
+from mudg.stages import bench, bench_shift, bench_shift_page, bench_shift_tables, score_truth
+from mudg.stages.config import BenchConfig
+
+TINY = LogRules(frames=4, width=96, height=64, cameras=("front",))
+
+
+# ---- lists -------------------------------------------------------------------------------------------------------------
+
+
+def test_lists_are_apart_from_each_other_and_from_all_training_cities():
+    development, reported = city_logs.LISTS["development"], city_logs.LISTS["reported"]
+    assert (len(development), len(reported)) == (4, 8)
+    assert not set(development) & set(reported)
+    trained = {seeds.key(0, city, "city") & 0x7FFFFFFF for city in range(5000)}
+    scored = {
+        city_clips.city_config(city_clips.CityClipRules(), c).seed for of in city_clips.LISTS.values() for c in of
+    }
+    assert not (trained | scored) & set(development + reported)
+
+
+@pytest.mark.parametrize("name", ["development", "reported"])
+def test_half_of_a_list_is_curved(name):
+    turns = [city_logs.turn_deg(city_logs.log_config(seed)) for seed in city_logs.LISTS[name]]
+    assert sum(turn >= city_logs.CHOICE.curved_deg for turn in turns) == len(turns) / 2
+
+
+def test_the_development_list_is_what_the_rule_gives():
+    assert city_logs.choose(city_logs.FIRST_SEEDS["development"], 4) == city_logs.DEVELOPMENT
+    with pytest.raises(UsageError, match="half"):
+        city_logs.choose(0, 3)
+
+
+@pytest.mark.slow
+def test_the_reported_list_is_what_the_rule_gives():
+    assert city_logs.choose(city_logs.FIRST_SEEDS["reported"], 8) == city_logs.REPORTED
+
+
+def test_moving_instances_are_those_of_the_generator():
+    world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
+    judged = set(city_logs.moving_instances(world))
+    still = {
+        number for number, mover in enumerate(world.movers, start=1) if np.ptp(mover.keys[:, :2], axis=0).max() == 0
+    }
+    assert judged
+    assert not judged & still
+
+
+# ---- rows --------------------------------------------------------------------------------------------------------------
+
+
+def test_variants_change_fields_of_the_fit():
+    rows = bench_shift.rows_of(
+        BenchConfig(methods=("mudg_s",), variant=("a=virtual_probability:0.4,densify:false", "b=sh_degree:1"))
+    )
+    a, b = rows[-2].fit, rows[-1].fit
+    assert (a.virtual_probability, a.densify, a.iterations) == (0.4, False, 1000)
+    assert dataclasses.replace(b, sh_degree=0) == rows[0].fit
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a", "a=", "a=densify", "=densify:false", "a/b=densify:false", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
+)
+def test_a_malformed_variant_is_refused(text):
+    with pytest.raises(UsageError):
+        bench_shift.rows_of(BenchConfig(variant=(text,)))
+
+
+def test_ablation_brings_the_rows_it_is_compared_with():
+    rows = {r.name: r.fit for r in bench_shift.rows_of(BenchConfig(methods=("mudg_r",), ablation=True))}
+    assert list(rows) == ["street_gaussians", "mudg_r", "mudg_s", "only_I", "only_I_D", "only_I_S"]
+    full = rows["mudg_s"]
+    assert rows["only_I"] == dataclasses.replace(full, virtual_depth_weight=0, virtual_semantic_weight=0)
+    assert rows["only_I_D"] == dataclasses.replace(full, virtual_semantic_weight=0)
+    assert rows["only_I_S"] == dataclasses.replace(full, virtual_depth_weight=0)
+
+
+def test_unknown_methods_and_repeated_names_are_refused():
+    with pytest.raises(UsageError, match="unknown method"):
+        bench_shift.rows_of(BenchConfig(methods=("nerf",)))
+    with pytest.raises(UsageError, match="same name"):
+        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify:false",)))
+
+
+# ---- tables ------------------------------------------------------------------------------------------------------------
+
+
+def made_up(psnr, abs_rel):
+    """Logs whose methods have the given numbers at 2 m and these plus 1 at 4 m; nothing else."""
+    logs = []
+    for number in range(len(psnr["a"])):
+        values = {
+            m: {
+                p: {"psnr": psnr[m][number] + more, "abs_rel": abs_rel[m][number]}
+                for p, more in (("0", 5), ("2", 0), ("4", 1))
+            }
+            for m in psnr
+        }
+        facts = {
+            "log": number,
+            "turn_deg": 1.0,
+            "length_m": 2.0,
+            "movers": 3,
+            "mover_share": 0.1,
+            "words": "x",
+            "films": [],
+            "seconds": {},
+        }
+        logs.append({**facts, "values": values})
+    return logs
+
+
+def test_differences_and_ratios_with_their_standard_errors_by_hand():
+    logs = made_up({"a": [20.0, 22.0, 27.0], "b": [19.0, 20.0, 24.0]}, {"a": [0.1, 0.2, 0.3], "b": [0.2, 0.2, 0.2]})
+    for entry in logs:
+        entry["values"] = {m: bench_shift_tables._with_mean(of, ["2", "4"]) for m, of in entry["values"].items()}
+    difference = bench_shift_tables.compare(
+        logs, bench_shift_tables.Comparison("", "a", "b", "shifted", "psnr", "difference")
+    )
+    assert difference["value"] == pytest.approx(2.0)
+    assert difference["standard_error"] == pytest.approx(np.std([1, 2, 3], ddof=1) / math.sqrt(3))
+    ratio = bench_shift_tables.compare(logs, bench_shift_tables.Comparison("", "a", "b", "2", "abs_rel", "ratio"))
+    assert ratio["value"] == pytest.approx(1.0)
+    left = [1.25, 1.0, 0.75]  # ratio of means without the first, second, third log
+    assert ratio["standard_error"] == pytest.approx(math.sqrt(2 / 3 * sum((v - 1.0) ** 2 for v in left)))
+    one = bench_shift_tables.compare(logs[:1], bench_shift_tables.Comparison("", "a", "b", "2", "psnr", "difference"))
+    assert (one["value"], one["standard_error"]) == (1.0, None)
+
+
+def test_what_a_log_lacks_is_left_out_and_named():
+    logs = made_up({"a": [20.0, 22.0], "b": [19.0, 20.0]}, {"a": [0.1, 0.2], "b": [0.2, 0.2]})
+    logs[1]["values"]["a"]["2"]["psnr"] = "no truth"
+    rows = [{"name": "a", "title": "a", "fit": None}, {"name": "b", "title": "b", "fit": None}]
+    settings = {
+        "list": "x",
+        "iterations": 1,
+        "seed": 0,
+        "frames": 4,
+        "size_px": [8, 8],
+        "cameras": ["front"],
+        "held_out_every": 4,
+    }
+    document = bench_shift_tables.document(logs, rows, [2.0, 4.0], settings)
+    assert document["pooled"]["a"]["2"]["psnr"] == {"mean": 20.0, "standard_error": None, "logs": 1}
+    assert document["logs"][1]["values"]["a"]["shifted"]["psnr"] == "no truth"
+    assert document["pooled"]["a"]["0"]["psnr"]["mean"] == pytest.approx(26.0)
+    assert document["pooled"]["b"]["shifted"]["psnr"]["mean"] == pytest.approx(20.0)
+    assert document["pooled"]["a"]["2"]["miou"] == "not produced"
+    assert "not produced" in bench_shift_tables.markdown(document)
+    assert "<script>" in bench_shift_page.page(document)
+
+
+# ---- end to end --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    out = tmp_path_factory.mktemp("shift")
+    config = BenchConfig(logs=1, iterations=30, processes=1, methods=("nearest_fill", "street_gaussians"))
+    return bench_shift.run(config, out, rules=TINY, distances_m=(3.0,)), config
+
+
+def test_the_command_compares_methods_and_reuses_what_is_there(made):
+    out, config = made
+    document = store.read_json(out / "bench.json")
+    log = str(city_logs.DEVELOPMENT[0])
+    for method in ("nearest_fill", "street_gaussians"):
+        values = document["logs"][0]["values"][method]
+        assert set(values) == {"0", "3", "shifted"}
+        numbers = {m for m in document["metrics"] if isinstance(values["3"][m], float)}
+        assert {"psnr", "ssim", "perceptual", "abs_rel", "miou", "flicker"} <= numbers
+    better = {m: document["pooled"][m]["0"]["psnr"]["mean"] for m in ("nearest_fill", "street_gaussians")}
+    assert better["street_gaussians"] > better["nearest_fill"]
+    assert (out / log / "film" / "front_shift+3.0.jpg").is_file()
+    assert f'src="{log}/film/front_shift+3.0.mp4"' in (out / "page.html").read_text()
+    before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
+    again = bench_shift.run(
+        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify:false",)), out,
+        rules=TINY, distances_m=(3.0,),
+    )  # fmt: skip
+    assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
+    assert [m["name"] for m in store.read_json(again / "bench.json")["methods"]] == ["street_gaussians", "still"]
+
+
+def test_stored_truth_is_the_drawn_truth(made):
+    out, _ = made
+    log = out / str(city_logs.DEVELOPMENT[0])
+    assert set(list_observation_sets(log / "truth")) == {"front_recorded", "front_shift+3.0", "front_shift-3.0"}
+    stored = score_truth.stored_truth(log / "truth")
+    world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
+    view = read_observations(log / "truth" / "front_shift+3.0").views[2]
+    found, drawn = stored.at(view, None, "front_shift+3.0"), world.render(view)
+    assert np.array_equal(found.seen.semantics.numpy(), drawn.semantics)
+    assert float((found.seen.rgb.permute(1, 2, 0).numpy() - drawn.rgb).__abs__().max()) <= 0.5 / 255 + 1e-6
+    assert np.array_equal(found.moving[0].numpy(), np.isin(drawn.instance, city_logs.moving_instances(world)))
+    with pytest.raises(InputError, match="another view"):
+        stored.at(dataclasses.replace(view, time_s=view.time_s + 0.05), None, "front_shift+3.0")
+    with pytest.raises(InputError, match="lacks a trajectory"):
+        stored.at(view, None, "front_shift+9.0")
+
+
+def test_other_settings_in_the_same_folder_are_refused(made):
+    out, config = made
+    with pytest.raises(UsageError, match="another configuration"):
+        bench.run("shift", dataclasses.replace(config, iterations=31), out)

@@ -1,0 +1,256 @@
+"""Perceptual distance, flicker and movers: order of known degradations, known values, and what the scorer does with them."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+import torch
+import toy_views
+from PIL import Image
+from torch.nn import functional
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, View
+from mudg.core import metrics
+from mudg.core.metrics import Pair
+from mudg.data.city import CityConfig, CityWorld
+from mudg.models import mdm
+from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
+from mudg.stages import score, score_tables
+from mudg.stages.config import ScoreConfig
+
+
+def pair(**given) -> Pair:
+    empty = dict.fromkeys(
+        ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
+    )
+    return Pair(**{**empty, **given})
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Two views of different cities, f32[3, 128, 192]."""
+    found = []
+    for seed in (11, 12):
+        world = CityWorld(CityConfig(seed=seed, n_frames=4, width=192, height=128, cameras=("front",)))
+        found.append(
+            torch.from_numpy(world.render(world.frame_views("front")[2]).rgb.copy()).permute(2, 0, 1).contiguous()
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def distance():
+    perceptual = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
+    return lambda made, truth, mask=None: perceptual(pair(rgb=made, truth_rgb=truth, mask=mask))
+
+
+def blurred(rgb, sigma):
+    reach = int(3 * sigma) + 1
+    kernel = torch.exp(-(torch.arange(-reach, reach + 1.0) ** 2) / (2 * sigma**2))
+    kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
+    padded = functional.pad(rgb[None], (reach,) * 4, mode="replicate")
+    return functional.conv2d(functional.conv2d(padded, kernel, groups=3), kernel.transpose(2, 3), groups=3)[0]
+
+
+def noisy(rgb, sigma):
+    return (rgb + sigma * torch.randn(rgb.shape, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
+
+
+def jpeg(rgb, quality):
+    target = io.BytesIO()
+    Image.fromarray((rgb * 255).round().byte().permute(1, 2, 0).numpy()).save(target, "JPEG", quality=quality)
+    return torch.from_numpy(np.array(Image.open(target))).permute(2, 0, 1) / 255
+
+
+def scrambled(rgb, seed=0):
+    """Blocks of 4x4 pixels change places within 32x32: colours and their local statistics stay, what is drawn does not."""
+    blocks = rgb.reshape(3, 4, 8, 4, 6, 8, 4).permute(1, 4, 2, 5, 0, 3, 6).reshape(24, 64, 3, 4, 4)
+    order = torch.stack([torch.randperm(64, generator=torch.Generator().manual_seed(seed + n)) for n in range(24)])
+    moved = torch.stack([cell[o] for cell, o in zip(blocks, order)])
+    return moved.reshape(4, 6, 8, 8, 3, 4, 4).permute(4, 0, 2, 5, 1, 3, 6).reshape(3, 128, 192)
+
+
+def test_equal_pictures_are_0_apart(pictures, distance):
+    assert distance(pictures[0], pictures[0]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "strengths"), [(blurred, (0.5, 1.0, 2.0, 4.0)), (noisy, (0.01, 0.03, 0.1)), (jpeg, (90, 50, 20, 5))]
+)
+def test_stronger_degradation_is_farther(pictures, distance, change, strengths):
+    apart = [distance(change(pictures[0], s), pictures[0]) for s in strengths]
+    assert apart == sorted(apart)
+    assert apart[-1] > 4 * apart[0] > 0
+
+
+def test_degradations_are_ordered_as_people_see_them_where_psnr_is_not(pictures, distance):
+    truth = pictures[0]
+    darker, moved = truth * 0.9, torch.roll(truth, 1, 2)
+    soft, wrong = blurred(truth, 2.0), scrambled(truth)
+    apart = {
+        name: distance(x, truth) for name, x in (("darker", darker), ("moved", moved), ("soft", soft), ("wrong", wrong))
+    }
+    assert apart["darker"] < apart["moved"] < apart["soft"] < apart["wrong"]
+    assert apart["wrong"] > 3 * apart["soft"]  # the wrong texture is farther than none
+    assert distance(pictures[1], truth) > 3 * apart["soft"]
+    # Of a picture a tenth darker and one with visible blocks, PSNR takes the blocks.
+    assert metrics.psnr(jpeg(truth, 20), truth) > metrics.psnr(darker, truth)
+    assert distance(jpeg(truth, 20), truth) > 2 * apart["darker"]
+
+
+def test_only_masked_in_pixels_count_and_odd_sizes_work(pictures, distance):
+    truth = pictures[0][:, :125, :187]
+    spoilt = truth.clone()
+    spoilt[:, :, 120:] = 0.5
+    mask = torch.zeros(1, 125, 187, dtype=torch.bool)
+    mask[..., :40] = True
+    assert distance(spoilt, truth, mask) < 1e-6 < distance(spoilt, truth)
+
+
+def test_perceptual_distance_by_hand():
+    a, b = torch.tensor([[[3.0, 1.0]], [[4.0, 0.0]]]), torch.tensor([[[6.0, 0.0]], [[8.0, 2.0]]])
+    # First place: the same direction; second: right angles, squared distance of unit vectors 2.
+    assert metrics.perceptual_distance([a], [b]) == pytest.approx(1.0, abs=1e-5)
+    assert metrics.perceptual_distance([a, a], [b, a]) == pytest.approx(0.5, abs=1e-5)
+    assert metrics.perceptual_distance([a, a], [b, a], weights=[torch.tensor([1.0, 0.0])] * 2) == pytest.approx(
+        0.5, abs=1e-5
+    )
+    assert metrics.perceptual_distance([a], [b], torch.tensor([[[True, False]]])) == pytest.approx(0.0, abs=1e-5)
+    with pytest.raises(InputError, match="shape"):
+        metrics.perceptual_distance([a], [b[..., :1]])
+
+
+def lpips_state():
+    generator = torch.Generator().manual_seed(0)
+    state = {}
+    for stage, (place, out, into, size, _, _) in enumerate(LpipsFeatures.LAYERS):
+        kernel = torch.randn(out, into, size, size, generator=generator) / (into * size * size) ** 0.5
+        state[f"net.slice{stage + 1}.{place}.weight"] = kernel
+        state[f"net.slice{stage + 1}.{place}.bias"] = torch.randn(out, generator=generator) * 0.1
+        state[f"lin{stage}.model.1.weight"] = torch.rand(1, out, 1, 1, generator=generator)
+    return state
+
+
+def lpips_twin(made, truth, state):
+    """LPIPS in float64 from torch's layers and the paper's equation, written down a second time."""
+    conv = torch.nn.Conv2d
+    trunk = torch.nn.Sequential(
+        conv(3, 64, 11, 4, 2), torch.nn.ReLU(), torch.nn.MaxPool2d(3, 2), conv(64, 192, 5, padding=2), torch.nn.ReLU(),
+        torch.nn.MaxPool2d(3, 2), conv(192, 384, 3, padding=1), torch.nn.ReLU(), conv(384, 256, 3, padding=1), torch.nn.ReLU(),
+        conv(256, 256, 3, padding=1), torch.nn.ReLU(),
+    ).double()  # fmt: skip
+    trunk.load_state_dict({name.split(".", 2)[2]: v.double() for name, v in state.items() if name.startswith("net.")})
+    x = torch.stack([made, truth]).double() * 2 - 1
+    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor(
+        [0.458, 0.448, 0.450]
+    ).double().view(3, 1, 1)
+    total, stage = 0.0, 0
+    with torch.no_grad():
+        for layer in trunk:
+            x = layer(x)
+            if isinstance(layer, torch.nn.ReLU):
+                a, b = functional.normalize(x, dim=1)
+                total += float(((a - b) ** 2 * state[f"lin{stage}.model.1.weight"][0].double()).sum(0).mean())
+                stage += 1
+    return total
+
+
+def test_lpips_equals_its_float64_twin(pictures):
+    state, truth = lpips_state(), pictures[0][:, :96, :100]
+    network = LpipsFeatures(state)
+    apart = PerceptualDistance(network, network.channel_weights)(pair(rgb=blurred(truth, 1.0), truth_rgb=truth))
+    assert apart == pytest.approx(lpips_twin(blurred(truth, 1.0), truth, state), rel=1e-4)
+
+
+def test_incomplete_lpips_weights_are_refused_and_named(tmp_path):
+    state = lpips_state()
+    del state["lin3.model.1.weight"]
+    with pytest.raises(InputError, match="lin3.model.1.weight"):
+        LpipsFeatures(state, "file")
+    with pytest.raises(InputError, match="too small"):
+        LpipsFeatures(lpips_state())(torch.zeros(3, 20, 64))
+
+
+# ---- flicker and movers ----------------------------------------------------------------------------------------------
+
+
+def still_pair(number, made_noise):
+    """A wall 10 m ahead whose true picture flickers by 0.1 and the made one by ``made_noise`` (each frame against the next)."""
+    wall = torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.4
+    sign = 1.0 if number % 2 else -1.0
+    view = View(Camera("front", 16, 12, 20.0, 20.0, 8.0, 6.0), np.eye(4), 0.1 * number)
+    depth, ids = torch.full((1, 12, 16), 10.0), torch.full((12, 16), 2)
+    depth[:, :3], ids[:3] = 0.0, 10  # sky: no depth
+    return pair(
+        rgb=wall + sign * made_noise / 2,
+        truth_rgb=wall + sign * 0.05,
+        truth_depth=depth,
+        truth_semantics=ids,
+        view=view,
+    )
+
+
+def test_flicker_is_change_of_static_surfaces_over_that_of_the_truth():
+    metric = metrics.Flicker()
+    assert metric.value() is None
+    for number in range(4):
+        metric.update(still_pair(number, 0.25))
+    assert metric.value() == pytest.approx(2.5, rel=1e-4)
+    alone = metrics.Flicker()
+    alone.update(still_pair(0, 0.25))
+    assert alone.value() is None
+
+
+def test_psnr_of_movers_counts_their_pixels_only_and_leaves_specks_out():
+    truth = torch.zeros(3, 40, 50)
+    made = truth.clone()
+    moving = torch.zeros(1, 40, 50, dtype=torch.bool)
+    moving[:, 10:20, 10:20] = True
+    made[:, 10:20, 10:20] = 0.1
+    made[:, 30:] = 1.0  # elsewhere
+    of = metrics.build_all()["psnr_movers"]
+    of.update(pair(rgb=made, truth_rgb=truth, moving=moving))
+    assert of.value() == pytest.approx(20.0, abs=1e-4)
+    speck = torch.zeros_like(moving)
+    speck[0, 0, 0] = True
+    empty = metrics.build_all()["psnr_movers"]
+    empty.update(pair(rgb=made, truth_rgb=truth, moving=speck))
+    empty.update(pair(rgb=made, truth_rgb=truth))
+    assert empty.value() is None
+
+
+# ---- in the scorer ---------------------------------------------------------------------------------------------------
+
+
+def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_movers(tmp_path):
+    scene = toy_views.write_scene(tmp_path / "scene")
+
+    def grey(_index, seen):
+        return dataclasses.replace(seen, rgb=torch.full_like(seen.rgb, 0.5))
+
+    plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
+    views = {"a": plain, "b": toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), grey)}
+    document = store.read_json(score.run(ScoreConfig(), scene, views, tmp_path / "score") / "metrics.json")
+    values = {r["method"]: r["values"] for r in document["results"]}
+    assert values["a"]["perceptual"] == pytest.approx(0.0, abs=1e-6)
+    assert values["b"]["perceptual"] > 0.05
+    assert values["a"]["flicker"] == values["a"]["psnr_movers"] == score_tables.NO_TRUTH
+    assert values["a"]["lpips"] == "not computed"
+    store.write_safetensors(tmp_path / "lpips.safetensors", {name: v.numpy() for name, v in lpips_state().items()})
+    config = ScoreConfig(perceptual_views=0, lpips_weights=str(tmp_path / "lpips.safetensors"))
+    other = store.read_json(score.run(config, scene, views, tmp_path / "other") / "metrics.json")
+    values = {r["method"]: r["values"] for r in other["results"]}
+    assert values["a"]["perceptual"] == score_tables.NOT_ASKED
+    assert values["a"]["lpips"] == pytest.approx(0.0, abs=1e-6) != values["b"]["lpips"]
+
+
+def test_evenly_spread_views():
+    assert score.evenly(range(6), 8) == [0, 1, 2, 3, 4, 5]
+    assert score.evenly(range(24), 3) == [4, 12, 20]
+    assert score.evenly([3, 7, 11], 1) == [7]
+    assert score.evenly([], 4) == score.evenly(range(4), 0) == []
