@@ -7,7 +7,9 @@ import math
 import pytest
 import torch
 
+from mudg.base import config as configuration
 from mudg.base import geometry
+from mudg.base.errors import UsageError
 from mudg.base.types import RasterTrace
 from mudg.core.table import Table
 from mudg.models.densify import (
@@ -20,6 +22,7 @@ from mudg.models.densify import (
     shorten_needles,
 )
 from mudg.models.nodes import RigidNode, SceneModel, StaticNode
+from mudg.stages.config import FitConfig
 
 SETTINGS = DensifySettings(
     start=10, stop=100, every=10, static_gradient=1.0, object_gradient=1.0, split_above_m=0.5, max_rows=1000, growth=10.0
@@ -178,3 +181,25 @@ def test_rotate_agrees_with_the_matrix():
     vector = torch.tensor([[1.0, 2.0, -0.7]])
     expected = geometry.matrix_from_quaternion(quats[0].numpy()) @ vector[0].numpy()
     assert rotate(quats, vector)[0].tolist() == pytest.approx(expected.tolist(), abs=1e-6)
+
+
+def test_objects_count_with_their_plain_gradient():
+    """Opposite contributions of single pixels cancel there; the background keeps the absolute gradient."""
+    stats = DensifyStats.zeros(3)
+    means2d = torch.zeros(3, 2, requires_grad=True)
+    means2d.grad = torch.tensor([[0.1, 0.0], [0.1, 0.0], [0.0, 0.2]])
+    absolute = torch.tensor([[0.3, 0.0], [0.3, 0.0], [0.0, 0.4]])
+    trace = RasterTrace(means2d, torch.zeros(3, 2, dtype=torch.int32), torch.ones(3, dtype=torch.bool), absolute)
+    stats.observe(trace, 200, 100, plain_from=1)
+    assert stats.gradient.tolist() == pytest.approx([30.0, 10.0, 10.0])
+    stats.observe(trace, 200, 100)
+    assert stats.gradient.tolist() == pytest.approx([60.0, 40.0, 30.0])
+
+
+def test_files_that_say_yes_or_no_are_still_read(tmp_path):
+    for text, kind in (("true", "gradient"), ("false", "none"), ("mcmc", "mcmc"), ("none", "none")):
+        (tmp_path / "fit.yaml").write_text(f"densify: {text}\n")
+        assert configuration.load(FitConfig, None, tmp_path / "fit.yaml").densify == kind
+    (tmp_path / "fit.yaml").write_text("densify: mcm\n")
+    with pytest.raises(UsageError, match="'gradient', 'mcmc' or 'none'"):
+        configuration.load(FitConfig, None, tmp_path / "fit.yaml")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 from dataclasses import replace
@@ -13,16 +14,17 @@ import pytest
 import torch
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
+from mudg import native
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.base.palette import ID
-from mudg.base.types import View
+from mudg.base.types import Gaussians, View
 from mudg.core import metrics, trajectory
 from mudg.core.raster import RasterConfig
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scenefile import read_scene
-from mudg.models.nodes import RigidNode
+from mudg.models.nodes import RigidNode, SceneModel
 from mudg.stages import fit, fit_start, fit_trust, fit_views
 from mudg.stages.config import FitConfig
 
@@ -99,30 +101,86 @@ def test_same_in_same_out(world, tmp_path):
     assert fitted_bytes(other) != fitted_bytes(first)
 
 
-@pytest.mark.parametrize("stop_after", [7, 21])
-def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, stop_after):
-    """Ctrl-C before and after a densification; virtual views, learnt poses and all. Bit for bit."""
-    config = settings("mudg_s", iterations=32, learn_poses=True)
-    schedule = fit.densify_schedule(config)
-    steps = [step for step in range(1, 33) if schedule.due(step)]
-    assert steps, "the test must cross a densification"
+@pytest.mark.parametrize("densify", ["gradient", "mcmc"])
+def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, densify):
+    """Ctrl-C before and after virtual views join, a densification and an opacity reset; learnt poses and all. Bit for bit."""
+    config = settings("mudg_s", iterations=26, learn_poses=True, densify=densify)
+    schedule, stops = fit.densify_schedule(config), [3, 4, 9, 10, 11, 12, 21]
+    if densify == "gradient":
+        schedule = dataclasses.replace(schedule, reset_every=12)
+        monkeypatch.setattr(fit, "densify_schedule", lambda _config: schedule)
+        assert [step for step in range(1, 27) if schedule.reset_due(step)] == [12]
+    assert [step for step in range(1, 27) if schedule.due(step)] == ([10] if densify == "gradient" else [10, 20])
+    assert config.virtual_start * config.iterations == pytest.approx(3.9)
     arguments = (config, world["scene"], world["fuse"])
     whole = fit.run(*arguments, tmp_path / "whole", observations=world["virtual"])
 
-    adam_step = fit.adam_step
+    adam_step, parts = fit.adam_step, tmp_path / "parts"
 
     def ctrl_c(model, step, *rest):
         adam_step(model, step, *rest)
-        if step == stop_after:
+        if step == stops[0]:
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(fit, "adam_step", ctrl_c)
-    with pytest.raises(KeyboardInterrupt):
-        fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
+    while stops:
+        with pytest.raises(KeyboardInterrupt):
+            fit.run(*arguments, parts, observations=world["virtual"])
+        assert (parts / "steps" / f"step_{stops.pop(0):08d}").is_dir()
     monkeypatch.setattr(fit, "adam_step", adam_step)
-    assert (tmp_path / "parts" / "steps" / f"step_{stop_after:08d}").is_dir()
-    parts = fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
-    assert fitted_bytes(parts) == fitted_bytes(whole)
+    assert fitted_bytes(fit.run(*arguments, parts, observations=world["virtual"])) == fitted_bytes(whole)
+
+
+@pytest.mark.parametrize("densify", ["gradient", "mcmc", "none"])
+def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch, densify):
+    """Row counts kept between densifications, and any number of threads: the same bytes."""
+    config = settings(iterations=22, densify=densify)
+    first = fit.run(config, world["scene"], world["fuse"], tmp_path / "a")
+
+    def counted_again(model):
+        return torch.bincount(model.table.labels["node"].long(), minlength=len(model.nodes)).tolist()
+
+    monkeypatch.setattr(SceneModel, "counts", counted_again)
+    before = native.threads()
+    native.set_threads(3) if native.library() is not None else None
+    torch.set_num_threads(2)
+    try:
+        second = fit.run(config, world["scene"], world["fuse"], tmp_path / "b")
+        assert torch.get_num_threads() == 2
+    finally:
+        native.set_threads(before) if native.library() is not None else None
+    assert fitted_bytes(first) == fitted_bytes(second)
+
+
+def test_the_kinds_of_densification_differ_and_none_keeps_the_rows(world, tmp_path):
+    config = settings(iterations=44, max_gaussians=1600)
+    made = {kind: fit.run(dataclasses.replace(config, densify=kind), world["scene"], world["fuse"], tmp_path / kind)
+            for kind in ("gradient", "mcmc", "none")}  # fmt: skip
+    rows = {kind: len(fit.load_model(folder).table) for kind, folder in made.items()}
+    start = len(fit.load_model(fit.run(settings(iterations=1), world["scene"], world["fuse"], tmp_path / "start")).table)
+    assert rows["none"] == start
+    assert start < rows["mcmc"] <= 1600
+    assert start < rows["gradient"] <= 1600
+    lines = list(map(store.parse_json, (made["mcmc"] / "log.jsonl").read_text().splitlines(), ["log"] * 99))
+    assert {"loss_opacity", "loss_scale"} <= set(lines[0])
+    assert any("relocated" in line for line in lines)
+
+
+def test_regularisers_are_means_of_opacity_and_scale():
+    table = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    opacity = torch.tensor([0.2, 0.6], requires_grad=True)
+    one = torch.zeros(2, 1)
+    gaussians = Gaussians(
+        torch.zeros(2, 3), torch.ones(2, 4), table, opacity, torch.zeros(2, 1, 3), extra=None, node=one[:, 0].int(), sh_rest=None
+    )
+    assert fit.regularisers(gaussians, settings()) == {}
+    terms = fit.regularisers(gaussians, settings(opacity_weight=0.5, scale_weight=2.0))
+    assert terms["opacity"].item() == pytest.approx(0.5 * 0.4)
+    assert terms["scale"].item() == pytest.approx(2.0 * 0.35)
+    terms["opacity"].backward()
+    assert opacity.grad.tolist() == [0.25, 0.25]
+    assert set(fit.regularisers(gaussians, settings(densify="mcmc"))) == {"opacity", "scale"}
+    assert set(fit.regularisers(gaussians, settings(densify="mcmc", scale_weight=0.0))) == {"opacity"}
 
 
 def test_densification_grows_within_its_cap(world, tmp_path):

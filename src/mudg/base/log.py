@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 
+Sink = Callable[[dict[str, Any]], None]
+"""Takes messages as JSON values: ``{"info": text}``, ``{"warn": text}`` or ``{"progress": text}``."""
+
 _quiet = False
 _said: set[str] = set()
+_sink: Sink | None = None
 
 
 def set_quiet(quiet: bool) -> None:
@@ -24,6 +28,12 @@ def is_quiet() -> bool:
     return _quiet
 
 
+def set_sink(sink: Sink | None) -> None:
+    """Hand all messages and progress to ``sink`` instead of writing them (a child process tells its parent); None = write."""
+    global _sink
+    _sink = sink
+
+
 def _console():
     from rich.console import Console
 
@@ -32,7 +42,11 @@ def _console():
 
 def info(message: str) -> None:
     """Say something worth knowing, once, on stderr."""
-    if not _quiet:
+    if _quiet:
+        return
+    if _sink is not None:
+        _sink({"info": message})
+    else:
         _console().print(message, markup=False)
 
 
@@ -45,7 +59,10 @@ def info_once(message: str) -> None:
 
 def warn(message: str) -> None:
     """Say that something is wrong but the work goes on."""
-    _console().print(f"warning: {message}", markup=False, style="yellow")
+    if _sink is not None:
+        _sink({"warn": message})
+    else:
+        _console().print(f"warning: {message}", markup=False, style="yellow")
 
 
 class Task:
@@ -59,7 +76,7 @@ class Task:
         self._progress = None
         self._id = None
         self._last_line_s = time.monotonic()
-        if _quiet:
+        if _quiet or _sink is not None:
             return
         console = _console()
         if console.is_terminal:
@@ -82,6 +99,10 @@ class Task:
         self._done += count
         if self._progress is not None and self._id is not None:
             self._progress.update(self._id, completed=self._done, text=self._text)
+        elif _sink is not None and not _quiet:
+            if time.monotonic() - self._last_line_s > 0.3:
+                self._last_line_s = time.monotonic()
+                _sink({"progress": f"{self._description}: {self._done}/{self._total} {self._text}".rstrip()})
         elif not _quiet and (time.monotonic() - self._last_line_s > 10.0):
             self._last_line_s = time.monotonic()
             info(f"{self._description}: {self._done}/{self._total} {self._text}")

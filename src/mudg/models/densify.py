@@ -1,11 +1,13 @@
-"""Densification: grow Gaussians where the image asks for detail, drop those that do nothing. Explicit state, pure schedule.
+"""Densification by screen gradient: grow Gaussians where the image asks for detail, drop those that do nothing.
 
-A simplified form of the published schedule (Kerbl 2023, with the absolute screen gradients of AbsGS and Street Gaussians):
-every ``every`` steps rows whose mean screen gradient exceeds a threshold are cloned (small) or split in two (large); rows that
-are transparent, grown out of proportion, or have left their box are removed; now and then opacities are pulled down so that
-what is not needed fades. Growth is bounded by ``max_rows``: the rows with the largest gradients go first.
+The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): every ``every`` steps rows whose mean screen
+gradient exceeds a threshold are cloned (small) or split in two (large); rows that are transparent, grown out of proportion,
+or have left their box are removed; now and then opacities are pulled down so that what is not needed fades. The background
+is judged by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain ones. Growth is
+bounded by ``max_rows``: the rows with the largest gradients go first.
 
-Which views may speak is the caller's choice (``stages/fit.py`` feeds recorded views only, see ``Observation.kind``).
+State is explicit: statistics belong to rows of the table, the schedule is a function of the step. Which views may speak is the
+caller's choice (``stages/fit.py`` feeds recorded views only, see ``Observation.kind``). ``models/mcmc.py`` is the alternative.
 """
 
 from __future__ import annotations
@@ -78,13 +80,22 @@ class DensifyStats:
         """Nothing seen yet."""
         return cls(torch.zeros(rows), torch.zeros(rows))
 
-    def observe(self, trace: RasterTrace, width: int, height: int) -> None:
-        """Add one backward pass (``trace.abs_grad2d`` in pixels; stored in units of half the image)."""
+    def observe(self, trace: RasterTrace, width: int, height: int, plain_from: int | None = None) -> None:
+        """Add one backward pass (gradients in pixels; stored in units of half the image).
+
+        Args:
+            trace: of a render with absolute gradients, after backward.
+            plain_from: rows from here on (those of the objects) count with their plain gradient, where the contributions
+                of single pixels cancel; None = all rows with the absolute one.
+        """
         if trace.abs_grad2d is None:
             raise ValueError("the render was made without absolute gradients")
+        gradient = trace.abs_grad2d
+        if plain_from is not None and plain_from < len(gradient) and trace.means2d.grad is not None:
+            gradient = torch.cat([gradient[:plain_from], trace.means2d.grad[plain_from:]])
         half_size = torch.tensor([width / 2, height / 2])
         visible = trace.visible
-        length = torch.view_as_complex(trace.abs_grad2d * half_size).abs()  # far faster than a norm over rows of two
+        length = torch.view_as_complex(gradient * half_size).abs()  # far faster than a norm over rows of two
         self.gradient += length * visible
         self.seen += visible
 
@@ -117,7 +128,7 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
         if len(labels["node"]):
             model.table.append(columns, labels)
     keep = torch.cat([keep, torch.ones(len(model.table) - len(keep), dtype=torch.bool)])
-    doomed = _useless(model, settings)
+    doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
     pruned = int((doomed & keep).sum())
     model.table.take(keep & ~doomed)
     model.sort_rows()
@@ -182,17 +193,17 @@ def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[t
     return halves
 
 
-def _useless(model: SceneModel, settings: DensifySettings) -> Tensor:
-    """Bool[N]: transparent, oversized, not finite, or outside the box it belongs to."""
+def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, box_margin: float) -> Tensor:
+    """Bool[N]: transparent, oversized, not finite, or outside ``box_margin`` times the box it belongs to (plus 0.1 m)."""
     table = model.table
     means = table["means"].detach()
-    doomed = torch.sigmoid(table["logits"].detach()) < settings.prune_opacity
-    doomed |= table["log_scales"].detach().amax(1).exp() > settings.prune_scale_m
+    doomed = torch.sigmoid(table["logits"].detach()) < prune_opacity
+    doomed |= table["log_scales"].detach().amax(1).exp() > prune_scale_m
     doomed |= ~torch.isfinite(means).all(1)
     half_size = torch.full((len(model.nodes), 3), torch.inf)
     for index, node in enumerate(model.nodes):
         if isinstance(node, RigidNode):
-            half_size[index] = torch.tensor(node.size_m) / 2 * settings.box_margin + 0.1
+            half_size[index] = torch.tensor(node.size_m) / 2 * box_margin + 0.1
     return doomed | (means.abs() > half_size[table.labels["node"].long()]).any(1)
 
 

@@ -294,10 +294,14 @@ class SceneModel:
     classes: tuple[int, ...]
     sh_degree: int
     facts: dict[str, Any] = field(default_factory=dict)
+    _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
 
     def counts(self) -> list[int]:
-        """Rows of each node, in order."""
-        return torch.bincount(self.table.labels["node"].long(), minlength=len(self.nodes)).tolist()
+        """Rows of each node, in order; counted again only when rows were taken or appended."""
+        owner = self.table.labels["node"]
+        if self._counted is None or self._counted[0] is not owner:
+            self._counted = owner, torch.bincount(owner.long(), minlength=len(self.nodes)).tolist()
+        return list(self._counted[1])
 
     def sort_rows(self) -> None:
         """Bring rows back into node order after rows were appended (stable)."""

@@ -6,9 +6,9 @@ Defaults are a full run on a small machine. Every field is one flag; units are i
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
@@ -286,6 +286,11 @@ class ConvertConfig:
     """Address space that reading the checkpoint may take beyond the program's own (0 = from the file's size)."""
 
 
+def _densify_by_name(value: object) -> object:
+    """Older files say yes or no."""
+    return {True: "gradient", False: "none"}[value] if isinstance(value, bool) else value
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FitConfig:
     """Fit a dynamic Gaussian scene to recorded, and optionally virtual, views."""
@@ -318,7 +323,13 @@ class FitConfig:
     """Update only the Gaussians that a step's view shows."""
     learn_poses: bool = False
     """Correct the boxes of moving objects while fitting (offset and yaw per key)."""
-    densify: bool = True
+    densify: Annotated[Literal["gradient", "mcmc", "none"], BeforeValidator(_densify_by_name)] = "gradient"
+    """How the number of Gaussians changes. gradient: clone, split and prune by screen gradients; mcmc: move those that do nothing,
+    grow to max_gaussians; none: as they start."""
+    opacity_weight: float | None = Field(default=None, ge=0)
+    """Pulls all opacities down, so that what is not needed fades (unset = 0.01 with mcmc, else 0)."""
+    scale_weight: float | None = Field(default=None, ge=0)
+    """Pulls all sizes down, per metre (unset = 0.001 with mcmc, else 0)."""
     ssim_weight: float = Field(default=0.2, ge=0, le=1)
     lidar_weight: float = Field(default=0.1, ge=0)
     """LiDAR depth on recorded views (best 95 % of the points, relative error)."""

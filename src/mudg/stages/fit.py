@@ -30,7 +30,7 @@ from torch import Tensor
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
-from mudg.base.types import Observation, Render, View
+from mudg.base.types import Gaussians, Observation, Render, View
 from mudg.core import fused as kernels
 from mudg.core import losses, metrics
 from mudg.core.raster import RasterConfig, rasterize
@@ -38,6 +38,7 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.scenefile import read_scene
 from mudg.models.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
 from mudg.models.featnets import FilterBank
+from mudg.models.mcmc import McmcSettings, drift, relocate_and_grow
 from mudg.models.nodes import SceneModel, compose, composite_semantics, composite_sky
 from mudg.stages.config import FitConfig
 from mudg.stages.fit_start import StartSettings, start_model
@@ -59,6 +60,8 @@ PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
 NEAR_M = 0.2
+MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
+"""Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +110,9 @@ def run(
     folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
     if folder.complete:
         return folder.reused()
-    state = _prepare(config, recipe, Path(scene), Path(fused), virtual, folder.path)
-    optimise(state, config, folder)
+    with _one_torch_thread():
+        state = _prepare(config, recipe, Path(scene), Path(fused), virtual, folder.path)
+        optimise(state, config, folder)
     save_model(state.model, folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
     folder.finish(state.summary())
@@ -122,7 +126,7 @@ class FitState:
     model: SceneModel
     views: ViewSet
     stats: DensifyStats
-    schedule: DensifySettings
+    schedule: DensifySettings | McmcSettings | None
     step: int
     seconds: float = 0.0
     last: Mapping[str, float] | None = None
@@ -185,11 +189,13 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             sample = state.views.choose(config.seed, step, probability, state.unseen, reach_m)
             observation = sample.observation
             recorded = observation.kind == "recorded"
-            growing = (recorded or config.virtual_densify) and config.densify and step <= state.schedule.stop
+            wanted = recorded or config.virtual_densify
+            growing = wanted and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
 
             gaussians = compose(state.model, observation.view.time_s, semantics=not recorded or step % config.semantic_every == 0)
             render = rasterize(gaussians, observation.view, raster, absgrad=growing)
             terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception)
+            terms |= regularisers(gaussians, config)
             finite_or_refuse(terms, sample.name, step)
             torch.stack(list(terms.values())).sum().backward()
             gradients_or_refuse(state.model, sample.name, step)
@@ -197,7 +203,8 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.longest_to_middle)
             if growing:
-                state.stats.observe(render.trace, observation.view.camera.width, observation.view.camera.height)
+                camera = observation.view.camera
+                state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0])
             grown = _densify_if_due(state, config, step)
 
             state.step, state.seconds = step, state.seconds + time.perf_counter() - began
@@ -302,6 +309,19 @@ def virtual_terms(
     return terms
 
 
+def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
+    """Weighted mean opacity and mean scale in metres of all Gaussians, where their weights are not 0."""
+    published = config.densify == "mcmc"
+    opacity_weight = (MCMC_OPACITY_WEIGHT if published else 0.0) if config.opacity_weight is None else config.opacity_weight
+    scale_weight = (MCMC_SCALE_WEIGHT if published else 0.0) if config.scale_weight is None else config.scale_weight
+    terms = {}
+    if opacity_weight:
+        terms["opacity"] = opacity_weight * gaussians.opacity.mean()
+    if scale_weight:
+        terms["scale"] = scale_weight * gaussians.scales.mean()
+    return terms
+
+
 def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
     """NumericsError naming term, view and step if a loss term is not finite; nothing has been changed by then."""
     for name, value in terms.items():
@@ -316,8 +336,8 @@ def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
     """NumericsError naming the parameter if a gradient is not finite; the parameters have not been touched."""
     for owner, table in {"gaussians": model.table, **model.node_tables()}.items():
         for name, gradient in table.gradients().items():
-            if not math.isfinite(gradient.sum().item()):
-                count = int((~torch.isfinite(gradient)).sum())
+            # A sum is the cheapest pass over memory there is; it may overflow, so what it finds is counted.
+            if not math.isfinite(gradient.sum().item()) and (count := int((~torch.isfinite(gradient)).sum())):
                 table.clear_gradients()
                 raise NumericsError(
                     "a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
@@ -351,14 +371,21 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
     }
 
 
-def densify_schedule(config: FitConfig) -> DensifySettings:
-    """The published schedule (from 500, every 100, until half; opacity reset every 3000), scaled to the iterations."""
+def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None:
+    """The published schedules, scaled to the iterations; None without densification.
+
+    gradient: from 500, every 100, until 0.6 of the run, opacity reset every 3000. mcmc: the same rounds until 0.8.
+    """
     total = config.iterations
     every = max(10, min(100, total // 20))
+    start = max(every, min(500, total // 10))
+    if config.densify == "mcmc":
+        return McmcSettings(start, int(0.8 * total), every, max_rows=config.max_gaussians)
+    if config.densify == "none":
+        return None
     return DensifySettings(
-        start=max(every, min(500, total // 10)), stop=int(0.6 * total), every=every, max_rows=config.max_gaussians,
-        reset_every=3000 if total >= 10_000 else 0,
-    )  # fmt: skip
+        start, int(0.6 * total), every, max_rows=config.max_gaussians, reset_every=3000 if total >= 10_000 else 0
+    )
 
 
 def adam_step(model: SceneModel, step: int, config: FitConfig, visible: Tensor) -> None:
@@ -376,14 +403,20 @@ def adam_step(model: SceneModel, step: int, config: FitConfig, visible: Tensor) 
 
 
 def _densify_if_due(state: FitState, config: FitConfig, step: int) -> dict[str, Any]:
-    if not config.densify:
-        return {}
+    """What the schedule has for this step, after the optimiser's; a report if rows changed."""
+    model, schedule = state.model, state.schedule
     report: dict[str, Any] = {}
-    if state.schedule.due(step):
-        report = densify(state.model, state.stats, step, state.schedule, config.seed)
-        state.stats = DensifyStats.zeros(len(state.model.table))
-    if state.schedule.reset_due(step):
-        reset_opacity(state.model, state.schedule)
+    if isinstance(schedule, McmcSettings):
+        if schedule.due(step):
+            report = relocate_and_grow(model, step, schedule, config.seed)
+        drift(model, step, learning_rates(step, config.iterations)["means"], schedule, config.seed)
+    elif schedule is not None:
+        if schedule.due(step):
+            report = densify(model, state.stats, step, schedule, config.seed)
+        if schedule.reset_due(step):
+            reset_opacity(model, schedule)
+    if report:
+        state.stats = DensifyStats.zeros(len(model.table))
     return report
 
 
@@ -476,6 +509,18 @@ def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
         panels.append(palette.encode(seen.semantics.numpy(), palette.DISPLAY_COLORS))
     with store.atomic_path(path) as temporary:
         Image.fromarray(np.concatenate(panels, 1)).save(temporary)
+
+
+@contextlib.contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Results must not depend on how many cores are free; the native library's do not, torch's do. Its short loops gain nothing
+    from a second thread."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager

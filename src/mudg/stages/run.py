@@ -108,7 +108,9 @@ def _has_semantics(scene: Path) -> bool:
 
 
 def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[Step, ...]:
+    from mudg import native
     from mudg.stages import fit, fuse, render, score, synthesize
+    from mudg.stages.side_by_side import Task, run_side_by_side
 
     fused, virtual = out / "fuse", out / "synthesize"
     plain = replace(config.fit, method=WITHOUT_DIFFUSION)
@@ -119,6 +121,20 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
     def fitted(name: str) -> Path:
         settings, observations = (guided, virtual) if name == WITH_DIFFUSION else (plain, None)
         return fit.run(settings, scene, fused, models[name], observations=observations, overwrite=overwrite)
+
+    def fitted_both() -> None:
+        """Side by side where there are two cores: they need nothing of each other, and much of a fit uses one core only."""
+        threads = native.default_threads()
+        if threads < 2 or not all(overwrite or _unfinished(folder) for folder in models.values()):
+            for name in models:
+                fitted(name)
+            return
+        inputs = {WITHOUT_DIFFUSION: (plain, None), WITH_DIFFUSION: (guided, virtual)}
+        run_side_by_side(
+            [Task(name, fit.run, (settings, scene, fused, models[name]), {"observations": views, "overwrite": overwrite})
+             for name, (settings, views) in inputs.items()],
+            threads // 2,
+        )  # fmt: skip
 
     def rendered(name: str) -> Path:
         return render.run(config.render, scene, models[name], renders[name], overwrite=overwrite)
@@ -135,12 +151,17 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
         Step("fuse", "fuse", lambda: fuse.run(config.fuse, scene, fused, overwrite=overwrite)),
         Step("synthesize", "synthesize",
              lambda: synthesize.run(config.synthesize, scene, fused, virtual, overwrite=overwrite)),
-        Step("fit without diffusion", f"fit/{WITHOUT_DIFFUSION}", lambda: fitted(WITHOUT_DIFFUSION)),
-        Step("fit with diffusion", f"fit/{WITH_DIFFUSION}", lambda: fitted(WITH_DIFFUSION)),
+        Step("both fits", "fit", fitted_both),
         Step("render without diffusion", f"render/{WITHOUT_DIFFUSION}", lambda: rendered(WITHOUT_DIFFUSION)),
         Step("render with diffusion", f"render/{WITH_DIFFUSION}", lambda: rendered(WITH_DIFFUSION)),
         Step("score", "score", scored),
     )  # fmt: skip
+
+
+def _unfinished(folder: Path) -> bool:
+    """Whether no finished result lies there (a finished one is verified by the verb itself)."""
+    state = folder / "run.json"
+    return not state.is_file() or store.read_json(state).get("state") != "complete"
 
 
 def _report_key(out: Path) -> str:
