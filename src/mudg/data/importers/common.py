@@ -17,7 +17,6 @@ any number of workers.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Final, Literal, TypeVar
@@ -25,6 +24,7 @@ from typing import Final, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, pose_at, transform_points
@@ -47,8 +47,8 @@ _DESKEW_STEPS: Final = 32
 
 
 def processors() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Processors this process may use; MUDG_THREADS says otherwise."""
+    return native.default_threads()
 
 
 def for_each(
