@@ -19,9 +19,13 @@ from mudg.data.city.config import CityConfig
 class IngestConfig:
     """Turn a dataset log, or the built-in procedural city, into a scene directory."""
 
+    resolution: str = ""
+    """Size of the scene's images: longest side, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are never enlarged."""
+    workers: int = Field(default=0, ge=0)
+    """Threads that convert frames (0 = one per processor). The result does not depend on it."""
     test_every: int = Field(default=4, ge=0)
     """Hold out every n-th frame of all cameras for scoring (0 = hold out none)."""
-    format: Literal["auto", "kitti"] = "auto"
+    format: str = "auto"
     """Format of the log (auto = look)."""
     frames: str = ""
     """Source frames to take, FIRST:END with END left out (empty = all)."""

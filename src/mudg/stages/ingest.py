@@ -12,8 +12,9 @@ from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Frame, Scene
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.options import ImportOptions, parse_frame_range
+from mudg.data.importers import IMPORTERS, RECOGNISERS
+from mudg.data.importers.common import processors
+from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
 from mudg.data.scene_files import open_files
 from mudg.data.scenefile import SceneWriter, read_label, read_points, read_scene
 from mudg.stages.config import IngestConfig
@@ -37,7 +38,8 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
     source = str(source)
     make = _city if source == CITY else _maker(config, Path(source))
     inputs = {} if source == CITY else {"source": source_digest(Path(source))}
-    settings = {name: value for name, value in to_dict(config).items() if source == CITY or name != "city"}
+    idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
+    settings = {name: value for name, value in to_dict(config).items() if name not in idle}
     folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite)
     if folder.complete:
         return folder.reused()
@@ -67,15 +69,17 @@ def _maker(config: IngestConfig, source: Path) -> Maker:
         )
     if config.format != "auto":
         return _importer(config.format)
-    if source.is_file() or (source / "scene.json").is_file():
+    if is_scene(source):
         return _copy_scene
     for name, looks_like in RECOGNISERS.items():
         if looks_like(source):
             log.info(f"ingest: {source} looks like {name}")
             return _importer(name)
-    inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
+    inside = "a file"
+    if source.is_dir():
+        inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
     raise InputError(
-        "the folder's format was not recognised",
+        "the log's format was not recognised",
         where=str(source),
         expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
         got=inside,
@@ -83,17 +87,17 @@ def _maker(config: IngestConfig, source: Path) -> Maker:
     )
 
 
-def _looks_like_kitti(source: Path) -> bool:
-    if any((source / name).is_dir() for name in ("image_02", "image_2", "image_00", "velodyne_points")):
-        return True
-    return (source / "info.json").is_file() and any(path.suffix == ".bin" for path in source.iterdir())
-
-
-RECOGNISERS: Mapping[str, Callable[[Path], bool]] = {"kitti": _looks_like_kitti}
-"""Format name -> whether a folder looks like it."""
+def is_scene(source: Path) -> bool:
+    """Whether ``source`` is a scene directory, or a zip, which can be nothing else."""
+    return (source.is_file() and source.suffix == ".zip") or (source / "scene.json").is_file()
 
 
 def _importer(name: str) -> Maker:
+    if name not in IMPORTERS:
+        raise UsageError(
+            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=name
+        )
+
     def make(config: IngestConfig, source: Path, out: Path) -> Scene:
         return IMPORTERS[name](source, out, import_options(config))
 
@@ -111,14 +115,19 @@ def import_options(config: IngestConfig) -> ImportOptions:
         skip_missing=config.skip_missing,
         untwist=config.untwist,
         test_every=config.test_every,
+        resolution=parse_resolution(config.resolution),
+        workers=config.workers or processors(),
     )
 
 
 def source_digest(source: Path) -> str:
     """What identifies a log without reading all of it: names, sizes and modification times of its files; a scene's own digest."""
-    if source.is_file() or (source / "scene.json").is_file():
+    if is_scene(source):
         return store.digest(source)
     total = hashlib.sha256()
+    if source.is_file():
+        state = source.stat()
+        total.update(f"{source.name}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
     for folder, names, files in os.walk(source):
         names.sort()
         for name in sorted(files):

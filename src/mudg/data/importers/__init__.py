@@ -1,4 +1,8 @@
-"""Importers: dataset logs in their own formats -> scene directories. The table below is the only place that lists them."""
+"""Importers: dataset logs in their own formats -> scene directories. The two tables below are the only place that lists them.
+
+A format is one module ``<format>.py`` with ``import_<format>(source, out, options) -> Scene`` and
+``looks_like_<format>(source) -> bool``, and one row in each table. Rows load their module when called.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ from mudg.base.types import Scene
 from mudg.data.importers.options import ImportOptions
 
 Importer = Callable[[Path, Path, ImportOptions], Scene]
+Recogniser = Callable[[Path], bool]
 
 
 def _kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
@@ -17,7 +22,18 @@ def _kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
     return import_kitti(source, out, options)
 
 
+def _looks_like_kitti(source: Path) -> bool:
+    from mudg.data.importers.kitti import looks_like_kitti
+
+    return looks_like_kitti(source)
+
+
 IMPORTERS: Mapping[str, Importer] = {
     "kitti": _kitti,
 }
-"""Format name -> importer ``(source, out, options) -> Scene``; each loads its code when called."""
+"""Format name -> importer ``(source, out, options) -> Scene``."""
+
+RECOGNISERS: Mapping[str, Recogniser] = {
+    "kitti": _looks_like_kitti,
+}
+"""Format name -> whether a folder or file looks like it (by names of files, a few bytes at most). The first that says yes wins."""

@@ -67,6 +67,19 @@ class KittiFiles:
     single: bool
 
 
+def looks_like_kitti(source: Path) -> bool:
+    """Whether ``source`` is the folder of a KITTI drive, sequence, training set or single frame."""
+    if not source.is_dir():
+        return False
+    if any((source / name).is_dir() for name in ("image_02", "image_2", "image_00", "velodyne_points")):
+        return True
+    record = source / "info.json"
+    if not record.is_file() or not any(path.suffix == ".bin" for path in source.iterdir()):
+        return False
+    with record.open("rb") as handle:
+        return b'"CAM2"' in handle.read(1 << 16)
+
+
 def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import a KITTI recording into the scene directory ``out``; see the module text for what is understood.
 

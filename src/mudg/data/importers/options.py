@@ -9,6 +9,9 @@ from typing import Literal
 
 from mudg.base.errors import UsageError
 
+Resolution = int | tuple[int, int]
+"""Longest side in pixels, or width and height."""
+
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
@@ -22,6 +25,8 @@ class ImportOptions:
         skip_missing: leave out frames of which an image or scan is missing, instead of refusing.
         untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
         test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.
+        resolution: size of the scene's images; None keeps the recorded one. See ``images.ImageFit``.
+        workers: threads that convert frames; 0 = as many as there are processors to use. Results do not depend on it.
     """
 
     frames: tuple[int, int] | None = None
@@ -32,6 +37,8 @@ class ImportOptions:
     skip_missing: bool = False
     untwist: Literal["auto", "yes", "no"] = "auto"
     test_every: int = 4
+    resolution: Resolution | None = None
+    workers: int = 1
 
 
 def parse_frame_range(text: str) -> tuple[int, int] | None:
@@ -48,6 +55,24 @@ def parse_frame_range(text: str) -> tuple[int, int] | None:
             "frame range makes no sense", where="--frames", expected="FIRST:END with FIRST < END, e.g. 0:16", got=text
         )
     return int(match[1]), int(match[2])
+
+
+def parse_resolution(text: str) -> Resolution | None:
+    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None.
+
+    Raises:
+        UsageError: not of this form, or below 16 pixels.
+    """
+    if not text:
+        return None
+    match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
+    sides = [int(side) for side in match.groups() if side] if match is not None else []
+    if not sides or min(sides) < 16:
+        raise UsageError(
+            "image size makes no sense", where="--resolution",
+            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels", got=text,
+        )  # fmt: skip
+    return sides[0] if len(sides) == 1 else (sides[0], sides[1])
 
 
 def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[str, Literal["train", "test"]]:

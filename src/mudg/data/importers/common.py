@@ -1,0 +1,242 @@
+"""What importers share: work over frames in parallel, and the traps that every format has (units of time, poses).
+
+A typical importer::
+
+    times_s = seconds(raw_times, "us", where)                     # refuses milliseconds called microseconds
+    fits = {name: fit_images(camera, lens, options) for ...}      # images.py: rectified and resized in one place
+    with SceneWriter(out, scene_id, source) as writer:
+        for fit in fits.values():
+            writer.add_camera(fit.camera)
+        for_each(records, convert, workers=options.workers, title="importing", name=str)
+        ...
+        return writer.finish()
+
+``SceneWriter.add_*`` may be called from several threads and orders frames and sweeps by time, so the scene is the same for
+any number of workers.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from typing import Final, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mudg.base import log
+from mudg.base.errors import InputError, MudgError
+from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion
+
+Item = TypeVar("Item")
+Matrix = NDArray[np.float64]
+TimeUnit = Literal["ns", "us", "ms", "s"]
+
+UNITS_PER_SECOND: Final[dict[str, int]] = {"ns": 10**9, "us": 10**6, "ms": 10**3, "s": 1}
+PLAUSIBLE_PERIOD_S: Final = (2e-3, 20.0)
+"""Typical time between two records of one sensor; outside of it the unit is taken to be wrong."""
+POSE_TOLERANCE: Final = 1e-3
+QUATERNION_TOLERANCE: Final = 1e-2
+
+
+# --- work over frames -------------------------------------------------------------------------------------------------
+
+
+def processors() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def for_each(
+    items: Iterable[Item],
+    work: Callable[[Item], None],
+    *,
+    title: str,
+    total: int | None = None,
+    workers: int = 1,
+    name: Callable[[Item], str] = str,
+) -> int:
+    """Do ``work`` on every item with a progress bar; at most two items per worker are in memory.
+
+    Args:
+        items: read lazily, by the calling thread: a generator over the records of a large file is fine.
+        work: called once per item, from several threads if ``workers`` > 1.
+        title: of the progress bar.
+        total: number of items; None = ``len(items)``, or unknown for a generator.
+        workers: threads; 1 = no threads, 0 = as many as there are processors to use.
+        name: words for an item, put before the place of an error.
+
+    Returns:
+        Number of items.
+
+    Raises:
+        The error of the earliest failed item, its ``where`` completed by the item's name. No item is started after one
+        failed; those under way are waited for.
+    """
+    if total is None:
+        total = len(items) if isinstance(items, Sequence) else 0
+    workers = workers or processors()
+    done = 0
+    with log.task(title, total) as bar:
+        if workers == 1:
+            for item in items:
+                _named(work, item, name)
+                done += 1
+                bar.advance()
+            return done
+        with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
+            pending: dict[Future[None], int] = {}
+            failed: dict[int, BaseException] = {}
+            source = iter(items)
+            index = 0
+            try:
+                while not failed:
+                    while len(pending) < 2 * workers:
+                        try:
+                            item = next(source)
+                        except StopIteration:
+                            break
+                        pending[pool.submit(_named, work, item, name)] = index
+                        index += 1
+                    if not pending:
+                        break
+                    finished, _ = wait(pending, return_when=FIRST_COMPLETED)
+                    for future in finished:
+                        at = pending.pop(future)
+                        error = future.exception()
+                        if error is not None:
+                            failed[at] = error
+                        else:
+                            done += 1
+                            bar.advance()
+            finally:
+                for future in pending:
+                    future.cancel()
+            wait(pending)
+            for future, at in pending.items():
+                if not future.cancelled() and future.exception() is not None:
+                    failed[at] = future.exception()  # type: ignore[assignment]
+            if failed:
+                raise failed[min(failed)]
+    return done
+
+
+def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]) -> None:
+    try:
+        work(item)
+    except MudgError as error:
+        words = name(item)
+        if words in error.where:
+            raise
+        raise type(error)(
+            error.what, where=f"{words}: {error.where}" if error.where else words,
+            expected=error.expected, got=error.got, remedy=error.remedy,
+        ) from error  # fmt: skip
+
+
+# --- time -------------------------------------------------------------------------------------------------------------
+
+
+def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, where: str, start: float = 0) -> Matrix:
+    """Times of one sensor's records as seconds f64[N] since ``start`` (same unit), checked.
+
+    Integers are subtracted before they become floats, so nanoseconds of the epoch keep their digits.
+
+    Raises:
+        InputError: not increasing (with the first place), not finite, or so close or far apart that the unit is wrong.
+    """
+    numbers = np.asarray(times)
+    if numbers.dtype.kind not in "iuf" or numbers.ndim != 1 or not np.isfinite(numbers.astype(np.float64)).all():
+        raise InputError("timestamps are not a list of finite numbers", where=where, got=str(numbers)[:80])
+    if numbers.dtype.kind == "u":
+        numbers = numbers.astype(np.int64)
+    origin = int(start) if numbers.dtype.kind == "i" else start
+    since_start = (numbers - origin).astype(np.float64) / UNITS_PER_SECOND[unit]
+    steps = np.diff(since_start)
+    if (steps <= 0).any():
+        at = int(np.flatnonzero(steps <= 0)[0])
+        raise InputError(
+            "timestamps do not increase", where=f"{where}: record {at + 1}",
+            expected=f"later than {numbers[at]} {unit}", got=str(numbers[at + 1]),
+            remedy="sort the records by time, and remove doubled ones",
+        )  # fmt: skip
+    low, high = PLAUSIBLE_PERIOD_S
+    if len(steps) and not low <= (period := float(np.median(steps))) <= high:
+        raw = period * UNITS_PER_SECOND[unit]
+        fitting = [u for u, scale in UNITS_PER_SECOND.items() if low <= raw / scale <= high]
+        raise InputError(
+            "timestamps are in another unit than expected", where=where,
+            expected=f"{unit}; records {low:g} to {high:g} s apart", got=f"records {period:.3g} s apart",
+            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording",
+        )  # fmt: skip
+    return since_start
+
+
+# --- poses ------------------------------------------------------------------------------------------------------------
+
+
+def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
+    """A pose from a file, [3, 4] or [4, 4], as f64[4, 4]; rounding up to 1e-3 in the rotation is cleaned.
+
+    Raises:
+        InputError: scaled (the factor is told), left-handed, not a rotation, or not finite.
+    """
+    numbers = np.asarray(matrix, np.float64)
+    if numbers.shape not in ((3, 4), (4, 4)):
+        raise InputError("pose has the wrong shape", where=where, expected="3x4 or 4x4 numbers", got=str(numbers.shape))
+    if not np.isfinite(numbers).all():
+        raise InputError("pose holds values that are not finite", where=where)
+    if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
+        got = numbers[3].tolist()
+        transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
+        raise InputError(
+            "pose does not end in the row 0 0 0 1", where=where, got=str(got),
+            remedy="it looks transposed: write it row by row" if transposed else "write it row by row",
+        )  # fmt: skip
+    return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
+
+
+def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
+    """The rotation nearest to f64[3, 3] numbers that were rounded; see ``rigid_pose``."""
+    u, stretch, vt = np.linalg.svd(matrix)
+    handed = float(np.linalg.det(u @ vt))
+    if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
+        raise InputError(
+            "pose is scaled", where=where, expected="a rotation (scale 1)", got=f"scale {stretch[1]:.6g}",
+            remedy="divide the rotation part by its scale; are the translations in metres?",
+        )  # fmt: skip
+    if np.abs(stretch - 1).max() > POSE_TOLERANCE:
+        raise InputError(
+            "pose is not a rigid motion", where=where, expected="an orthonormal rotation part",
+            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}", remedy="is it row-major, without shear or scale?",
+        )  # fmt: skip
+    if handed < 0:
+        raise InputError(
+            "pose is left-handed", where=where, expected="determinant +1", got="a reflection (determinant -1)",
+            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras",
+        )  # fmt: skip
+    return u @ vt
+
+
+def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matrix:
+    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres.
+
+    Raises:
+        InputError: not finite, wrong count, or a quaternion whose length is not 1 within 1 %.
+    """
+    q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
+    if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
+        raise InputError(
+            "pose is not a quaternion and a translation", where=where, expected="4 and 3 finite numbers",
+            got=f"{q.tolist()} and {t.tolist()}",
+        )  # fmt: skip
+    length = float(np.linalg.norm(q))
+    if abs(length - 1) > QUATERNION_TOLERANCE:
+        raise InputError(
+            "quaternion does not have length 1",
+            where=where,
+            expected="w, x, y, z of a rotation",
+            got=f"length {length:.6g}",
+        )
+    return from_rotation_translation(matrix_from_quaternion(q), t)
