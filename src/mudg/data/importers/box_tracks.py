@@ -5,19 +5,21 @@ from __future__ import annotations
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base import log
 from mudg.base.errors import InputError
-from mudg.base.geometry import from_rotation_translation, slerp, matrix_from_quaternion, quaternion_from_matrix
+from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, quaternion_from_matrix, slerp
 from mudg.base.types import Track
 
 Matrix = NDArray[np.float64]
 MAX_GAP_S: Final = 0.55
 """A moving object that is not seen for longer than this is split: interpolating across would invent its path."""
 MAX_SIDE_M: Final = 100.0
+_LONGER_THAN_WIDE: Final = frozenset(("car", "van", "truck", "bus", "trailer", "vehicle", "caravan", "tram", "train"))
 _ROW: Final = 16  # time, size, pose
 
 
@@ -121,10 +123,18 @@ class BoxTracks:
                 Track(f"{name}.{part}" if part else name, member.label, size, times[piece], poses[piece])
                 for part, piece in enumerate(pieces)
             ]
-        return tracks, self._notes(split)
+        return tracks, self._notes(split, tracks)
 
-    def _notes(self, split: int) -> list[str]:
+    def _notes(self, split: int, tracks: list[Track]) -> list[str]:
         notes = []
+        long = [track for track in tracks if track.label in _LONGER_THAN_WIDE]
+        wide = [track for track in long if track.size_m[1] > 1.3 * track.size_m[0]]
+        if len(wide) * 2 > len(long):
+            notes.append(
+                f"{len(wide)} of {len(long)} vehicles are wider than long (first: {wide[0].id}): "
+                "length and width may be swapped in the source"
+            )
+            log.warn(f"{self._where}: {notes[-1]}")
         if split:
             notes.append(f"{split} tracks are not seen for more than {MAX_GAP_S} s and were split there")
         if self._unknown:

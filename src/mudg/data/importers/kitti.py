@@ -552,13 +552,18 @@ def read_scan(path: Path) -> SweepPoints:
     return SweepPoints(np.ascontiguousarray(rows[:, :3]), np.clip(rows[:, 3], 0, 1), np.zeros(len(rows), np.float32))
 
 
-def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s: float) -> SweepPoints:
+def untwist_scan(
+    points: SweepPoints, velo_at: Callable[[float], Matrix], time_s: float, clockwise: bool = False
+) -> SweepPoints:
     """Bring the points of a turning sensor to one moment; see the module text for the timing.
 
     The vehicle's pose is taken at 37 moments of the turn and points in between are blended linearly.
+
+    Args:
+        clockwise: the sensor turns the other way (seen from above) than the module text says.
     """
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
-    dt_s = np.asarray(kitti_boxes.azimuth_delay_s(azimuth), np.float32)
+    dt_s = np.asarray(kitti_boxes.azimuth_delay_s(-azimuth if clockwise else azimuth), np.float32)
     velo_from_world = invert(velo_at(time_s))
     moments = np.linspace(-0.5, 0.5, _TURN_STEPS + 1) * kitti_boxes.TURN_PERIOD_S
     corrections = [velo_from_world @ velo_at(time_s + float(moment)) for moment in moments]
