@@ -416,7 +416,7 @@ class _BoxTimes:
     def __init__(self, points: Mapping[str, NDArray[np.float64]], log_: _Log, index: int) -> None:
         self._points = points
         self._source_from_lidar = invert(log_.world_from_source) @ log_.world_from_lidar[0][index]
-        self._azimuth: NDArray[np.float64] | None = None
+        self._turning: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
 
     def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
         """Seconds from the frame's time: the median of the points inside; with few of them, of the points in that direction."""
@@ -432,12 +432,13 @@ class _BoxTimes:
     def _towards(self, centre: Matrix) -> NDArray[np.intp]:
         """Points of the turning LiDAR within a degree of the direction to ``centre``."""
         place = self._source_from_lidar[:3, 3]
-        if self._azimuth is None:
-            seen = self._points["xyz"][:, :2] - place[:2]
-            self._azimuth = np.where(self._points["d"] == 0, np.arctan2(seen[:, 1], seen[:, 0]), np.inf)
-        towards = np.arctan2(centre[1] - place[1], centre[0] - place[0])
-        turn = np.abs((self._azimuth - towards + np.pi) % (2 * np.pi) - np.pi)
-        return np.flatnonzero(turn < np.deg2rad(1.0))
+        if self._turning is None:
+            ids = np.flatnonzero(self._points["d"] == 0)
+            seen = self._points["xyz"][ids, :2] - place[:2]
+            self._turning = ids, np.arctan2(seen[:, 1], seen[:, 0])
+        ids, azimuth = self._turning
+        turn = azimuth - np.arctan2(centre[1] - place[1], centre[0] - place[0])
+        return ids[np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.deg2rad(1.0)]
 
 
 def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> list[str]:
