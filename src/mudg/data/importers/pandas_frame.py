@@ -93,7 +93,7 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     value = read_pickle(content, where, _MAKERS)
     try:
         return _columns(value)
-    except (ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise InputError(
             "pickle is not a plain data frame",
             where=where,

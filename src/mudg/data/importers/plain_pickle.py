@@ -87,6 +87,7 @@ def _filled(shape: Any, dtype: Any, order: str, content: Any) -> NDArray[Any]:
             raise ValueError(f"array of {count} objects holds {len(content)}")
         flat = np.empty(count, object)
         flat[:] = content
+        order = "C"  # numpy lists objects row by row, whatever the flag says
     else:
         if not isinstance(content, bytes | bytearray) or len(content) != count * dtype.value.itemsize:
             raise ValueError(f"array of shape {tuple(sizes)} and type {dtype.value} holds {len(content)} bytes")
