@@ -69,7 +69,7 @@ class Block:
         return _unpickle_block, (self.values, self.places, 2)
 
 
-def _new_Index(*_: Any) -> None: ...  # noqa: N802 - pandas' name
+def _new_Index(*_: Any) -> None: ...
 
 
 def _unpickle_block(*_: Any) -> None: ...

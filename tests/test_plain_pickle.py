@@ -18,6 +18,8 @@ from mudg.data.importers import pandas_frame, plain_pickle
 from mudg.data.importers.plain_pickle import NUMPY_MAKERS, Array, as_list, read_pickle
 
 GOLDEN = Path(__file__).parent / "golden"
+
+
 def made(rng: np.random.Generator, depth: int) -> Any:
     """Some plain value."""
     kind = int(rng.integers(0, 10 if depth else 7))
@@ -136,7 +138,8 @@ def test_names_outside_the_table_are_refused(content: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"(S'true'\nios\nsystem\n.", b"Pname\n.", b"I1\nQ.", b"\x82\x01.", b"(cnumpy\nndarray\no.", b"\x80\x05\x97."]
+    "content",
+    [b"(S'true'\nios\nsystem\n.", b"Pname\n.", b"I1\nQ.", b"\x82\x01.", b"(cnumpy\nndarray\no.", b"\x80\x05\x97."],
 )
 def test_operations_that_plain_data_does_not_need_are_refused(content: bytes) -> None:
     with pytest.raises(InputError, match=r"operation|malformed"):

@@ -129,7 +129,9 @@ def write_boxes(truth: Scene, path: Path) -> None:
     for instance, track in enumerate(truth.tracks, start=1):
         if np.ptp(track.world_from_object[:, 0, 3]) == 0:
             window = (FIRST, FIRST + len(track.times_s) - 1)
-            objects.append(box_xml(len(objects), track.world_from_object[0], track.size_m, instance=instance, window=window))
+            objects.append(
+                box_xml(len(objects), track.world_from_object[0], track.size_m, instance=instance, window=window)
+            )
             continue
         for index, pose in enumerate(track.world_from_object):
             frame = FIRST + index

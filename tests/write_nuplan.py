@@ -108,7 +108,7 @@ def write_nuplan(truth: Scene, root: Path, *, distortion: Sequence[float] = (0.0
             time_us = us(frame.view.time_s)
             file = f"{LOG}/{channel}/{token(channel, index).hex()}.jpg"
             buffer = io.BytesIO()
-            Image.fromarray(read_image(truth, frame)).save(buffer, "JPEG" if jpeg else "PNG", quality=95)
+            Image.fromarray(read_image(truth, frame)).save(buffer, "JPEG" if jpeg else "PNG", quality=95, subsampling=0)
             (root / "sensor_blobs" / file).write_bytes(buffer.getvalue())
             add("image", token=token("image", channel, index), camera_token=token(channel), filename_jpg=file,
                 timestamp=time_us - IMAGE_DELAY_US, ego_pose_token=token("ego", time_us))  # fmt: skip

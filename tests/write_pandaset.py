@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from pandas_pickles import write_frame
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
@@ -34,7 +34,9 @@ def write_pandaset(truth: Scene, folder: Path, *, point_times: bool = False, new
         for index, frame in enumerate(frames):
             Image.fromarray(read_image(truth, frame)).save(here / f"{index:02d}.png")
         camera = truth.cameras[name]
-        _dump(here / "intrinsics.json", {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - 0.5, "cy": camera.cy - 0.5})
+        _dump(
+            here / "intrinsics.json", {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - 0.5, "cy": camera.cy - 0.5}
+        )
         _dump(here / "poses.json", [pose_entry(SOURCE_FROM_WORLD @ frame.view.world_from_cam) for frame in frames])
         _dump(here / "timestamps.json", [EPOCH_S + frame.view.time_s for frame in frames])
     poses = []

@@ -147,7 +147,9 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
         if number in scans:
             points = read_scan(scans[number])
             if untwist:
-                points = untwist_scan(points, lambda t: motion.at(t) @ calibration.ego_from_velo, time_s, clockwise=True)
+                points = untwist_scan(
+                    points, lambda t: motion.at(t) @ calibration.ego_from_velo, time_s, clockwise=True
+                )
             writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, time_s, world_from_velo, points)
         if sick is not None:
             pose, lines = sick.sweep(time_s)
@@ -197,7 +199,10 @@ def _fit(calibration: Kitti360Calibration, camera: str, first: Path, options: Im
 
 
 def _say_left_out(
-    streams: Mapping[str, Mapping[int, Path]], placed: Mapping[str, Sequence[int]], options: ImportOptions, notes: list[str]
+    streams: Mapping[str, Mapping[int, Path]],
+    placed: Mapping[str, Sequence[int]],
+    options: ImportOptions,
+    notes: list[str],
 ) -> None:
     everything = {n for found in streams.values() for n in found}
     if options.frames is not None:
@@ -253,22 +258,25 @@ class _Motion:
                 remedy="download the data set's vehicle poses",
             )  # fmt: skip
         notes.append(f"poses from {path.name}")
-        numbers, poses = [], []
+        numbers, poses, before = [], [], -1
         for index, line in enumerate(kitti_poses.read_lines(path)):
             where = f"{path}: line {index + 1}"
             row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
             number = int(row[0])
-            if number != row[0] or number < 0 or (numbers and number <= numbers[-1]):
+            if number != row[0] or number <= before:
                 raise InputError(
                     "first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
                     remedy="is the file of another kind?",
                 )  # fmt: skip
+            before = number
             if number < len(clock):
                 pose = rigid_pose(row[1:].reshape(-1, 4), where)
                 numbers.append(number)
                 poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
         if not poses:
-            raise InputError("no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}")
+            raise InputError(
+                "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
+            )
         times = clock[numbers]
         if (np.diff(times) <= 0).any():
             at = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
@@ -361,7 +369,9 @@ def _read_line(path: Path) -> NDArray[np.float32]:
     """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane; source: the data set's reader."""
     content = store.read_bytes(path)
     if len(content) % 8:
-        raise InputError("SICK line is cut off", where=str(path), expected="a multiple of 8 bytes", got=f"{len(content)} bytes")
+        raise InputError(
+            "SICK line is cut off", where=str(path), expected="a multiple of 8 bytes", got=f"{len(content)} bytes"
+        )
     pairs = np.frombuffer(content, "<f4").reshape(-1, 2)
     if not np.isfinite(pairs).all():
         raise InputError("SICK line holds values that are not finite", where=str(path))
@@ -379,7 +389,9 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
         return {}
     ids = _grey(path)
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
-        raise InputError("semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits")
+        raise InputError(
+            "semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits"
+        )
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
@@ -396,7 +408,9 @@ def _grey(path: Path) -> NDArray[Any]:
     try:
         with Image.open(path, formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
-                raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits")
+                raise InputError(
+                    "label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits"
+                )
             array = np.array(image)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
@@ -438,7 +452,9 @@ def _read_tracks(
         span[2], span[3] = min(span[2], int(inside[0])), max(span[3], int(inside[-1]))
     for name, (box, pose, first, last) in spans.items():
         for number in dict.fromkeys((first, last)):
-            tracks.add(f"s-{name}" if name in moving else name, box.label, time_of[number], box.size_m, pose, standing=True)
+            tracks.add(
+                f"s-{name}" if name in moving else name, box.label, time_of[number], box.size_m, pose, standing=True
+            )
     if outside:
         notes.append(f"{outside} boxes lie outside the imported frames and were left out")
     notes += [f"{count} boxes {words} were left out" for words, count in left_out.items()]

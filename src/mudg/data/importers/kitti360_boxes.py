@@ -178,7 +178,9 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     return values.reshape(rows, columns)
 
 
-def _shape(transform: Matrix, vertices: Matrix, label: str, where: str) -> tuple[tuple[float, float, float], Matrix] | None:
+def _shape(
+    transform: Matrix, vertices: Matrix, label: str, where: str
+) -> tuple[tuple[float, float, float], Matrix] | None:
     """Size and pose of the box, or None if it is sheared.
 
     The axis that stands upright becomes z. Of the others, the first becomes x, for vehicles the longer one: which of them

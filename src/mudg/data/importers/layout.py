@@ -92,7 +92,9 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     if not options.cameras:
         chosen = [name for name in usual if name in available]
         if not chosen:
-            raise InputError("the log has no camera that can be imported", where=where, expected=", ".join(usual), got=words)
+            raise InputError(
+                "the log has no camera that can be imported", where=where, expected=", ".join(usual), got=words
+            )
         return chosen
     unknown = [name for name in options.cameras if name not in available and name not in by_scene_name]
     if unknown:

@@ -227,7 +227,9 @@ def _moments(
     groups: list[list[_Shot]] = []
     for shot in shots:
         last = groups[-1] if groups else []
-        fits = last and shot.time_us - last[0].time_us <= _SAME_MOMENT_US and shot.channel not in {s.channel for s in last}
+        fits = (
+            last and shot.time_us - last[0].time_us <= _SAME_MOMENT_US and shot.channel not in {s.channel for s in last}
+        )
         if fits:
             last.append(shot)
         else:
@@ -276,7 +278,9 @@ def _write(opened: NuplanLog, plan: _Plan, out: Path, options: ImportOptions) ->
         time_s = (cloud.time_us - start_us) / 1e6
         dangling += opened.dangling_boxes(cloud.token)
         for track, label, (x, y, z, yaw, *size) in opened.boxes(cloud.token):
-            tracks.add(track, label, time_s, (size[0], size[1], size[2]), world_from_source @ yaw_matrix(yaw, (x, y, z)))
+            tracks.add(
+                track, label, time_s, (size[0], size[1], size[2]), world_from_source @ yaw_matrix(yaw, (x, y, z))
+            )
     if dangling:
         raise InputError(
             "boxes name tracks or classes that are not there", where=f"{opened.path}: lidar_box", got=f"{dangling} boxes",

@@ -75,7 +75,9 @@ class NuplanLog:
     def rows(self, question: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         """Rows of a literal question, one by one; damage is an InputError."""
         try:
-            yield from self._connection.execute(question, values)
+            # a delegated cursor would be closed after the database when a question is left unfinished
+            for row in self._connection.execute(question, values):  # noqa: UP028
+                yield row
         except (sqlite3.Error, OverflowError) as error:
             raise InputError(
                 "log database is damaged", where=str(self.path), got=str(error), remedy="copy the file again"
@@ -83,7 +85,9 @@ class NuplanLog:
 
     def check(self) -> None:
         """Refuse a database that is not a nuPlan log."""
-        tables = {str(name): str(sql) for name, sql in self.rows("SELECT name, sql FROM sqlite_master WHERE type = 'table'")}
+        tables = {
+            str(name): str(sql) for name, sql in self.rows("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+        }
         for table, columns in SCHEMA.items():
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
                 raise InputError(
@@ -113,7 +117,11 @@ class NuplanLog:
         ):
             where = f"{self.path}: camera {channel}"
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
-            if abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6 or min(matrix[0, 0], matrix[1, 1]) <= 0:
+            if (
+                abs(matrix[0, 1]) > 1e-6
+                or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
+                or min(matrix[0, 0], matrix[1, 1]) <= 0
+            ):
                 raise InputError(
                     "intrinsics are not of a pinhole camera", where=f"{where}.intrinsic", got=str(matrix.tolist()),
                     expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
@@ -131,7 +139,9 @@ class NuplanLog:
         """Token -> place on the vehicle f64[4, 4]."""
         return {
             bytes(token): self._pose(translation, rotation, f"{self.path}: lidar {channel}")
-            for token, channel, translation, rotation in self.rows("SELECT token, channel, translation, rotation FROM lidar")
+            for token, channel, translation, rotation in self.rows(
+                "SELECT token, channel, translation, rotation FROM lidar"
+            )
         }
 
     def clouds(self, scene: str) -> Iterator[tuple[bytes, int]]:
@@ -157,7 +167,10 @@ class NuplanLog:
                 raise InputError("point cloud is of a LiDAR that is not there", where=where, got=bytes(lidar).hex())
             world_from_ego = self._ego(pose, where)
             return NuplanCloud(
-                token, _blob_name(file, where), self._time(time_us, "lidar_pc"), world_from_ego @ ego_from_lidar[bytes(lidar)]
+                token,
+                _blob_name(file, where),
+                self._time(time_us, "lidar_pc"),
+                world_from_ego @ ego_from_lidar[bytes(lidar)],
             )
         raise InputError(
             "point cloud has no vehicle pose", where=f"{self.path}: lidar_pc {token.hex()}.ego_pose_token",
@@ -212,7 +225,9 @@ class NuplanLog:
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if not isinstance(value, int):
-            raise InputError("timestamp is no whole number", where=f"{self.path}: {table}.timestamp", got=repr(value)[:40])
+            raise InputError(
+                "timestamp is no whole number", where=f"{self.path}: {table}.timestamp", got=repr(value)[:40]
+            )
         return value
 
     def _ego(self, row: list[Any], where: str) -> Matrix:

@@ -66,7 +66,7 @@ WORDS: Final = {
     "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
 }  # fmt: skip
 """The data set's classes -> words of the product; pickup trucks count as cars, as in Cityscapes."""
-MAX_POINT_DELAY_S: Final = 0.5
+MAX_POINT_DELAY_S: Final = 0.25
 MAX_CAMERA_DELAY_S: Final = 1.0
 MIN_KEY_STEP_S: Final = 0.02
 _MIN_BOX_POINTS: Final = 5
@@ -121,9 +121,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)
-    cameras = {
-        name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()
-    }
+    cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}
     chosen = chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
     images = {name: numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
     clouds = numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
@@ -240,7 +238,9 @@ class _Log:
         forward = _poses(folder / "lidar" / "poses.json", frames) @ yaw_matrix(np.pi / 2)
         first = forward[0]
         world_from_source = yaw_matrix(-yaw_of(first)) @ from_rotation_translation(np.eye(3), -first[:3, 3])
-        ego = EgoPath(seconds(raw_s, "s", str(folder / "lidar" / "timestamps.json"), start_s), world_from_source @ forward)
+        ego = EgoPath(
+            seconds(raw_s, "s", str(folder / "lidar" / "timestamps.json"), start_s), world_from_source @ forward
+        )
         needed = dict.fromkeys((*cameras, "front_camera"))
         camera_s, world_from_cam = {}, {}
         for name in needed:
@@ -265,7 +265,9 @@ class _Log:
         return cls(world_from_source, raw_s, camera_s, world_from_cam, world_from_lidar, ego)
 
 
-def _lidar_places(ego: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None) -> dict[int, Matrix]:
+def _lidar_places(
+    ego: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None
+) -> dict[int, Matrix]:
     """Where the LiDARs sit on the vehicle: median place of the front camera, plus the static calibration."""
     camera = np.zeros(3)
     if times_s is not None and world_from_cam is not None:
@@ -327,7 +329,9 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
     try:
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError("intrinsics are incomplete", where=str(path), got=repr(error), expected="fx fy cx cy") from error
+        raise InputError(
+            "intrinsics are incomplete", where=str(path), got=repr(error), expected="fx fy cx cy"
+        ) from error
     height, width = decode_image(store.read_bytes(image), str(image)).shape[:2]
     # the data set counts pixels from the centre of the top-left one, as OpenCV does
     return fit_images(Camera(name, width, height, fx, fy, cx + 0.5, cy + 0.5), options)
@@ -403,8 +407,14 @@ def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], log_: _
         sibling = siblings[row] if isinstance(siblings[row], str) and len(siblings[row]) > 1 else ""
         rows.append(
             _Cuboid(
-                str(frame["uuid"][row]), str(frame["label"][row]), float(log_.ego.times_s[index]) + late_s, size,
-                log_.world_from_source @ box, standing, int(sensor[row]), sibling,
+                str(frame["uuid"][row]),
+                str(frame["label"][row]),
+                float(log_.ego.times_s[index]) + late_s,
+                size,
+                log_.world_from_source @ box,
+                standing,
+                int(sensor[row]),
+                sibling,
             )  # fmt: skip
         )
     return rows

@@ -152,7 +152,16 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
             if opcode.name == "STOP":
                 return machine.result()
             machine.step(opcode.name, argument)
-    except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, struct.error) as error:
+    except (
+        ValueError,
+        IndexError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+        struct.error,
+    ) as error:
         raise InputError(
             "pickle is malformed or cut off",
             where=where,
