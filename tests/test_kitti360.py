@@ -310,6 +310,16 @@ def test_standing_boxes_hold_in_their_window_only(source: Path, tmp_path: Path) 
     assert any("1 boxes lie outside" in note for note in scene.source.notes)
 
 
+def test_an_object_drawn_twice_in_a_frame_is_taken_once(source: Path, tmp_path: Path) -> None:
+    pose, size = yaw_matrix(0.1, (3.0, 4.0, 1.0)), np.array([4.5, 1.8, 1.5])
+    text = "".join(made.box_xml(n, pose, size, timestamp=frame) for n, frame in enumerate((1, 2, 2, 3)))
+    path = tmp_path / "some.xml"
+    path.write_text(f"<opencv_storage>{text}</opencv_storage>")
+    scene = ingest(source, tmp_path / "out", boxes=path)
+    assert scene.tracks[0].times_s == pytest.approx([0.0, 0.1, 0.2])
+    assert any("1 boxes that an object has twice" in note for note in scene.source.notes)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

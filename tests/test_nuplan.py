@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import roundtrip
 import write_nuplan as made
+from PIL import Image
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene
@@ -98,10 +99,34 @@ def test_distorted_images_are_rectified_and_jpeg_stays_jpeg(truth: Scene, tmp_pa
     assert camera.fx >= truth.cameras["front"].fx
     assert scene.frames[0].image.path.endswith(".jpg")
     assert any("rectified" in note for note in scene.source.notes)
-    plain = made.write_nuplan(truth, tmp_path / "plain", jpeg=True)
+    plain = made.write_nuplan(truth, tmp_path / "plain", jpeg=True)  # no distortion: the files are kept
     roundtrip.assert_same_log(
         ingest(plain, tmp_path / "same"), truth, labels={"car": "vehicle"}, intensity=0.002, colour_levels=3
     )
+
+
+def test_rectified_pixels_show_the_rays_of_the_pinhole_camera(truth: Scene, tmp_path: Path) -> None:
+    """An image through the lens whose colours are ray directions: rectified, each pixel shows its own ray."""
+    k1, k2, p1, p2, k3 = bend = (-0.35, 0.15, 0.004, -0.003, -0.03)
+    database = made.write_nuplan(truth, tmp_path / "bent", distortion=bend)
+    camera = truth.cameras["front"]
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    bent = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy])
+    x, y = bent.copy()
+    for _ in range(100):  # undo the lens: OpenCV's fixed point
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        x = (bent[0] - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial
+        y = (bent[1] - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial
+    image = np.stack([x * 150 + 127, y * 150 + 127, np.zeros_like(x)], -1).round().clip(0, 255).astype(np.uint8)
+    for path in (tmp_path / "bent" / "sensor_blobs" / made.LOG / "CAM_F0").iterdir():
+        Image.fromarray(image).save(path, "PNG")
+    scene = ingest(database, tmp_path / "out", frames=(0, 1), cameras=("front",))
+    flat = scene.cameras["front"]
+    rays = read_image(scene, scene.frames[0])[..., :2].astype(float)
+    v, u = np.mgrid[: flat.height, : flat.width] + 0.5
+    expected = np.stack([(u - flat.cx) / flat.fx, (v - flat.cy) / flat.fy], -1) * 150 + 127
+    assert np.abs(rays - expected).max() < 1.2  # half a level each for writing, mixing and the weights' 8 bits
 
 
 def test_calibration_may_be_lists_arrays_or_the_data_sets_own_list_classes(source: Path, tmp_path: Path) -> None:
@@ -192,8 +217,8 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE ego_pose SET x = NULL"), "not a finite number"),
         (sql("UPDATE lidar_pc SET ego_pose_token = x'00'"), "point cloud has no vehicle pose"),
         (sql("UPDATE lidar_pc SET lidar_token = x'00'"), "LiDAR that is not there"),
-        (sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", made.token("box", "car-001", 1)), "not there"),
-        (sql("DELETE FROM category"), "name tracks or classes that are not there"),
+        (sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", made.token("box", "car-001", 1)), "names a track"),
+        (sql("DELETE FROM category"), "names a track or class that is not there"),
         (sql("UPDATE lidar_box SET length = 0"), "size makes no sense"),
         (sql("UPDATE lidar_box SET yaw = 'north'"), "not a finite number"),
         (sql("UPDATE image SET filename_jpg = '../../../etc/passwd'"), "leads out of the sensor blobs"),
@@ -239,6 +264,22 @@ def test_incomplete_moments_can_be_skipped(source: Path, tmp_path: Path) -> None
     words = " | ".join(scene.source.notes)
     assert "1 clouds whose files are missing" in words
     assert "moments without images of all cameras" in words
+
+
+def test_cameras_may_fire_one_after_another(source: Path, tmp_path: Path) -> None:
+    """A camera 45 ms behind the other is of the same moment; one image missing in the middle is found and named."""
+    change(source, "UPDATE image SET timestamp = timestamp + 45000 WHERE camera_token = ?", made.token("CAM_L0"))
+    scene = ingest(source, tmp_path / "out")
+    front, left = (np.array([frame.view.time_s for frame in scene.frames_of(name)]) for name in ("front", "front_left"))
+    assert left - front == pytest.approx(np.full(5, 0.045))
+    for channel in ("CAM_F0", "CAM_L0"):
+        shutil.copy(log(source), tmp_path / "whole.db")
+        change(source, "DELETE FROM image WHERE token = ?", made.token("image", channel, 2))
+        with pytest.raises(InputError, match="lacks images of some cameras") as caught:
+            ingest(source, tmp_path / "no")
+        assert caught.value.got == f"no {channel}; 1 such moments"
+        assert len(ingest(source, tmp_path / f"skip {channel}", skip_missing=True).frames) == 8
+        shutil.copy(tmp_path / "whole.db", log(source))
 
 
 def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import hashlib
 import io
 import pickle
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +69,14 @@ def pcd(xyz: NDArray[np.floating], intensity: NDArray[np.floating]) -> bytes:
     return header.encode() + rows.tobytes() + b"\0" * 32
 
 
-def write_nuplan(truth: Scene, root: Path, *, distortion: Sequence[float] = (0.0,) * 5, jpeg: bool = False) -> Path:
+def write_nuplan(
+    truth: Scene,
+    root: Path,
+    *,
+    distortion: Sequence[float] = (0.0,) * 5,
+    jpeg: bool = False,
+    cameras: Mapping[str, str] | None = None,
+) -> Path:
     """``root/splits/mini/<log>.db`` and ``root/sensor_blobs``; two scenes of the log. Returns the database."""
     database = root / "splits" / "mini" / f"{LOG}.db"
     database.parent.mkdir(parents=True)
@@ -96,7 +103,7 @@ def write_nuplan(truth: Scene, root: Path, *, distortion: Sequence[float] = (0.0
     mount = invert(ego) @ truth.sweeps[0].world_from_lidar
     add("lidar", token=token("lidar"), channel="MergedPointCloud", translation=pickle.dumps(mount[:3, 3].tolist()),
         rotation=pickle.dumps(wxyz(mount)))  # fmt: skip
-    for name, channel in CAMERA_OF.items():
+    for channel, name in (cameras or {channel: name for name, channel in CAMERA_OF.items()}).items():
         camera, frames = truth.cameras[name], truth.frames_of(name)
         mount = invert(ego) @ frames[0].view.world_from_cam
         k = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]

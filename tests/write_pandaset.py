@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,19 +21,29 @@ SOURCE_FROM_WORLD = yaw_matrix(0.8, (12.0, -34.0, 1.5))
 CAMERA_OF = {"front": "front_camera", "front_left": "front_left_camera"}
 
 
-def write_pandaset(truth: Scene, folder: Path, *, point_times: bool = False, new: bool = False) -> Path:
+def write_pandaset(
+    truth: Scene,
+    folder: Path,
+    *,
+    point_times: bool = False,
+    new: bool = False,
+    cameras: Mapping[str, str] | None = None,
+    suffix: str = ".png",
+) -> Path:
     """``folder`` as one sequence; every fifth point is the solid-state LiDAR's. Returns ``folder``.
 
     Args:
         point_times: write the points' own times; else all have the frame's, and boxes stay where they are.
         new: tables as pandas 2 writes them.
+        cameras: the data set's camera -> camera of the log; None = ``CAMERA_OF``.
+        suffix: of the images; ``.jpg`` is what the data set has, ``.png`` loses nothing.
     """
-    for name, theirs in CAMERA_OF.items():
+    for theirs, name in (cameras or {theirs: name for name, theirs in CAMERA_OF.items()}).items():
         here = folder / "camera" / theirs
         here.mkdir(parents=True)
         frames = truth.frames_of(name)
         for index, frame in enumerate(frames):
-            Image.fromarray(read_image(truth, frame)).save(here / f"{index:02d}.png")
+            Image.fromarray(read_image(truth, frame)).save(here / f"{index:02d}{suffix}", quality=95)
         camera = truth.cameras[name]
         _dump(
             here / "intrinsics.json", {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - 0.5, "cy": camera.cy - 0.5}

@@ -90,7 +90,7 @@ def looks_like_kitti360(source: Path) -> bool:
     """Whether ``source`` is the data set's folder (``data_2d_raw`` and ``calibration`` in it), or a drive's in ``data_2d_raw``."""
     if not source.is_dir():
         return False
-    root = source.resolve().parent.parent if source.resolve().parent.name == "data_2d_raw" else source
+    root = source.absolute().parent.parent if source.absolute().parent.name == "data_2d_raw" else source
     return (root / "data_2d_raw").is_dir() and (root / "calibration" / "calib_cam_to_pose.txt").is_file()
 
 
@@ -174,8 +174,8 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
 def _find(source: Path, options: ImportOptions) -> _Folders:
     if not source.is_dir():
         raise InputError("KITTI-360 folder does not exist", where=str(source), expected="a folder")
-    if source.resolve().parent.name == "data_2d_raw":
-        return _Folders(source.resolve().parent.parent, source.resolve().name)
+    if source.absolute().parent.name == "data_2d_raw":
+        return _Folders(source.absolute().parent.parent, source.absolute().name)
     raw = source / "data_2d_raw"
     if not raw.is_dir():
         raise InputError(
@@ -434,12 +434,17 @@ def _read_tracks(
     numbers = np.array(sorted(time_of))
     tracks, left_out, outside = BoxTracks(str(path), WORDS), {}, 0
     spans: dict[str, list[Any]] = {}
-    moving: set[str] = set()
+    moving: dict[str, set[int]] = {}
     for box in read_boxes(path, left_out):
         pose = world_from_source @ box.world_from_box
         if box.frame >= 0:
-            moving.add(box.object_id)
-            if box.frame in time_of:
+            seen = moving.setdefault(box.object_id, set())
+            if box.frame in seen:  # the parts of a drive overlap; the data set's own reader keeps one box, too
+                left_out["that an object has twice in a frame"] = (
+                    left_out.get("that an object has twice in a frame", 0) + 1
+                )
+            elif box.frame in time_of:
+                seen.add(box.frame)
                 tracks.add(box.object_id, box.label, time_of[box.frame], box.size_m, pose)
             else:
                 outside += 1

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,8 @@ WORDS: Final = {
 IMAGE_DELAY_US: Final = 16_667
 """From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it found this."""
 _MARGIN_US: Final = 500_000
-_SAME_MOMENT_US: Final = 30_000
+_REACH_US: Final = 60_000
+_PERIOD_US: Final = 100_000
 _SQLITE: Final = b"SQLite format 3\0"
 
 
@@ -197,7 +198,7 @@ class _Plan:
         folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
         available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}
         names = chosen_cameras(available, options, f"{opened.path}: camera", tuple(CAMERAS))
-        span = (chosen[0][1] - _SAME_MOMENT_US, chosen[-1][1] + _SAME_MOMENT_US)
+        span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
         shots = [
             _Shot(by_token[token].channel, blobs / file, time_us)
             for token, file, time_us in opened.images(*span)
@@ -223,17 +224,8 @@ def _refuse_missing(what: str, path: Path, count: int, total: int) -> None:
 def _moments(
     shots: Sequence[_Shot], names: Sequence[str], options: ImportOptions, where: str
 ) -> tuple[list[list[_Shot]], list[str]]:
-    """Images put together by time: a new moment starts where a camera would appear twice, or 30 ms after the first."""
-    groups: list[list[_Shot]] = []
-    for shot in shots:
-        last = groups[-1] if groups else []
-        fits = (
-            last and shot.time_us - last[0].time_us <= _SAME_MOMENT_US and shot.channel not in {s.channel for s in last}
-        )
-        if fits:
-            last.append(shot)
-        else:
-            groups.append([shot])
+    """The images of each moment at which all cameras fired, and notes; see ``_by_moment``."""
+    groups = _by_moment(shots, names)
     lacking = [shot for group in groups for shot in group if not shot.file.is_file()]
     if lacking and not options.skip_missing:
         _refuse_missing("camera image", lacking[0].file, len(lacking), len(shots))
@@ -255,6 +247,40 @@ def _moments(
     return whole, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
 
+def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]]:
+    """Images put together by time, in order of time.
+
+    Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the camera
+    that has most of them, after its own camera's median delay is taken off. What lies half a period from all is alone.
+    """
+    by_camera = {name: [shot for shot in shots if shot.channel == name] for name in names}
+    leading = max(by_camera.values(), key=len)
+    if not leading:
+        return []
+    beats = np.array([shot.time_us for shot in leading])
+    half_us = float(np.median(np.diff(beats))) / 2 if len(beats) > 1 else _PERIOD_US / 2
+    groups: dict[int, list[_Shot]] = {index: [] for index in range(len(beats))}
+    alone = []
+    for found in by_camera.values():
+        times = np.array([shot.time_us for shot in found], np.int64)
+        late = times - beats[_nearest(beats, times)]
+        usual = float(np.median(late[np.abs(late) <= half_us])) if (np.abs(late) <= half_us).any() else 0.0
+        for shot, index in zip(found, _nearest(beats, times - usual), strict=True):
+            taken = any(other.channel == shot.channel for other in groups[int(index)])
+            if taken or abs(shot.time_us - usual - beats[index]) >= half_us:
+                alone.append([shot])
+            else:
+                groups[int(index)].append(shot)
+    return sorted([*groups.values(), *alone], key=lambda group: min(shot.time_us for shot in group))
+
+
+def _nearest(beats: NDArray[np.int64], times: NDArray[Any]) -> NDArray[np.intp]:
+    """Index of the nearest of growing ``beats`` for each time."""
+    after = np.searchsorted(beats, times).clip(1, len(beats) - 1) if len(beats) > 1 else np.zeros(len(times), int)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(times - beats[before]) <= np.abs(times - beats[after]), before, after)
+
+
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
@@ -273,19 +299,12 @@ def _write(opened: NuplanLog, plan: _Plan, out: Path, options: ImportOptions) ->
     notes = [*plan.notes, *(fit.words for fit in fits.values() if fit.words)]
     notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
     tracks = BoxTracks(f"{opened.path}: lidar_box", WORDS)
-    dangling = 0
-    for cloud in plan.clouds:
-        time_s = (cloud.time_us - start_us) / 1e6
-        dangling += opened.dangling_boxes(cloud.token)
-        for track, label, (x, y, z, yaw, *size) in opened.boxes(cloud.token):
-            tracks.add(
-                track, label, time_s, (size[0], size[1], size[2]), world_from_source @ yaw_matrix(yaw, (x, y, z))
-            )
-    if dangling:
-        raise InputError(
-            "boxes name tracks or classes that are not there", where=f"{opened.path}: lidar_box", got=f"{dangling} boxes",
-            expected="tokens of track and category", remedy="copy the file again",
-        )  # fmt: skip
+    time_of = {cloud.token: (cloud.time_us - start_us) / 1e6 for cloud in plan.clouds}
+    span = (plan.clouds[0].time_us, plan.clouds[-1].time_us) if plan.clouds else (0, -1)
+    for token, track, label, (x, y, z, yaw, *size) in opened.boxes(*span):
+        if token in time_of:
+            pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
+            tracks.add(track, label, time_of[token], (size[0], size[1], size[2]), pose)
     found, track_notes = tracks.tracks()
     notes += track_notes
     for note in notes:

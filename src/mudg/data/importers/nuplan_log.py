@@ -197,25 +197,24 @@ class NuplanLog:
         ):
             yield bytes(camera), _blob_name(file, f"{self.path}: image at {time_us}"), self._time(time_us, "image")
 
-    def boxes(self, token: bytes) -> Iterator[tuple[str, str, tuple[float, ...]]]:
-        """Track, class, and x y z yaw length width height (metres, radians, the log's world) of one cloud's boxes."""
-        for track, label, *numbers in self.rows(
-            "SELECT b.track_token, c.name, b.x, b.y, b.z, b.yaw, b.length, b.width, b.height FROM lidar_box AS b "
-            "JOIN track AS t ON t.token = b.track_token JOIN category AS c ON c.token = t.category_token "
-            "WHERE b.lidar_pc_token = ?",
-            (token,),
-        ):
-            where = f"{self.path}: lidar_box of track {bytes(track).hex()}"
-            yield bytes(track).hex(), str(label), tuple(_finite(number, where) for number in numbers)
+    def boxes(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, str, tuple[float, ...]]]:
+        """Cloud, track, class, and x y z yaw length width height (metres, radians, the log's world) of all boxes of a span.
 
-    def dangling_boxes(self, token: bytes) -> int:
-        """How many boxes of a cloud name a track or class that is not there."""
-        ((count,),) = self.rows(
-            "SELECT COUNT(*) FROM lidar_box AS b LEFT JOIN track AS t ON t.token = b.track_token "
-            "LEFT JOIN category AS c ON c.token = t.category_token WHERE b.lidar_pc_token = ? AND c.token IS NULL",
-            (token,),
-        )
-        return int(count)
+        One pass over the table: the databases need not have an index of boxes by cloud.
+        """
+        for cloud, track, label, *numbers in self.rows(
+            "SELECT p.token, b.track_token, c.name, b.x, b.y, b.z, b.yaw, b.length, b.width, b.height FROM lidar_pc AS p "
+            "JOIN lidar_box AS b ON b.lidar_pc_token = p.token LEFT JOIN track AS t ON t.token = b.track_token "
+            "LEFT JOIN category AS c ON c.token = t.category_token WHERE p.timestamp BETWEEN ? AND ?",
+            (first_us, last_us),
+        ):
+            where = f"{self.path}: lidar_box of track {bytes(track or b'').hex()}"
+            if label is None:
+                raise InputError(
+                    "box names a track or class that is not there", where=where, expected="tokens of track and category",
+                    remedy="copy the file again",
+                )  # fmt: skip
+            yield bytes(cloud), bytes(track).hex(), str(label), tuple(_finite(number, where) for number in numbers)
 
     def scenes(self) -> list[str]:
         """Names of the scenes (pieces of up to 20 s)."""

@@ -47,7 +47,7 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
     **dict.fromkeys(_MANAGERS),
     "pandas.core.indexes.base._new_Index": _new_index,
     "pandas.core.indexes.base.Index": None,
-    "pandas.core.indexes.numeric.Int64Index": None,
+    **dict.fromkeys(f"pandas.core.indexes.numeric.{kind}Index" for kind in ("Int64", "UInt64", "Float64")),
     "pandas.core.indexes.range.RangeIndex": None,
     "pandas._libs.internals._unpickle_block": _block,
     _NEW_BLOCK: None,

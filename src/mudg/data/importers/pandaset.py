@@ -66,6 +66,8 @@ WORDS: Final = {
     "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
 }  # fmt: skip
 """The data set's classes -> words of the product; pickup trucks count as cars, as in Cityscapes."""
+FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
+"""Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
 MAX_POINT_DELAY_S: Final = 0.25
 MAX_CAMERA_DELAY_S: Final = 1.0
 MIN_KEY_STEP_S: Final = 0.02
@@ -131,6 +133,8 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     cuboids = numbered_files(folder / "annotations" / "cuboids", (".pkl.gz", ".pkl"))
     notes = [f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here"]
     notes += [fit.words for fit in fits.values() if fit.words]
+    if "front_camera" not in log_.world_from_cam:
+        notes.append("front camera's poses are missing: the LiDARs' places are those of sequence 002")
     if not cuboids:
         notes.append("no boxes found: everything counts as static")
     elif any(n not in cuboids for n in frames) and not options.skip_missing:
@@ -269,7 +273,7 @@ def _lidar_places(
     ego: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None
 ) -> dict[int, Matrix]:
     """Where the LiDARs sit on the vehicle: median place of the front camera, plus the static calibration."""
-    camera = np.zeros(3)
+    camera = np.array(FRONT_CAMERA_M)
     if times_s is not None and world_from_cam is not None:
         seen = []
         for time_s, pose in zip(times_s, world_from_cam, strict=True):
@@ -395,7 +399,10 @@ def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], log_: _
     width, length, height = (_numbers(frame, f"dimensions.{axis}", path) for axis in "xyz")
     yaw = _numbers(frame, "yaw", path)
     count = len(yaw)
-    sensor = _numbers(frame, "cuboids.sensor_id", path) if "cuboids.sensor_id" in frame else np.full(count, -1.0)
+    sensor = np.full(count, -1.0)
+    if "cuboids.sensor_id" in frame:
+        given = {"id": np.where(_missing(frame["cuboids.sensor_id"]), -1, frame["cuboids.sensor_id"])}
+        sensor = _numbers(given, "id", path)
     siblings = frame.get("cuboids.sibling_id", np.full(count, "", object))
     when = _BoxTimes(points, log_, index)
     rows = []
@@ -418,6 +425,11 @@ def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], log_: _
             )  # fmt: skip
         )
     return rows
+
+
+def _missing(column: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a column has no value: None or NaN."""
+    return np.array([value is None or value != value for value in column], bool)
 
 
 class _BoxTimes:
