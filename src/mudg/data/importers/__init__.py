@@ -64,7 +64,20 @@ def _looks_like_nuplan(source: Path) -> bool:
     return looks_like_nuplan(source)
 
 
+def _custom(source: Path, out: Path, options: ImportOptions) -> Scene:
+    from mudg.data.importers.custom import import_custom
+
+    return import_custom(source, out, options)
+
+
+def _looks_like_custom(source: Path) -> bool:
+    from mudg.data.importers.custom import looks_like_custom
+
+    return looks_like_custom(source)
+
+
 IMPORTERS: Mapping[str, Importer] = {
+    "custom": _custom,
     "kitti": _kitti,
     "kitti360": _kitti360,
     "pandaset": _pandaset,
@@ -76,6 +89,7 @@ RECOGNISERS: Mapping[str, Recogniser] = {
     "kitti360": _looks_like_kitti360,  # before kitti: a drive's folder has image_00 in both
     "pandaset": _looks_like_pandaset,
     "nuplan": _looks_like_nuplan,
+    "custom": _looks_like_custom,
     "kitti": _looks_like_kitti,
 }
 """Format name -> whether a folder or file looks like it (by names of files, a few bytes at most). The first that says yes wins."""

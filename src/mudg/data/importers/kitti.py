@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import invert, pose_at, transform_points
+from mudg.base.geometry import invert, transform_points
 from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers import kitti_boxes, kitti_poses
-from mudg.data.importers.common import for_each
+from mudg.data.importers.common import for_each, pose_near
 from mudg.data.importers.images import ImageFit, fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, read_calibration_day, read_calibration_text
 from mudg.data.importers.options import ImportOptions, holdout_split
@@ -46,7 +46,6 @@ FRAME_PERIOD_S: Final = 0.1
 SENSOR: Final = "velodyne"
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI: Geiger, Lenz, Stiller, Urtasun; attribution, non-commercial, share-alike)"
 CAMERA_NAMES: Final = {"image_02": "front", "image_03": "front_stereo", "image_00": "grey", "image_01": "grey_stereo"}
-_MAX_EXTRAPOLATION_S: Final = 0.15
 _TURN_STEPS: Final = 36
 
 
@@ -368,7 +367,7 @@ class _Motion:
 
     def velo_at(self, time_s: float) -> Matrix:
         """World-from-velodyne at a time."""
-        return _pose_near(self.ego, time_s) @ self.ego_from_velo
+        return pose_near(self.ego, time_s) @ self.ego_from_velo
 
 
 def _find_motion(
@@ -469,32 +468,6 @@ def _ego_from_packets(path: Path, frames: Sequence[int], clock: _Clock) -> EgoPa
     return EgoPath(times[later], poses[later])
 
 
-def _pose_near(ego: EgoPath, time_s: float) -> Matrix:
-    """Ego pose at a time; up to 0.15 s outside the path it goes on as it did between its two nearest keys."""
-    inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
-    if inside is not None:
-        return inside
-    first = time_s < ego.times_s[0]
-    beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
-    if beyond > _MAX_EXTRAPOLATION_S:
-        raise InputError(
-            "vehicle poses do not cover the images and scans",
-            where="ego path",
-            got=f"{beyond:.2f} s outside",
-            expected="poses from the first to the last frame",
-        )
-    if len(ego.times_s) == 1:
-        return ego.world_from_ego[0]
-    near, far = (0, 1) if first else (-1, -2)
-    step = float(abs(ego.times_s[far] - ego.times_s[near]))
-    if beyond > step:
-        return ego.world_from_ego[near]
-    # mirror the motion of the neighbouring interval: the pose at "beyond" before the end, turned around
-    back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
-    end = ego.world_from_ego[near]
-    return end if back is None else end @ invert(back) @ end
-
-
 # --- boxes and scans ------------------------------------------------------------------------------------------------
 
 
@@ -563,18 +536,13 @@ def read_scan(path: Path) -> SweepPoints:
     return SweepPoints(np.ascontiguousarray(rows[:, :3]), np.clip(rows[:, 3], 0, 1), np.zeros(len(rows), np.float32))
 
 
-def untwist_scan(
-    points: SweepPoints, velo_at: Callable[[float], Matrix], time_s: float, clockwise: bool = False
-) -> SweepPoints:
+def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s: float) -> SweepPoints:
     """Bring the points of a turning sensor to one moment; see the module text for the timing.
 
     The vehicle's pose is taken at 37 moments of the turn and points in between are blended linearly.
-
-    Args:
-        clockwise: the sensor turns the other way (seen from above) than the module text says.
     """
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
-    dt_s = np.asarray(kitti_boxes.azimuth_delay_s(-azimuth if clockwise else azimuth), np.float32)
+    dt_s = np.asarray(kitti_boxes.azimuth_delay_s(azimuth), np.float32)
     velo_from_world = invert(velo_at(time_s))
     moments = np.linspace(-0.5, 0.5, _TURN_STEPS + 1) * kitti_boxes.TURN_PERIOD_S
     corrections = [velo_from_world @ velo_at(time_s + float(moment)) for moment in moments]

@@ -36,14 +36,14 @@ from PIL import Image, UnidentifiedImageError
 
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import from_rotation_translation, invert, pose_at, transform_points, yaw_matrix, yaw_of
+from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers import kitti_poses
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.common import for_each, rigid_pose, seconds
+from mudg.data.importers.common import deskew, for_each, pose_near, rigid_pose, seconds
 from mudg.data.importers.images import ImageFit
-from mudg.data.importers.kitti import read_scan, untwist_scan
+from mudg.data.importers.kitti import read_scan
 from mudg.data.importers.kitti360_boxes import WORDS, read_boxes
 from mudg.data.importers.kitti360_calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
 from mudg.data.importers.layout import chosen_cameras, numbered_files, some_numbers, whole_frames
@@ -59,7 +59,6 @@ SICK: Final = "sick"
 FRAME_PERIOD_S: Final = 0.1
 MAX_GAP_M: Final = 3.0
 """Frames without a pose are interpolated where the vehicle moved less than this between the poses around them."""
-_MAX_BEYOND_S: Final = 0.15
 _SICK_REACH_S: Final = 0.055
 _TRAIN_IDS: Final = {
     7: 0, 8: 1, 11: 2, 12: 3, 13: 4, 17: 5, 19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12, 26: 13, 27: 14, 28: 15,
@@ -147,9 +146,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
         if number in scans:
             points = read_scan(scans[number])
             if untwist:
-                points = untwist_scan(
-                    points, lambda t: motion.at(t) @ calibration.ego_from_velo, time_s, clockwise=True
-                )
+                points = _untwisted(points, motion, calibration, time_s)
             writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, time_s, world_from_velo, points)
         if sick is not None:
             pose, lines = sick.sweep(time_s)
@@ -235,10 +232,9 @@ def _clock(folders: _Folders, last: int, notes: list[str]) -> NDArray[np.float64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
-    """Poses of the vehicle at the frames that have one: ``times_s`` f64[n], ``world_from_ego`` f64[n, 4, 4]."""
+    """The vehicle at the frames that have a pose."""
 
-    times_s: NDArray[np.float64]
-    world_from_ego: Matrix
+    ego: EgoPath
 
     @classmethod
     def read(
@@ -281,31 +277,22 @@ class _Motion:
         if (np.diff(times) <= 0).any():
             at = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
             raise InputError("timestamps do not increase", where=f"{folders.root}: {folders.drive}, frame {at}")
-        return cls(times, np.stack(poses) @ IMU_FROM_EGO)
+        return cls(EgoPath(times, np.stack(poses) @ IMU_FROM_EGO))
 
     def known(self, time_s: float) -> bool:
         """Whether there is a pose at a time, or it can be interpolated."""
-        after = int(np.searchsorted(self.times_s, time_s))
-        if after < len(self.times_s) and self.times_s[after] - time_s < 1e-9:
+        times = self.ego.times_s
+        after = int(np.searchsorted(times, time_s))
+        if after < len(times) and times[after] - time_s < 1e-9:
             return True
-        if after in (0, len(self.times_s)):
+        if after in (0, len(times)):
             return False
-        moved = self.world_from_ego[after, :3, 3] - self.world_from_ego[after - 1, :3, 3]
+        moved = self.ego.world_from_ego[after, :3, 3] - self.ego.world_from_ego[after - 1, :3, 3]
         return bool(np.linalg.norm(moved) < MAX_GAP_M)
 
     def at(self, time_s: float) -> Matrix:
-        """World-from-ego; up to 0.15 s beyond the ends the vehicle goes on as before (half a turn of the sensor needs it)."""
-        first, last = float(self.times_s[0]), float(self.times_s[-1])
-        inside = pose_at(self.times_s, self.world_from_ego, time_s)
-        if inside is not None:
-            return inside
-        beyond, end = (first - time_s, 0) if time_s < first else (time_s - last, -1)
-        if beyond > _MAX_BEYOND_S:
-            raise InputError("vehicle poses do not cover the frames", where="poses", got=f"{beyond:.2f} s outside")
-        mirrored = first + beyond if end == 0 else last - beyond
-        back = pose_at(self.times_s, self.world_from_ego, mirrored)
-        pose = self.world_from_ego[end]
-        return pose if back is None else pose @ invert(back) @ pose
+        """World-from-ego; a little beyond the ends the vehicle goes on as before (half a turn of the sensor needs it)."""
+        return pose_near(self.ego, time_s)
 
     def level_at(self, time_s: float) -> Matrix:
         """The scene's world from the data set's: origin and heading of the vehicle at a time, upright."""
@@ -314,11 +301,19 @@ class _Motion:
 
     def moved(self, start_s: float, world_from_source: Matrix) -> _Motion:
         """The same motion in another clock and world."""
-        return _Motion(self.times_s - start_s, world_from_source @ self.world_from_ego)
+        return _Motion(EgoPath(self.ego.times_s - start_s, world_from_source @ self.ego.world_from_ego))
 
     def path(self, times_s: NDArray[np.float64]) -> EgoPath:
         """The vehicle at the imported frames."""
         return EgoPath(times_s, np.stack([self.at(float(time)) for time in times_s]))
+
+
+def _untwisted(points: SweepPoints, motion: _Motion, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:
+    """A scan as seen at its frame's moment: a point at azimuth a was measured a / 2 pi turns before it."""
+    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+    dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
+    xyz = deskew(points.xyz, dt_s, lambda t: motion.at(t) @ calibration.ego_from_velo, time_s)
+    return SweepPoints(xyz, points.intensity, dt_s)
 
 
 # --- SICK lines -------------------------------------------------------------------------------------------------------
