@@ -8,7 +8,7 @@ import os
 import shutil
 import threading
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -205,6 +205,10 @@ class SceneWriter:
     def set_ego(self, ego: EgoPath) -> None:
         """Set the path of the vehicle."""
         self._ego = ego
+
+    def add_notes(self, notes: Iterable[str]) -> None:
+        """Add sentences to the source's notes: what was learnt while the log was read."""
+        self._source = replace(self._source, notes=(*self._source.notes, *notes))
 
     def set_split(self, split: Mapping[str, Literal["train", "test"]]) -> None:
         """Set which frames are held out: frame id -> ``train`` or ``test``. Frames not named are for training."""

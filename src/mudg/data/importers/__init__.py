@@ -28,6 +28,42 @@ def _looks_like_kitti(source: Path) -> bool:
     return looks_like_kitti(source)
 
 
+def _kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
+    from mudg.data.importers.kitti360 import import_kitti360
+
+    return import_kitti360(source, out, options)
+
+
+def _looks_like_kitti360(source: Path) -> bool:
+    from mudg.data.importers.kitti360 import looks_like_kitti360
+
+    return looks_like_kitti360(source)
+
+
+def _pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
+    from mudg.data.importers.pandaset import import_pandaset
+
+    return import_pandaset(source, out, options)
+
+
+def _looks_like_pandaset(source: Path) -> bool:
+    from mudg.data.importers.pandaset import looks_like_pandaset
+
+    return looks_like_pandaset(source)
+
+
+def _nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
+    from mudg.data.importers.nuplan import import_nuplan
+
+    return import_nuplan(source, out, options)
+
+
+def _looks_like_nuplan(source: Path) -> bool:
+    from mudg.data.importers.nuplan import looks_like_nuplan
+
+    return looks_like_nuplan(source)
+
+
 def _custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     from mudg.data.importers.custom import import_custom
 
@@ -43,10 +79,16 @@ def _looks_like_custom(source: Path) -> bool:
 IMPORTERS: Mapping[str, Importer] = {
     "custom": _custom,
     "kitti": _kitti,
+    "kitti360": _kitti360,
+    "pandaset": _pandaset,
+    "nuplan": _nuplan,
 }
 """Format name -> importer ``(source, out, options) -> Scene``."""
 
 RECOGNISERS: Mapping[str, Recogniser] = {
+    "kitti360": _looks_like_kitti360,  # before kitti: a drive's folder has image_00 in both
+    "pandaset": _looks_like_pandaset,
+    "nuplan": _looks_like_nuplan,
     "custom": _looks_like_custom,
     "kitti": _looks_like_kitti,
 }

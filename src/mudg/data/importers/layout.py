@@ -1,0 +1,115 @@
+"""Finding the files of a log: numbered files, frames that are whole, cameras that were asked for, options that do not apply."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from mudg.base import log
+from mudg.base.errors import InputError, UsageError
+from mudg.data.importers.options import ImportOptions
+
+
+def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    """Files called by a frame number, in order: ``0000000012.png`` with suffix ``.png``, ``07.pkl.gz`` with ``.pkl.gz``.
+
+    A folder that does not exist holds none.
+    """
+    if not folder.is_dir():
+        return {}
+    found = {}
+    for path in folder.iterdir():
+        stem, dot, rest = path.name.partition(".")
+        if stem.isascii() and stem.isdigit() and dot + rest.lower() in suffixes:
+            found[int(stem)] = path
+    return dict(sorted(found.items()))
+
+
+def whole_frames(
+    streams: Mapping[str, Iterable[int]], options: ImportOptions, where: str, title: str, optional: Iterable[int] = ()
+) -> list[int]:
+    """Frame numbers to import: those that every stream has, within ``options.frames``.
+
+    Args:
+        streams: name of a camera or LiDAR -> its frame numbers.
+        options: ``frames`` and ``skip_missing`` are used.
+        where: the log, for messages.
+        title: the format's name, for messages.
+        optional: frames that may be missing from every stream without a word (documented gaps).
+
+    Raises:
+        InputError: a stream lacks frames that others have (unless ``skip_missing``), or nothing is left.
+    """
+    numbers = {name: set(found) for name, found in streams.items()}
+    everything = set().union(*numbers.values()) - set(optional)
+    if options.frames is not None:
+        everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
+    missing = {name: sorted(everything - found) for name, found in numbers.items() if everything - found}
+    words = "; ".join(f"{name} lacks {some_numbers(lacks)}" for name, lacks in missing.items())
+    if missing and not options.skip_missing:
+        raise InputError(
+            "images and sweeps do not pair up",
+            where=where,
+            expected="every camera and LiDAR for every frame",
+            got=words,
+            remedy="copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing",
+        )
+    if missing:
+        log.warn(f"{title}: left out incomplete frames: {words}")
+    for lacks in missing.values():
+        everything -= set(lacks)
+    if not everything:
+        raise InputError(
+            "no frames to import",
+            where=where,
+            expected="numbered images" + (f" in {options.frames[0]}:{options.frames[1]}" if options.frames else ""),
+            got=", ".join(f"{name}: {some_numbers(sorted(found))}" for name, found in numbers.items()) or "nothing",
+        )
+    return sorted(everything)
+
+
+def some_numbers(numbers: Sequence[int]) -> str:
+    """Frame numbers in words, a long list cut short."""
+    if not numbers:
+        return "none"
+    return ", ".join(str(n) for n in numbers[:8]) + (f", ... ({len(numbers)} in all)" if len(numbers) > 8 else "")
+
+
+def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
+    """The data set's names of the cameras to import.
+
+    Args:
+        available: the data set's name -> the name in the scene; either may be asked for.
+        options: ``cameras`` is used.
+        where: the log, for messages.
+        usual: the data set's names taken when none is asked for; those that are not there are left out.
+
+    Raises:
+        UsageError: no such camera. InputError: none of the usual ones is there.
+    """
+    by_scene_name = {ours: theirs for theirs, ours in available.items()}
+    words = ", ".join(f"{ours} ({theirs})" for theirs, ours in available.items()) or "no cameras"
+    if not options.cameras:
+        chosen = [name for name in usual if name in available]
+        if not chosen:
+            raise InputError(
+                "the log has no camera that can be imported", where=where, expected=", ".join(usual), got=words
+            )
+        return chosen
+    unknown = [name for name in options.cameras if name not in available and name not in by_scene_name]
+    if unknown:
+        raise UsageError("the log has no such camera", where=where, expected=words, got=", ".join(unknown))
+    return list(dict.fromkeys(by_scene_name.get(name, name) for name in options.cameras))
+
+
+def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
+    """Refuse options of other formats that were set here: better than to do something else than asked.
+
+    Raises:
+        UsageError: one of ``names`` differs from its default.
+    """
+    default = ImportOptions()
+    for name in names:
+        if getattr(options, name) != getattr(default, name):
+            flag = "--" + name.replace("_", "-")
+            raise UsageError(f"{title} logs have no use for {flag}", where=flag, remedy="leave it out")

@@ -1,0 +1,438 @@
+"""KITTI-360 importer: a round trip through the published layout, then every part and every refusal."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import roundtrip
+import write_kitti360 as made
+from PIL import Image
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import invert, transform_points, yaw_matrix
+from mudg.base.types import Scene
+from mudg.data.importers import IMPORTERS, RECOGNISERS
+from mudg.data.importers.kitti360_boxes import read_boxes
+from mudg.data.importers.kitti360_calib import read_calibration
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scenefile import read_image, read_label, read_points
+
+pytestmark = roundtrip.needs_native
+SAME = {"front": "front", "front_left": "front_stereo"}
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
+
+
+@pytest.fixture(scope="module")
+def pristine(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made.write_kitti360(truth, tmp_path_factory.mktemp("kitti360") / "KITTI-360")
+
+
+@pytest.fixture
+def source(pristine: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return shutil.copytree(pristine, tmp_path / "KITTI-360")
+
+
+def ingest(source: Path, out: Path, **options: object) -> Scene:
+    return IMPORTERS["kitti360"](source, out, ImportOptions(**{"untwist": "no", **options}))  # type: ignore[arg-type]
+
+
+def parts(source: Path) -> dict[str, Path]:
+    return {
+        "images": source / "data_2d_raw" / made.DRIVE,
+        "scans": source / "data_3d_raw" / made.DRIVE / "velodyne_points",
+        "poses": source / "data_poses" / made.DRIVE,
+        "boxes": source / "data_3d_bboxes" / "train" / f"{made.DRIVE}.xml",
+        "calibration": source / "calibration",
+    }
+
+
+# --- what is read -----------------------------------------------------------------------------------------------------
+
+
+def test_round_trip(truth: Scene, pristine: Path, tmp_path: Path) -> None:
+    scene = ingest(pristine, tmp_path / "out", workers=2)
+    roundtrip.assert_same_log(scene, truth, cameras=SAME)
+    assert "CC BY-NC-SA" in scene.source.licence
+    assert "front/000004" in {name for name, part in scene.split.items() if part == "test"}
+    assert np.abs(scene.ego.world_from_ego[0, :3, 3]).max() < 1e-9  # the world begins at the vehicle
+    assert [name for name, looks_like in RECOGNISERS.items() if looks_like(pristine)] == ["kitti360"]
+    drive = pristine / "data_2d_raw" / made.DRIVE
+    assert next(name for name, looks_like in RECOGNISERS.items() if looks_like(drive)) == "kitti360"
+    part = ingest(drive, tmp_path / "part", frames=(2, 4), cameras=("image_01",), sequence="0003")
+    assert [frame.id for frame in part.frames] == ["front_stereo/000000", "front_stereo/000001"]
+    assert (read_image(part, part.frames[0]) == read_image(truth, truth.frames_of("front_left")[1])).all()
+
+
+def test_poses_between_are_interpolated_and_outside_are_left_out(truth: Scene, source: Path, tmp_path: Path) -> None:
+    path = parts(source)["poses"] / "poses.txt"
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(rows[k] for k in (0, 2, 4)) + "\n")
+    scene = ingest(source, tmp_path / "out")
+    assert len(scene.sweeps) == 5
+    for n in (1, 3):
+        before, own, after = (scene.sweeps[k].world_from_lidar[:3, 3] for k in (n - 1, n, n + 1))
+        assert np.abs(own - (before + after) / 2).max() < 1e-5  # the LiDAR turns about the vehicle
+    moved = scene.sweeps[2].world_from_lidar[:3, 3] - scene.sweeps[0].world_from_lidar[:3, 3]
+    true = truth.sweeps[2].world_from_lidar[:3, 3] - truth.sweeps[0].world_from_lidar[:3, 3]
+    assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(true), abs=1e-6)
+    path.write_text("\n".join(rows[1:4]) + "\n")
+    inner = ingest(source, tmp_path / "inner")
+    assert len(inner.sweeps) == 3
+    assert any("without a pose were left out: 1, 5" in note for note in inner.source.notes)
+
+
+def test_a_gap_in_which_the_vehicle_moved_is_not_filled(source: Path, tmp_path: Path) -> None:
+    path = parts(source)["poses"] / "poses.txt"
+    rows = [np.array(line.split(), float) for line in path.read_text().splitlines()]
+    for row in rows[3:]:
+        row[[4, 8]] += 40.0
+    path.write_text("\n".join(made.numbers(row).replace(".0 ", " ", 1) for row in (rows[0], rows[1], rows[3], rows[4])))
+    scene = ingest(source, tmp_path / "out", boxes=None)
+    assert len(scene.sweeps) == 4
+    assert any("without a pose were left out: 3" in note for note in scene.source.notes)
+
+
+def test_rectified_camera_poses_serve_where_vehicle_poses_are_missing(
+    source: Path, pristine: Path, tmp_path: Path
+) -> None:
+    path = parts(source)["poses"] / "poses.txt"
+    calibration = read_calibration(source / "calibration")
+    lines = []
+    for line in path.read_text().splitlines():
+        row = np.array(line.split(), float)
+        pose = np.vstack([row[1:].reshape(3, 4), [0, 0, 0, 1]]) @ calibration.imu_from_rect0
+        lines.append(f"{int(row[0])} {made.numbers(pose)}")
+    path.unlink()
+    (path.parent / "cam0_to_world.txt").write_text("\n".join(lines) + "\n")
+    one, other = ingest(source, tmp_path / "one"), ingest(pristine, tmp_path / "other")
+    for a, b in zip(one.frames, other.frames, strict=True):
+        assert np.abs(a.view.world_from_cam - b.view.world_from_cam).max() < 1e-9
+
+
+def test_scans_are_untwisted_clockwise(truth: Scene, source: Path, tmp_path: Path) -> None:
+    """Posts measured by a sensor that turns from left to right stand where they are; turned the other way they do not."""
+    first = truth.ego.pose_at(0.0)
+    assert first is not None
+    mount = invert(first) @ truth.sweeps[0].world_from_lidar
+    rng = np.random.default_rng(4)
+    turn, reach = rng.uniform(-np.pi, np.pi, 300), rng.uniform(8, 25, 300)
+    posts = transform_points(
+        truth.sweeps[2].world_from_lidar, np.c_[reach * np.cos(turn), reach * np.sin(turn), rng.uniform(-1, 3, 300)]
+    )
+
+    def velo(time_s: float) -> np.ndarray:
+        pose = truth.ego.pose_at(float(np.clip(time_s, -0.05, 0.45)))
+        assert pose is not None
+        return pose @ mount
+
+    time_s = truth.sweeps[2].time_s
+    points = transform_points(invert(velo(time_s)), posts)
+    for _ in range(8):
+        late = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) * 0.1
+        points = np.stack(
+            [transform_points(invert(velo(time_s + dt)), p[None])[0] for dt, p in zip(late, posts, strict=True)]
+        )
+    path = parts(source)["scans"] / "data" / f"{made.FIRST + 2:010d}.bin"
+    np.c_[points, np.full(300, 0.5)].astype("<f4").tofile(path)
+    world_from_truth = None
+    errors = {}
+    for choice in ("auto", "no"):
+        scene = ingest(source, tmp_path / choice, untwist=choice)
+        sweep = scene.sweeps[2]
+        world_from_truth = sweep.world_from_lidar @ invert(truth.sweeps[2].world_from_lidar)
+        got = read_points(scene, sweep)
+        found = transform_points(sweep.world_from_lidar, got.xyz.astype(np.float64))
+        errors[choice] = np.linalg.norm(found - transform_points(world_from_truth, posts), axis=1)
+        if choice == "auto":
+            ahead = np.abs(late) < 0.045
+            assert np.abs(got.dt_s - late)[ahead].max() < 1e-3
+    assert errors["auto"].max() < 0.02
+    assert errors["no"].max() > 0.2
+
+
+def test_sick_lines_become_one_sweep_a_frame(truth: Scene, source: Path, tmp_path: Path) -> None:
+    folder = source / "data_3d_raw" / made.DRIVE / "sick_points"
+    (folder / "data").mkdir(parents=True)
+    first = truth.ego.pose_at(0.0)
+    assert first is not None
+    mount = invert(first) @ truth.sweeps[0].world_from_lidar @ made.VELO_FROM_SICK
+    times = [0.0, 0.025, 0.05, 0.1, 0.125]
+    pairs = np.array([[3.0, 1.5], [4.0, -0.5], [0, 0]])
+    for number, _ in enumerate(times):
+        pairs.astype("<f4").tofile(folder / "data" / f"{number:010d}.bin")
+    (folder / "timestamps.txt").write_text("\n".join(made.stamp(time) for time in times) + "\n")
+    scene = ingest(source, tmp_path / "out")
+    lines = [sweep for sweep in scene.sweeps if sweep.sensor == "sick"]
+    assert [sweep.id for sweep in lines] == ["sick/000000", "sick/000001"]
+    points = read_points(scene, lines[1])
+    assert np.allclose(np.unique(points.dt_s), [-0.05, 0.0, 0.025], atol=1e-6)
+    in_plane = np.array([[0, -3.0, 1.5], [0, -4.0, -0.5]])
+    velo = next(s for s in scene.sweeps if s.sensor == "velodyne")
+    world_from_truth = velo.world_from_lidar @ invert(truth.sweeps[0].world_from_lidar)
+    for time_s in (0.1, 0.125):
+        ego = truth.ego.pose_at(time_s)
+        assert ego is not None
+        expected = transform_points(world_from_truth @ ego @ mount, in_plane)
+        mine = np.abs(points.dt_s - (time_s - 0.1)) < 1e-6
+        found = transform_points(lines[1].world_from_lidar, points.xyz[mine].astype(np.float64))
+        assert np.abs(found - expected).max() < 0.01  # between frames the vehicle is interpolated
+    (folder / "timestamps.txt").unlink()
+    assert any("SICK lines were left out" in note for note in ingest(source, tmp_path / "none").source.notes)
+
+
+def write_fisheye(source: Path) -> None:
+    """Two lenses whose pixels show the direction of their ray: red = x, green = y, blue = z, -1..1 as 0..254."""
+    side, xi, gamma, k1, k2 = 140, 2.2, 133.6, 0.016, 1.65
+    v, u = np.mgrid[:side, :side]
+    x, y = (u - 71.6) / gamma, (v - 70.5) / gamma
+    a, b = x.copy(), y.copy()
+    for _ in range(60):  # undo the distortion: the fixed point of division by the radial factor
+        r2 = a * a + b * b
+        a, b = x / (1 + k1 * r2 + k2 * r2 * r2), y / (1 + k1 * r2 + k2 * r2 * r2)
+    r2 = a * a + b * b
+    factor = (xi + np.sqrt(np.maximum(1 + (1 - xi * xi) * r2, 0))) / (r2 + 1)  # back onto the sphere, Mei 2007
+    ray = np.stack([factor * a, factor * b, factor - xi], -1)
+    image = np.round((ray + 1) * 127).clip(0, 254).astype(np.uint8)
+    for name in ("image_02", "image_03"):
+        (source / "calibration" / f"{name}.yaml").write_text(
+            "%YAML:1.0\n---\nmodel_type: MEI\ncamera_name: " + name + f"\nimage_width: {side}\nimage_height: {side}\n"
+            f"mirror_parameters:\n   xi: {xi:.16e}\ndistortion_parameters:\n   k1: {k1}\n   k2: {k2}\n   p1: 0.0\n   p2: 0.0\n"
+            f"projection_parameters:\n   gamma1: {gamma}\n   gamma2: {gamma}\n   u0: 71.6\n   v0: 70.5\n"
+        )
+        folder = source / "data_2d_raw" / made.DRIVE / name / "data_rgb"
+        folder.mkdir(parents=True)
+        for n in range(made.FIRST, made.FIRST + 5):
+            Image.fromarray(image).save(folder / f"{n:010d}.png")
+
+
+def test_fisheyes_become_pinhole_images_of_the_same_rays(source: Path, tmp_path: Path) -> None:
+    write_fisheye(source)
+    assert set(ingest(source, tmp_path / "usual").cameras) == {"front", "front_stereo"}
+    scene = ingest(source, tmp_path / "out", cameras=("side_left", "image_03"), frames=(1, 3))
+    camera = scene.cameras["side_left"]
+    assert camera.width == camera.height == round(2 * 133.6 / 3.2)
+    assert 2 * np.rad2deg(np.arctan(camera.width / 2 / camera.fx)) == pytest.approx(90, abs=0.5)
+    assert camera.distortion[0] == 2.2
+    image = read_image(scene, scene.frames_of("side_left")[0]).astype(float) / 127 - 1
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    assert np.abs(image - ray).max() < 0.012  # 8 bits and bilinear mixing
+    left = scene.frames_of("side_left")[0].view.world_from_cam[:3, 2]
+    assert left @ scene.ego.world_from_ego[0][:3, 1] == pytest.approx(1.0, abs=1e-6)  # the lens looks to the left
+
+
+def test_semantics_are_taken_where_there_are_some(source: Path, tmp_path: Path) -> None:
+    folder = source / "data_2d_semantics" / "train" / made.DRIVE / "image_00"
+    ids = np.zeros((64, 96), np.uint8)
+    ids[:10], ids[10:20], ids[20:30], ids[30:40], ids[40:] = 23, 26, 34, 9, 7
+    sure = np.linspace(0, 65535, 96 * 64).reshape(64, 96).astype(np.uint16)
+    for kind in ("semantic", "confidence"):
+        (folder / kind).mkdir(parents=True)
+    Image.fromarray(ids).save(folder / "semantic" / f"{made.FIRST:010d}.png")
+    Image.fromarray(sure).save(folder / "confidence" / f"{made.FIRST:010d}.png")
+    scene = ingest(source, tmp_path / "out")
+    frame = scene.frames_of("front")[0]
+    assert np.unique(read_label(scene, frame, "semantics")[[0, 10, 20, 30, 40]]).tolist() == [0, 2, 10, 13, 255]
+    assert np.abs(read_label(scene, frame, "semantics_confidence") - sure / 65535).max() < 1e-6
+    assert not scene.frames_of("front")[1].labels
+    assert not scene.frames_of("front_stereo")[0].labels
+    Image.fromarray(ids + 30).save(folder / "semantic" / f"{made.FIRST:010d}.png")
+    with pytest.raises(InputError, match="ids that do not exist"):
+        ingest(source, tmp_path / "bad")
+
+
+# --- boxes ------------------------------------------------------------------------------------------------------------
+
+
+def boxes_of(tmp_path: Path, *objects: str) -> tuple[list, dict[str, int]]:
+    path = tmp_path / "boxes.xml"
+    path.write_text('<?xml version="1.0"?>\n<opencv_storage>' + "".join(objects) + "</opencv_storage>")
+    left_out: dict[str, int] = {}
+    return list(read_boxes(path, left_out)), left_out
+
+
+@pytest.mark.parametrize(
+    "axes", [np.eye(3), np.eye(3)[:, [1, 0, 2]], np.eye(3)[:, [2, 0, 1]], np.diag([1.0, -1, 1]), np.diag([1.0, 1, -1])]
+)
+def test_the_same_box_by_any_axes(tmp_path: Path, axes: np.ndarray) -> None:
+    """Sizes along other axes, mirrored and left-handed transforms are the same box: long, narrow, upright."""
+    pose, size = yaw_matrix(0.4, (3.0, 4.0, 1.0)), np.array([4.5, 1.8, 1.5])
+    turned = pose.copy()
+    turned[:3, :3] = pose[:3, :3] @ axes
+    ((box,), _) = boxes_of(tmp_path, made.box_xml(1, turned, np.abs(axes.T @ size)))
+    assert box.size_m == pytest.approx((4.5, 1.8, 1.5))
+    expected = made.SOURCE_FROM_WORLD @ pose
+    assert np.abs(box.world_from_box[:3, 3] - expected[:3, 3]).max() < 1e-6
+    assert abs(box.world_from_box[:3, 0] @ expected[:3, 0]) == pytest.approx(1)
+    assert np.linalg.det(box.world_from_box[:3, :3]) == pytest.approx(1)
+    assert box.world_from_box[2, 2] == pytest.approx(1)
+
+
+def test_classes_labels_and_shear(tmp_path: Path) -> None:
+    pose, size = yaw_matrix(0.1, (3.0, 4.0, 1.0)), np.array([4.5, 1.8, 1.5])
+    sheared = pose.copy()
+    sheared[0, 1] += 0.5
+    named = re.sub(r"<semanticId>.*?</instanceId>", "", made.box_xml(7, pose, size)).replace(
+        ">car<", ">unknownVehicle<"
+    )
+    found, left_out = boxes_of(
+        tmp_path,
+        made.box_xml(1, pose, size, semantic=19),
+        made.box_xml(2, pose, size, semantic=11),
+        made.box_xml(3, pose, size, semantic=77),
+        made.box_xml(4, sheared, size),
+        named,
+    )
+    assert [box.label for box in found] == ["person", "unknown vehicle"]
+    assert left_out == {"of classes that do not move": 2, "that are not cuboids": 1}
+
+
+def test_standing_boxes_hold_in_their_window_only(source: Path, tmp_path: Path) -> None:
+    pose, size = yaw_matrix(0.1, (3.0, 4.0, 1.0)), np.array([4.5, 1.8, 1.5])
+    text = made.box_xml(1, pose, size, window=(2, 4)) + made.box_xml(2, pose, size, instance=2, window=(70, 90))
+    path = tmp_path / "some.xml"
+    path.write_text(f"<opencv_storage>{text}</opencv_storage>")
+    scene = ingest(source, tmp_path / "out", boxes=path)
+    (track,) = scene.tracks
+    assert track.times_s == pytest.approx([0.1, 0.3])
+    assert (track.world_from_object[0] == track.world_from_object[1]).all()
+    assert any("1 boxes lie outside" in note for note in scene.source.notes)
+
+
+def test_an_object_drawn_twice_in_a_frame_is_taken_once(source: Path, tmp_path: Path) -> None:
+    pose, size = yaw_matrix(0.1, (3.0, 4.0, 1.0)), np.array([4.5, 1.8, 1.5])
+    text = "".join(made.box_xml(n, pose, size, timestamp=frame) for n, frame in enumerate((1, 2, 2, 3)))
+    path = tmp_path / "some.xml"
+    path.write_text(f"<opencv_storage>{text}</opencv_storage>")
+    scene = ingest(source, tmp_path / "out", boxes=path)
+    assert scene.tracks[0].times_s == pytest.approx([0.0, 0.1, 0.2])
+    assert any("1 boxes that an object has twice" in note for note in scene.source.notes)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: s.replace("<opencv_storage>", '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage>'), "entities"),
+        (lambda s: s.replace('version="1.0"', 'version="1.0" encoding="cp037"'), "encoding"),
+        (lambda s: s[: len(s) // 2], "cut off"),
+        (lambda s: s.replace("<rows>4</rows>", "<rows>999999999</rows>"), "size it declares"),
+        (lambda s: s.replace("<timestamp>-1</timestamp>", "<timestamp>soon</timestamp>"), "'timestamp'"),
+        (lambda s: re.sub(r"(<transform.*?<data>\s*)\S+", r"\1nan", s, flags=re.S), "not finite"),
+        (lambda s: re.sub(r"(<transform.*?<data>\s*)\S+", r"\1car", s, flags=re.S), "no number"),
+    ],
+)
+def test_spoilt_box_files(source: Path, tmp_path: Path, change: Callable[[str], str], words: str) -> None:
+    path = parts(source)["boxes"]
+    path.write_text(change(path.read_text()))
+    with pytest.raises(InputError, match=words):
+        ingest(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+def spoil_text(name: str, pattern: str, instead: str) -> Callable[[Path], None]:
+    def spoil(source: Path) -> None:
+        path = source / name
+        text = path.read_text()
+        changed = re.sub(pattern, instead, text, count=1, flags=re.S)
+        assert changed != text
+        path.write_text(changed)
+
+    return spoil
+
+
+def scaled_pose(source: Path, factor: np.ndarray) -> None:
+    path = parts(source)["poses"] / "poses.txt"
+    lines = path.read_text().splitlines()
+    row = np.array(lines[2].split(), float)
+    pose = row[1:].reshape(3, 4)
+    pose[:, :3] = pose[:, :3] @ factor
+    lines[2] = f"{int(row[0])} {made.numbers(pose)}"
+    path.write_text("\n".join(lines) + "\n")
+
+
+POSES = f"data_poses/{made.DRIVE}/poses.txt"
+STAMPS = f"data_3d_raw/{made.DRIVE}/velodyne_points/timestamps.txt"
+IMAGE = f"data_2d_raw/{made.DRIVE}/image_01/data_rect/{made.FIRST + 2:010d}.png"
+SCAN = f"data_3d_raw/{made.DRIVE}/velodyne_points/data/{made.FIRST + 1:010d}.bin"
+
+
+def cut(name: str, size: int) -> Callable[[Path], None]:
+    return lambda source: (source / name).write_bytes((source / name).read_bytes()[:size])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda s: (s / IMAGE).unlink(), "image_01 lacks 3"),
+        (lambda s: (s / SCAN).unlink(), "velodyne lacks 2"),
+        (cut(SCAN, 1001), "scan is cut off"),
+        (cut(IMAGE, 400), "cannot be decoded"),
+        (lambda s: shutil.rmtree(s / "data_poses"), "no vehicle poses"),
+        (cut(POSES, 700), "wrong number of values|not a rigid|no pose|without"),
+        (spoil_text(POSES, r"\n2 ", "\n9 "), "growing frame numbers"),
+        (lambda s: scaled_pose(s, 1.01 * np.eye(3)), "pose is scaled"),
+        (lambda s: scaled_pose(s, np.diag([1.0, 1, -1])), "left-handed"),
+        (lambda s: scaled_pose(s, np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]])), "not a rigid motion"),
+        (lambda s: (s / STAMPS).write_text("\n".join(str(n * 100.0) for n in range(9))), "another unit"),
+        (lambda s: (s / STAMPS).write_text("\n".join(str(n * 100_000) for n in range(9))), "another unit"),
+        (lambda s: (s / STAMPS).write_text(made.stamp(0.0) + "\n"), "do not cover"),
+        (spoil_text(STAMPS, r":17\.550", ":17.350"), "do not increase"),
+        (spoil_text("calibration/calib_cam_to_pose.txt", r"image_00: \S+", "image_00:"), "wrong number of values"),
+        (spoil_text("calibration/calib_cam_to_pose.txt", r"image_00: \S+", "image_00: 7.5"), "pose"),
+        (spoil_text("calibration/calib_cam_to_velo.txt", r"^\S+ ", ""), "wrong number of values"),
+        (spoil_text("calibration/perspective.txt", r"S_rect_00: 96", "S_rect_00: 1408"), "not have the size"),
+        (spoil_text("calibration/perspective.txt", r"P_rect_00", "P_rest_00"), "lacks P_rect_00"),
+        (spoil_text("calibration/perspective.txt", r"R_rect_01: \S+", "R_rect_01: 2.0"), "rigid|scaled"),
+        (lambda s: shutil.rmtree(s / "calibration"), "file not found"),
+    ],
+)  # fmt: skip
+def test_spoilt_logs_are_refused_in_words(
+    source: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
+) -> None:
+    spoil(source)
+    with pytest.raises(InputError) as caught:
+        ingest(source, tmp_path / "out")
+    assert re.search(words, str(caught.value)), str(caught.value)
+    assert str(source) in caught.value.where or "frame" in caught.value.where
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_frames_can_be_skipped_and_choices_are_checked(source: Path, tmp_path: Path) -> None:
+    (source / IMAGE).unlink()
+    assert len(ingest(source, tmp_path / "out", skip_missing=True).sweeps) == 4
+    with pytest.raises(UsageError, match="no such camera") as caught:
+        ingest(source, tmp_path / "no", cameras=("side_left",))
+    assert "front (image_00)" in caught.value.expected
+    with pytest.raises(UsageError, match="no such drive"):
+        ingest(source, tmp_path / "no", sequence="0007")
+    (source / "data_2d_raw" / "2013_05_28_drive_0004_sync").mkdir()
+    with pytest.raises(UsageError, match="several drives"):
+        ingest(source, tmp_path / "no")
+    assert len(ingest(source, tmp_path / "yes", sequence="0003", frames=(1, 3)).sweeps) == 2
+    with pytest.raises(InputError, match="no frames to import"):
+        ingest(source, tmp_path / "no", sequence="0003", frames=(50, 60))
+
+
+def test_a_fisheye_calibration_of_another_model_is_refused(source: Path, tmp_path: Path) -> None:
+    write_fisheye(source)
+    path = source / "calibration" / "image_02.yaml"
+    for old, new, words in (("MEI", "KANNALA_BRANDT", "another camera model"), ("gamma2", "gamma3", "incomplete")):
+        text = path.read_text()
+        path.write_text(text.replace(old, new))
+        with pytest.raises(InputError, match=words):
+            ingest(source, tmp_path / "out", cameras=("image_02",))
+        path.write_text(text)

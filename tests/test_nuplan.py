@@ -1,0 +1,289 @@
+"""nuPlan importer: a round trip through the published schema, choices, bait in calibration pickles, damage."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import roundtrip
+import write_nuplan as made
+from PIL import Image
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Scene
+from mudg.data.importers import IMPORTERS, RECOGNISERS
+from mudg.data.importers.nuplan_log import open_log
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scenefile import read_image
+
+pytestmark = roundtrip.needs_native
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
+
+
+@pytest.fixture(scope="module")
+def pristine(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made.write_nuplan(truth, tmp_path_factory.mktemp("nuplan") / "nuplan-v1.1").parents[2]
+
+
+@pytest.fixture
+def source(pristine: Path, tmp_path: Path) -> Path:
+    """A copy to spoil; its database is ``log(source)``."""
+    return shutil.copytree(pristine, tmp_path / "nuplan-v1.1")
+
+
+def log(source: Path) -> Path:
+    return source / "splits" / "mini" / f"{made.LOG}.db"
+
+
+def ingest(source: Path, out: Path, **options: object) -> Scene:
+    return IMPORTERS["nuplan"](source, out, ImportOptions(**options))  # type: ignore[arg-type]
+
+
+# --- what is read -----------------------------------------------------------------------------------------------------
+
+
+def test_round_trip(truth: Scene, pristine: Path, tmp_path: Path) -> None:
+    scene = ingest(log(pristine), tmp_path / "out", workers=2)
+    roundtrip.assert_same_log(scene, truth, labels={"car": "vehicle"}, intensity=0.002)  # intensity has 8 bits
+    assert np.abs(scene.ego.pose_at(0.0)[:3, 3]).max() < 1e-9  # type: ignore[index]
+    assert "nuPlan" in scene.source.licence
+    assert sorted(name for name, part in scene.split.items() if part == "test") == ["front/000004", "front_left/000004"]
+    for path in (log(pristine), pristine, pristine.parent):
+        assert [name for name, looks_like in RECOGNISERS.items() if looks_like(path)] == ["nuplan"]
+
+
+def test_scenes_frames_cameras_and_logs_are_chosen(truth: Scene, pristine: Path, tmp_path: Path) -> None:
+    scene = ingest(log(pristine), tmp_path / "scene", sequence="scene-0001", cameras=("CAM_L0",))
+    assert len(scene.sweeps) == len(scene.frames) == 2
+    assert scene.id == f"{made.LOG}_scene-0001"
+    assert (read_image(scene, scene.frames[0]) == read_image(truth, truth.frames_of("front_left")[3])).all()
+    part = ingest(pristine, tmp_path / "part", sequence=f"{made.LOG}/scene-0000", frames=(1, 3))
+    assert [sweep.time_s for sweep in part.sweeps] == pytest.approx([0.0, 0.1])
+    assert len(part.frames) == 4
+    assert all(len(track.times_s) == 2 for track in part.tracks)
+    for options, words in (({"sequence": "scene-0009"}, "no such scene"), ({"cameras": ("CAM_B0",)}, "no such camera"),
+                           ({"untwist": "no"}, "no use for --untwist")):  # fmt: skip
+        with pytest.raises(UsageError, match=words):
+            ingest(log(pristine), tmp_path / "no", **options)
+    with pytest.raises(InputError, match="no clouds to import"):
+        ingest(log(pristine), tmp_path / "no", frames=(70, 80))
+
+
+def test_several_logs_need_a_name(source: Path, tmp_path: Path) -> None:
+    shutil.copy(log(source), log(source).with_name("2021.06.01.db"))
+    with pytest.raises(UsageError, match="several logs") as caught:
+        ingest(source, tmp_path / "no")
+    assert made.LOG in caught.value.expected
+    assert len(ingest(source, tmp_path / "yes", sequence=made.LOG, frames=(0, 1)).sweeps) == 1
+    with pytest.raises(UsageError, match="no such log"):
+        ingest(source, tmp_path / "no", sequence="2022.db")
+
+
+def test_distorted_images_are_rectified_and_jpeg_stays_jpeg(truth: Scene, tmp_path: Path) -> None:
+    bend = (-0.35, 0.15, 0.001, -0.0005, -0.03)
+    database = made.write_nuplan(truth, tmp_path / "bent", distortion=bend, jpeg=True)
+    scene = ingest(database, tmp_path / "out", frames=(0, 2), cameras=("front",))
+    camera = scene.cameras["front"]
+    assert camera.distortion == bend
+    assert camera.fx >= truth.cameras["front"].fx
+    assert scene.frames[0].image.path.endswith(".jpg")
+    assert any("rectified" in note for note in scene.source.notes)
+    plain = made.write_nuplan(truth, tmp_path / "plain", jpeg=True)  # no distortion: the files are kept
+    roundtrip.assert_same_log(
+        ingest(plain, tmp_path / "same"), truth, labels={"car": "vehicle"}, intensity=0.002, colour_levels=3
+    )
+
+
+def test_rectified_pixels_show_the_rays_of_the_pinhole_camera(truth: Scene, tmp_path: Path) -> None:
+    """An image through the lens whose colours are ray directions: rectified, each pixel shows its own ray."""
+    k1, k2, p1, p2, k3 = bend = (-0.35, 0.15, 0.004, -0.003, -0.03)
+    database = made.write_nuplan(truth, tmp_path / "bent", distortion=bend)
+    camera = truth.cameras["front"]
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    bent = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy])
+    x, y = bent.copy()
+    for _ in range(100):  # undo the lens: OpenCV's fixed point
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        x = (bent[0] - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial
+        y = (bent[1] - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial
+    image = np.stack([x * 150 + 127, y * 150 + 127, np.zeros_like(x)], -1).round().clip(0, 255).astype(np.uint8)
+    for path in (tmp_path / "bent" / "sensor_blobs" / made.LOG / "CAM_F0").iterdir():
+        Image.fromarray(image).save(path, "PNG")
+    scene = ingest(database, tmp_path / "out", frames=(0, 1), cameras=("front",))
+    flat = scene.cameras["front"]
+    rays = read_image(scene, scene.frames[0])[..., :2].astype(float)
+    v, u = np.mgrid[: flat.height, : flat.width] + 0.5
+    expected = np.stack([(u - flat.cx) / flat.fx, (v - flat.cy) / flat.fy], -1) * 150 + 127
+    assert np.abs(rays - expected).max() < 1.2  # half a level each for writing, mixing and the weights' 8 bits
+
+
+def test_calibration_may_be_lists_arrays_or_the_data_sets_own_list_classes(source: Path, tmp_path: Path) -> None:
+    matrix = np.array([[80.0, 0, 48], [0, 81, 32], [0, 0, 1]])
+    home = "nuplan.database.common.data_types"
+    as_class = f"\x80\x03c{home}\nCameraIntrinsic\n)\x81".encode("latin1") + pickle.dumps(matrix.tolist(), 3)[3:-1]
+    as_class = as_class.replace(b"]q\x00", b"", 1)  # the list's items go to the object
+    for blob in (pickle.dumps(matrix.tolist()), pickle.dumps(matrix), as_class + b"."):
+        change(source, "UPDATE camera SET intrinsic = ?", blob)
+        with open_log(log(source)) as opened:
+            assert next(iter(opened.cameras().values())).intrinsics == (80.0, 81.0, 48.0, 32.0)
+
+
+def test_nothing_is_written_beside_the_database(pristine: Path, tmp_path: Path) -> None:
+    before = log(pristine).read_bytes()
+    ingest(log(pristine), tmp_path / "out", frames=(0, 1))
+    assert log(pristine).read_bytes() == before
+    assert [path.name for path in log(pristine).parent.iterdir()] == [log(pristine).name]
+
+
+# --- bait and damage --------------------------------------------------------------------------------------------------
+
+
+class Asks:
+    """Pickles as a command."""
+
+    def __init__(self, words: str) -> None:
+        self.words = words
+
+    def __reduce__(self) -> object:
+        return os.system, (self.words,)
+
+
+@pytest.mark.parametrize("column", ["translation", "rotation", "intrinsic", "distortion"])
+def test_a_calibration_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, column: str) -> None:
+    bait = tmp_path / "ran"
+    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([Asks(f"touch {bait}")]))
+    with pytest.raises(InputError, match=r"asks for '(posix|nt)\.system'") as caught:
+        ingest(source, tmp_path / "out")
+    assert column in caught.value.where
+    assert not bait.exists()
+
+
+def change(source: Path, words: str, *values: object) -> None:
+    connection = sqlite3.connect(log(source))
+    connection.execute(words, values)
+    connection.commit()
+    connection.close()
+
+
+def sql(words: str, *values: object) -> Callable[[Path], None]:
+    return lambda source: change(source, words, *values)
+
+
+def blob(kind: str, index: int = 1) -> Callable[[Path], Path]:
+    return lambda source: sorted((source / "sensor_blobs" / made.LOG / kind).iterdir())[index]
+
+
+def rewritten(kind: str, edit: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    def spoil(source: Path) -> None:
+        path = blob(kind)(source)
+        path.write_bytes(edit(path.read_bytes()))
+
+    return spoil
+
+
+def cut(source: Path, size: int) -> None:
+    log(source).write_bytes(log(source).read_bytes()[:size])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda s: log(s).write_bytes(b"SQLite format 3\0" + b"x" * 5000), "not a readable SQLite|damaged"),
+        (lambda s: log(s).write_text("a text"), "not a readable SQLite|damaged"),
+        (lambda s: cut(s, 6000), "damaged|not a readable|no table"),
+        (sql("ALTER TABLE lidar_box RENAME TO boxes"), "no table 'lidar_box'"),
+        (sql("ALTER TABLE ego_pose RENAME COLUMN qw TO w"), "'ego_pose' lacks columns"),
+        (lambda s: shutil.rmtree(s / "sensor_blobs"), "sensor blobs of the log were not found"),
+        (lambda s: blob("CAM_F0")(s).unlink(), "file of a camera image is missing"),
+        (lambda s: blob("MergedPointCloud")(s).unlink(), "file of a point cloud is missing"),
+        (sql("DELETE FROM image WHERE token = ?", made.token("image", "CAM_L0", 2)), "lacks images of some cameras"),
+        (sql("UPDATE ego_pose SET timestamp = timestamp / 1000"), "no vehicle poses at the time"),
+        (sql("UPDATE lidar_pc SET timestamp = timestamp / 1000"), "another unit"),
+        (sql("UPDATE image SET timestamp = timestamp / 1000"), "no moment has images"),
+        (sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)), "no whole number|numbers"),
+        (sql("UPDATE ego_pose SET qw = qw * 1.5, qx = qx * 1.5, qy = qy * 1.5, qz = qz * 1.5"), "length 1"),
+        (sql("UPDATE ego_pose SET x = NULL"), "not a finite number"),
+        (sql("UPDATE lidar_pc SET ego_pose_token = x'00'"), "point cloud has no vehicle pose"),
+        (sql("UPDATE lidar_pc SET lidar_token = x'00'"), "LiDAR that is not there"),
+        (sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", made.token("box", "car-001", 1)), "names a track"),
+        (sql("DELETE FROM category"), "names a track or class that is not there"),
+        (sql("UPDATE lidar_box SET length = 0"), "size makes no sense"),
+        (sql("UPDATE lidar_box SET yaw = 'north'"), "not a finite number"),
+        (sql("UPDATE image SET filename_jpg = '../../../etc/passwd'"), "leads out of the sensor blobs"),
+        (sql("UPDATE lidar_pc SET filename = '/etc/passwd'"), "leads out of the sensor blobs"),
+        (sql("UPDATE camera SET rotation = ?", pickle.dumps([0.0, 0, 0, 0])), "length 1"),
+        (sql("UPDATE camera SET intrinsic = ?", pickle.dumps([[1.0, 2], [3, 4]])), "wrong number of values"),
+        (sql("UPDATE camera SET intrinsic = ?", pickle.dumps([[0.0, 0, 0]] * 3)), "not of a pinhole camera"),
+        (sql("UPDATE camera SET intrinsic = ?", pickle.dumps([["a"] * 3] * 3)), "not a finite number"),
+        (sql("UPDATE camera SET intrinsic = ?", b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7f."), "malformed"),
+        (sql("UPDATE camera SET intrinsic = 'text'"), "no pickled list"),
+        (sql("UPDATE camera SET width = 40"), "size"),
+        (rewritten("MergedPointCloud", lambda c: c[:700]), "cut off|bytes"),
+        (rewritten("MergedPointCloud", lambda c: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 99999999999", c)), "POINTS|points|bytes"),
+        (rewritten("MergedPointCloud", lambda c: c.replace(b"FIELDS x y z", b"FIELDS a y z")), "no coordinates"),
+        (rewritten("CAM_F0", lambda c: c[:300]), "cannot be decoded"),
+    ],
+)  # fmt: skip
+def test_spoilt_logs_are_refused_in_words(
+    source: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
+) -> None:
+    spoil(source)
+    with pytest.raises(InputError) as caught:
+        ingest(log(source), tmp_path / "out")
+    assert re.search(words, str(caught.value)), str(caught.value)
+    assert caught.value.where
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_that_is_a_view_or_virtual_is_no_table(source: Path, tmp_path: Path) -> None:
+    change(source, "ALTER TABLE category RENAME TO real_category")
+    change(source, "CREATE VIEW category AS SELECT * FROM real_category")
+    with pytest.raises(InputError, match="no table 'category'"):
+        ingest(source, tmp_path / "out")
+
+
+def test_incomplete_moments_can_be_skipped(source: Path, tmp_path: Path) -> None:
+    blob("CAM_F0")(source).unlink()
+    blob("MergedPointCloud")(source).unlink()
+    change(source, "DELETE FROM image WHERE token = ?", made.token("image", "CAM_L0", 2))
+    scene = ingest(source, tmp_path / "out", skip_missing=True)
+    assert len(scene.sweeps) == 4
+    assert len(scene.frames_of("front")) == len(scene.frames_of("front_left")) in (3, 4)
+    words = " | ".join(scene.source.notes)
+    assert "1 clouds whose files are missing" in words
+    assert "moments without images of all cameras" in words
+
+
+def test_cameras_may_fire_one_after_another(source: Path, tmp_path: Path) -> None:
+    """A camera 45 ms behind the other is of the same moment; one image missing in the middle is found and named."""
+    change(source, "UPDATE image SET timestamp = timestamp + 45000 WHERE camera_token = ?", made.token("CAM_L0"))
+    scene = ingest(source, tmp_path / "out")
+    front, left = (np.array([frame.view.time_s for frame in scene.frames_of(name)]) for name in ("front", "front_left"))
+    assert left - front == pytest.approx(np.full(5, 0.045))
+    for channel in ("CAM_F0", "CAM_L0"):
+        shutil.copy(log(source), tmp_path / "whole.db")
+        change(source, "DELETE FROM image WHERE token = ?", made.token("image", channel, 2))
+        with pytest.raises(InputError, match="lacks images of some cameras") as caught:
+            ingest(source, tmp_path / "no")
+        assert caught.value.got == f"no {channel}; 1 such moments"
+        assert len(ingest(source, tmp_path / f"skip {channel}", skip_missing=True).frames) == 8
+        shutil.copy(tmp_path / "whole.db", log(source))
+
+
+def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
+    change(source, "UPDATE category SET name = 'Hover Board'")
+    scene = ingest(source, tmp_path / "out", frames=(0, 2))
+    assert {track.label for track in scene.tracks} == {"hover_board"}
+    assert any("Hover Board" in note for note in scene.source.notes)

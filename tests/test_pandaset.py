@@ -1,0 +1,317 @@
+"""PandaSet importer: a round trip through the published layout, siblings and times of boxes, bait and damage."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import pickle
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import roundtrip
+from pandas_pickles import write_frame
+from write_pandaset import CAMERA_OF, EPOCH_S, SOURCE_FROM_WORLD, cuboids, pose_entry, write_pandaset
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.types import Scene, Track
+from mudg.data.importers import IMPORTERS, RECOGNISERS
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scenefile import read_points
+
+pytestmark = roundtrip.needs_native
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
+
+
+@pytest.fixture(scope="module")
+def pristine(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_pandaset(truth, tmp_path_factory.mktemp("pandaset") / "001")
+
+
+@pytest.fixture
+def source(pristine: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return shutil.copytree(pristine, tmp_path / "001")
+
+
+def ingest(source: Path, out: Path, **options: object) -> Scene:
+    return IMPORTERS["pandaset"](source, out, ImportOptions(**options))  # type: ignore[arg-type]
+
+
+def world_points(scene: Scene, sensor: str, index: int) -> np.ndarray:
+    sweep = next(s for s in scene.sweeps if s.id == f"{sensor}/{index:06d}")
+    return transform_points(sweep.world_from_lidar, read_points(scene, sweep).xyz.astype(np.float64))
+
+
+# --- what is read -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_round_trip(truth: Scene, tmp_path: Path, new: bool) -> None:
+    source = write_pandaset(truth, tmp_path / "042", new=new)
+    scene = ingest(source, tmp_path / "out", workers=2)
+    roundtrip.assert_same_log(scene, truth, sweeps=False)  # the LiDAR's place is not in the format; points follow
+    world_from_truth = scene.frames_of("front")[0].view.world_from_cam @ invert(
+        truth.frames_of("front")[0].view.world_from_cam
+    )
+    for index, sweep in enumerate(truth.sweeps):
+        points = read_points(truth, sweep)
+        expected = transform_points(world_from_truth @ sweep.world_from_lidar, points.xyz.astype(np.float64))
+        solid = np.arange(len(expected)) % 5 == 0
+        for sensor, mine in (("pandar64", ~solid), ("pandar_gt", solid)):
+            assert np.abs(world_points(scene, sensor, index) - expected[mine]).max() < 2e-5
+            got = next(s for s in scene.sweeps if s.id == f"{sensor}/{index:06d}")
+            assert got.time_s == pytest.approx(sweep.time_s, abs=1e-6)
+            assert np.abs(read_points(scene, got).intensity - points.intensity[mine]).max() < 1e-6
+    camera = scene.frames_of("front")[0].view.center_world
+    place = transform_points(invert(scene.sweeps[0].world_from_lidar), camera[None])[0]
+    assert np.linalg.norm(place) < 0.07  # the turning LiDAR sits just above and behind the front camera
+    assert scene.id == "042"
+    assert "CC BY 4.0" in scene.source.licence
+    assert [name for name, looks_like in RECOGNISERS.items() if looks_like(source)] == ["pandaset"]
+
+
+def test_cameras_frames_and_sequences_are_chosen(truth: Scene, pristine: Path, tmp_path: Path) -> None:
+    part = ingest(pristine, tmp_path / "part", frames=(1, 4), cameras=("front_left_camera",))
+    assert [frame.id for frame in part.frames] == [f"front_left/{n:06d}" for n in range(3)]
+    assert part.frames[0].view.time_s == pytest.approx(0.0, abs=1e-6)
+    shutil.copytree(pristine, tmp_path / "all" / "002")
+    shutil.copytree(pristine, tmp_path / "all" / "016")
+    assert RECOGNISERS["pandaset"](tmp_path / "all")
+    with pytest.raises(UsageError, match="several sequences") as caught:
+        ingest(tmp_path / "all", tmp_path / "no")
+    assert "002, 016" in caught.value.expected
+    assert ingest(tmp_path / "all", tmp_path / "yes", sequence="016", frames=(0, 1)).id == "016"
+    for options, words in (({"sequence": "../001"}, "no such sequence"), ({"cameras": ("top",)}, "no such camera"),
+                           ({"boxes": Path("x")}, "no use for --boxes")):  # fmt: skip
+        with pytest.raises(UsageError, match=words):
+            ingest(tmp_path / "all", tmp_path / "no", **{"sequence": "002", **options})
+
+
+def test_point_times_stay_and_moving_boxes_get_theirs(truth: Scene, tmp_path: Path) -> None:
+    """Each moving box's key stands at the median time of its points; the standing ones keep one pose."""
+    source = write_pandaset(truth, tmp_path / "001", point_times=True)
+    scene = ingest(source, tmp_path / "out")
+    sweep = next(s for s in scene.sweeps if s.id == "pandar64/000002")
+    late = read_points(truth, truth.sweeps[2]).dt_s
+    assert np.abs(np.sort(read_points(scene, sweep).dt_s) - np.sort(late[np.arange(len(late)) % 5 != 0])).max() < 1e-6
+    checked = 0
+    for track in scene.tracks:
+        given = next(t for t in truth.tracks if t.id == track.id)
+        if np.ptp(given.world_from_object[:, 0, 3]) == 0:
+            assert (track.world_from_object[0] == track.world_from_object[-1]).all()
+            assert track.times_s[[0, -1]] == pytest.approx([0.0, 0.4])
+            continue
+        points = read_points(truth, truth.sweeps[2])
+        in_box = transform_points(
+            invert(given.world_from_object[2]) @ truth.sweeps[2].world_from_lidar, points.xyz.astype(np.float64)
+        )
+        turning = np.arange(len(in_box)) % 5 != 0
+        inside = (np.abs(in_box) < given.size_m / 2).all(1) & turning
+        if inside.sum() >= 5 and len(track.times_s) == 5:
+            assert track.times_s[2] - 0.2 == pytest.approx(float(np.median(points.dt_s[inside])), abs=1e-5)
+            checked += 1
+    assert checked >= 2
+
+
+def test_siblings_are_one_object(truth: Scene, source: Path, tmp_path: Path) -> None:
+    """An object with a box per LiDAR is one track; the turning LiDAR's box wins, and either alone will do."""
+    for index, sweep in enumerate(truth.sweeps):
+        table = {name: list(column) for name, column in cuboids(truth, sweep.time_s).items()}  # type: ignore[call-overload]
+        row = table["uuid"].index("car-001")
+        table["cuboids.sibling_id"][row], table["cuboids.sensor_id"][row] = "other", 0
+        for column in table.values():
+            column.append(column[row])
+        table["uuid"][-1], table["cuboids.sibling_id"][-1], table["cuboids.sensor_id"][-1] = "other", "car-001", 1
+        table["position.z"][-1] += 5.0
+        if index == 4:  # only the solid-state LiDAR sees it
+            table = {name: column[:row] + column[row + 1 :] for name, column in table.items()}
+            table["position.z"][-1] -= 5.0
+        write_frame(source / "annotations" / "cuboids" / f"{index:02d}.pkl.gz", table)
+    scene = ingest(source, tmp_path / "out")
+    roundtrip.assert_same_log(scene, truth, sweeps=False)
+    assert "other" not in {track.id for track in scene.tracks}
+    assert any("4 boxes are second boxes" in note for note in scene.source.notes)
+
+
+def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source: Path, tmp_path: Path) -> None:
+    """Two poses of sequence 002 as published: x of the vehicle is its motion, its front camera looks ahead, 1.8 m up."""
+    lidar = [
+        ((0.0, 0.0, 0.0), (0.9227878803693977, 0.004463029824737836, 0.017858463809403605, -0.3848683989086472)),
+        (
+            (13.445349134518345, 13.366435600237008, -0.01126648),
+            (0.923331091922337, 0.0043070355, 0.0159992193, -0.383647193545),
+        ),
+    ]
+    camera = [
+        ((0.6558286953029124, 0.555863909647736, 1.8011768068489773),
+         (0.6548767857613946, -0.6514903276121121, 0.27678883380008457, -0.26473513174921903)),
+        ((14.293106553533605, 14.122942595987043, 1.7937735), (0.65556671, -0.6515317593, 0.2746473378642303, -0.26515560256)),
+    ]  # fmt: skip
+    for path, poses in ((source / "lidar", lidar), (source / "camera" / "front_camera", camera)):
+        entries = [
+            {"position": dict(zip("xyz", place, strict=True)), "heading": dict(zip("wxyz", turn, strict=True))}
+            for place, turn in poses
+        ]
+        (path / "poses.json").write_text(json.dumps(entries))
+        (path / "timestamps.json").write_text(json.dumps([EPOCH_S, EPOCH_S + 2.0]))
+    shutil.rmtree(source / "annotations")
+    write_frame(source / "lidar" / "01.pkl.gz", {"t": np.array([EPOCH_S + 2.0]), **{n: np.zeros(1) for n in "xyzid"}})
+    scene = ingest(source, tmp_path / "out", cameras=("front",), frames=(0, 2))
+    moved = scene.ego.world_from_ego[1, :3, 3]
+    assert np.linalg.norm(moved) == pytest.approx(18.96, abs=0.01)
+    assert abs(np.arctan2(moved[1], moved[0])) < np.deg2rad(1.0)  # along x of the scene's world
+    in_ego = invert(scene.ego.world_from_ego[0]) @ scene.frames[0].view.world_from_cam
+    assert in_ego[:3, 2] == pytest.approx([1, 0, 0], abs=0.03)  # looks forward
+    assert in_ego[:3, 0] == pytest.approx([0, -1, 0], abs=0.03)  # its right is the vehicle's
+    assert in_ego[:3, 3] == pytest.approx([0.85, 0.0, 1.8], abs=0.1)
+
+
+def test_unknown_classes_and_swapped_sizes_are_said(source: Path, tmp_path: Path, truth: Scene) -> None:
+    for index, sweep in enumerate(truth.sweeps):
+        table = cuboids(truth, sweep.time_s)
+        table["dimensions.x"], table["dimensions.y"] = table["dimensions.y"], table["dimensions.x"]
+        table["label"] = ["Hover Board", *table["label"][1:]]  # type: ignore[index]
+        write_frame(source / "annotations" / "cuboids" / f"{index:02d}.pkl.gz", table)
+    scene = ingest(source, tmp_path / "out")
+    words = " | ".join(scene.source.notes)
+    assert "'Hover Board' (1)" in words
+    assert "may be swapped" in words
+    assert scene.tracks[0].label == "hover_board"
+
+
+# --- bait and damage --------------------------------------------------------------------------------------------------
+
+
+class Asks:
+    """Pickles as a command."""
+
+    def __init__(self, words: str) -> None:
+        self.words = words
+
+    def __reduce__(self) -> object:
+        return os.system, (self.words,)
+
+
+@pytest.mark.parametrize("name", ["lidar/02.pkl.gz", "annotations/cuboids/02.pkl.gz"])
+def test_a_pickle_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, name: str) -> None:
+    bait = tmp_path / "ran"
+    (source / name).write_bytes(gzip.compress(pickle.dumps({"x": Asks(f"touch {bait}")})))
+    with pytest.raises(InputError, match=r"asks for '(posix|nt)\.system'") as caught:
+        ingest(source, tmp_path / "out")
+    assert name in caught.value.where
+    assert not bait.exists()
+    assert not (tmp_path / "out").exists()
+
+
+def points_table(change: Callable[[dict], object]) -> Callable[[Path], None]:
+    def spoil(source: Path) -> None:
+        count = 40
+        table = {"x": np.arange(count) * 1.0, "y": np.ones(count), "z": np.ones(count), "i": np.full(count, 9.0)}
+        table |= {"t": np.full(count, EPOCH_S + 0.2), "d": np.zeros(count, np.int64)}
+        change(table)
+        write_frame(source / "lidar" / "02.pkl.gz", table)
+
+    return spoil
+
+
+def box_table(truth_column: str, value: object) -> Callable[[Path], None]:
+    def spoil(source: Path) -> None:
+        table = {"uuid": ["a"], "label": ["Car"], "yaw": np.zeros(1), "stationary": np.array([False])}
+        table |= {f"position.{axis}": np.ones(1) for axis in "xyz"} | {
+            f"dimensions.{axis}": np.ones(1) for axis in "xyz"
+        }
+        table[truth_column] = np.array([value])
+        write_frame(source / "annotations" / "cuboids" / "02.pkl.gz", table)
+
+    return spoil
+
+
+def json_entry(name: str, change: Callable[[list], object]) -> Callable[[Path], None]:
+    def spoil(source: Path) -> None:
+        values = json.loads((source / name).read_text())
+        change(values)
+        (source / name).write_text(json.dumps(values))
+
+    return spoil
+
+
+def times_scaled(factor: float) -> Callable[[Path], None]:
+    return json_entry("lidar/timestamps.json", lambda v: v.__setitem__(slice(None), [x * factor for x in v]))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda s: (s / "camera/front_camera/03.png").unlink(), "front_camera lacks 3"),
+        (lambda s: (s / "lidar/01.pkl.gz").unlink(), "lidar lacks 1"),
+        (lambda s: (s / "annotations/cuboids/01.pkl.gz").unlink(), "a frame has no boxes"),
+        (lambda s: (s / "lidar/02.pkl.gz").write_bytes((s / "lidar/02.pkl.gz").read_bytes()[:5000]), "cut off|damaged"),
+        (lambda s: (s / "lidar/02.pkl.gz").write_bytes(b""), "cut off"),
+        (lambda s: shutil.copy(s / "annotations/cuboids/02.pkl.gz", s / "lidar/02.pkl.gz"), "table lacks columns"),
+        (lambda s: shutil.copy(s / "lidar/01.pkl.gz", s / "lidar/04.pkl.gz"), "do not belong to their frame"),
+        (points_table(lambda t: t.update(t=t["t"] * 1000)), "do not belong to their frame"),
+        (points_table(lambda t: t.update(d=t["d"] + 2)), "LiDAR that does not exist"),
+        (points_table(lambda t: t["z"].__setitem__(3, np.nan)), "not finite"),
+        (points_table(lambda t: t.update(x=["a"] * 40)), "not of numbers"),
+        (box_table("dimensions.y", 0.0), "size makes no sense"),
+        (box_table("dimensions.y", -3.0), "size makes no sense"),
+        (box_table("dimensions.y", 4500.0), "size makes no sense"),
+        (box_table("yaw", np.inf), "not finite"),
+        (times_scaled(1000), "another unit"),
+        (json_entry("lidar/timestamps.json", lambda v: v.pop()), "does not cover"),
+        (json_entry("lidar/timestamps.json", lambda v: v.__setitem__(2, v[1])), "do not increase"),
+        (json_entry("lidar/timestamps.json", lambda v: v.__setitem__(2, "soon")), "not numbers"),
+        (json_entry("camera/front_camera/timestamps.json", lambda v: v.__setitem__(slice(None), [x + 50 for x in v])), "share a clock"),
+        (json_entry("lidar/poses.json", lambda v: v[2]["heading"].update(w=3.0)), "length 1"),
+        (json_entry("lidar/poses.json", lambda v: v[2]["position"].pop("x")), "pose is incomplete"),
+        (json_entry("camera/front_camera/poses.json", lambda v: v[2]["heading"].update(w=None)), "pose"),
+        (json_entry("camera/front_camera/intrinsics.json", lambda v: v.pop("fy")), "intrinsics are incomplete"),
+        (lambda s: (s / "camera/front_camera/poses.json").write_text("[{"), "not valid JSON"),
+    ],
+)  # fmt: skip
+def test_spoilt_logs_are_refused_in_words(
+    source: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
+) -> None:
+    spoil(source)
+    with pytest.raises(InputError) as caught:
+        ingest(source, tmp_path / "out")
+    assert re.search(words, str(caught.value)), str(caught.value)
+    assert caught.value.where
+    assert not (tmp_path / "out").exists()
+
+
+def test_incomplete_frames_can_be_skipped(source: Path, tmp_path: Path) -> None:
+    (source / "camera" / CAMERA_OF["front"] / "03.png").unlink()
+    (source / "annotations" / "cuboids" / "01.pkl.gz").unlink()
+    scene = ingest(source, tmp_path / "out", skip_missing=True)
+    assert len(scene.frames_of("front")) == 4
+    assert scene.frames_of("front")[3].view.time_s == pytest.approx(0.4)
+
+
+def test_a_log_without_boxes_or_front_camera_is_still_one(source: Path, tmp_path: Path) -> None:
+    shutil.rmtree(source / "annotations")
+    shutil.rmtree(source / "camera" / "front_camera")
+    scene = ingest(source, tmp_path / "out")
+    assert scene.tracks == ()
+    assert set(scene.cameras) == {"front_left"}
+    assert any("no boxes" in note for note in scene.source.notes)
+
+
+def test_the_writer_of_these_tests_turns_yaw_as_documented() -> None:
+    """Yaw 0 looks along y, and a quarter turn left of it along -x."""
+    track = Track("a", "car", [4, 2, 1.5], [0.0], invert(SOURCE_FROM_WORLD)[None] @ yaw_matrix(np.pi / 2))
+    scene = type("Log", (), {"tracks": (track,)})()
+    assert cuboids(scene, 0.0)["yaw"] == pytest.approx([0.0])  # type: ignore[arg-type]
+    assert yaw_of(yaw_matrix(np.pi)) == pytest.approx(np.pi)
+    heading = pose_entry(yaw_matrix(np.pi / 2))["heading"]
+    assert (heading["w"], heading["z"]) == pytest.approx((np.sqrt(0.5), np.sqrt(0.5)))

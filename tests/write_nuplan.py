@@ -1,0 +1,147 @@
+"""A log as a nuPlan database with sensor blobs, written after the published schema; independent of the importer."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+import sqlite3
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from mudg.base.geometry import invert, yaw_matrix, yaw_of
+from mudg.base.types import Scene
+from mudg.data.scenefile import read_image, read_points
+
+LOG = "2021.05.12.22.00.38_veh-35_01008_01518"
+EPOCH_US = 1_620_857_890_123_456
+IMAGE_DELAY_US = 16_667
+SOURCE_FROM_WORLD = yaw_matrix(0.8, (331_200.0, 4_690_300.0, 12.5))
+CAMERA_OF = {"front": "CAM_F0", "front_left": "CAM_L0"}
+TABLES = """
+CREATE TABLE log (token BLOB PRIMARY KEY, vehicle_name, date, timestamp INTEGER, logfile VARCHAR(64), location, map_version);
+CREATE TABLE ego_pose (token BLOB PRIMARY KEY, timestamp INTEGER, x FLOAT, y FLOAT, z FLOAT, qw FLOAT, qx FLOAT, qy FLOAT,
+    qz FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, epsg INTEGER, log_token BLOB);
+CREATE TABLE camera (token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR(64), model, translation BLOB, rotation BLOB,
+    intrinsic BLOB, distortion BLOB, width INTEGER, height INTEGER);
+CREATE TABLE image (token BLOB PRIMARY KEY, next_token BLOB, prev_token BLOB, ego_pose_token BLOB, camera_token BLOB,
+    filename_jpg VARCHAR(128), timestamp INTEGER);
+CREATE TABLE lidar (token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR(64), model, translation BLOB, rotation BLOB);
+CREATE TABLE lidar_pc (token BLOB PRIMARY KEY, next_token BLOB, prev_token BLOB, ego_pose_token BLOB, lidar_token BLOB,
+    scene_token BLOB, filename VARCHAR(128), timestamp INTEGER);
+CREATE TABLE lidar_box (token BLOB PRIMARY KEY, lidar_pc_token BLOB, track_token BLOB, next_token BLOB, prev_token BLOB,
+    x FLOAT, y FLOAT, z FLOAT, width FLOAT, length FLOAT, height FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, yaw FLOAT,
+    confidence FLOAT);
+CREATE TABLE track (token BLOB PRIMARY KEY, category_token BLOB, width FLOAT, length FLOAT, height FLOAT);
+CREATE TABLE category (token BLOB PRIMARY KEY, name VARCHAR(64), description TEXT);
+CREATE TABLE scene (token BLOB PRIMARY KEY, log_token BLOB, name TEXT, goal_ego_pose_token BLOB, roadblock_ids TEXT);
+"""
+
+
+def token(*words: object) -> bytes:
+    """Eight bytes, the same for the same words."""
+    return hashlib.sha256(repr(words).encode()).digest()[:8]
+
+
+def wxyz(pose: NDArray[np.float64]) -> list[float]:
+    """Rotation as the data set's quaternion."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    return [w, x, y, z]
+
+
+def pcd(xyz: NDArray[np.floating], intensity: NDArray[np.floating]) -> bytes:
+    """A merged cloud: x y z intensity ring lidar_info, binary, with bytes behind the end as the data set has them."""
+    layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("ring", "u1"), ("lidar_info", "<i4")]
+    rows = np.zeros(len(xyz), layout)
+    for axis, name in enumerate("xyz"):
+        rows[name] = xyz[:, axis]
+    rows["intensity"] = np.round(intensity * 255)
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity ring lidar_info\nSIZE 4 4 4 1 1 4\n"
+        f"TYPE F F F U U I\nCOUNT 1 1 1 1 1 1\nWIDTH {len(xyz)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(xyz)}\n"
+        "DATA binary\n"
+    )
+    return header.encode() + rows.tobytes() + b"\0" * 32
+
+
+def write_nuplan(
+    truth: Scene,
+    root: Path,
+    *,
+    distortion: Sequence[float] = (0.0,) * 5,
+    jpeg: bool = False,
+    cameras: Mapping[str, str] | None = None,
+) -> Path:
+    """``root/splits/mini/<log>.db`` and ``root/sensor_blobs``; two scenes of the log. Returns the database."""
+    database = root / "splits" / "mini" / f"{LOG}.db"
+    database.parent.mkdir(parents=True)
+    blobs = root / "sensor_blobs" / LOG
+    connection = sqlite3.connect(database)
+    connection.executescript(TABLES)
+
+    def add(table: str, **row: object) -> None:
+        marks = ", ".join("?" * len(row))
+        connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
+
+    add("log", token=token("log"), logfile=LOG, location="here", timestamp=EPOCH_US)
+    add("category", token=token("vehicle"), name="vehicle")
+    for name in ("scene-0000", "scene-0001"):
+        add("scene", token=token(name), log_token=token("log"), name=name)
+    for time_s, pose in zip(truth.ego.times_s, truth.ego.world_from_ego, strict=True):
+        pose = SOURCE_FROM_WORLD @ pose
+        qw, qx, qy, qz = wxyz(pose)
+        time_us = us(float(time_s))
+        add("ego_pose", token=token("ego", time_us), timestamp=time_us, x=pose[0, 3], y=pose[1, 3], z=pose[2, 3],
+            qw=qw, qx=qx, qy=qy, qz=qz)  # fmt: skip
+    ego = truth.ego.pose_at(truth.sweeps[0].time_s)
+    assert ego is not None
+    mount = invert(ego) @ truth.sweeps[0].world_from_lidar
+    add("lidar", token=token("lidar"), channel="MergedPointCloud", translation=pickle.dumps(mount[:3, 3].tolist()),
+        rotation=pickle.dumps(wxyz(mount)))  # fmt: skip
+    for channel, name in (cameras or {channel: name for name, channel in CAMERA_OF.items()}).items():
+        camera, frames = truth.cameras[name], truth.frames_of(name)
+        mount = invert(ego) @ frames[0].view.world_from_cam
+        k = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
+        add("camera", token=token(channel), channel=channel, width=camera.width, height=camera.height,
+            translation=pickle.dumps(mount[:3, 3].tolist()), rotation=pickle.dumps(wxyz(mount)), intrinsic=pickle.dumps(k),
+            distortion=pickle.dumps(list(distortion)))  # fmt: skip
+        (blobs / channel).mkdir(parents=True)
+        for index, frame in enumerate(frames):
+            time_us = us(frame.view.time_s)
+            file = f"{LOG}/{channel}/{token(channel, index).hex()}.jpg"
+            buffer = io.BytesIO()
+            Image.fromarray(read_image(truth, frame)).save(buffer, "JPEG" if jpeg else "PNG", quality=95, subsampling=0)
+            (root / "sensor_blobs" / file).write_bytes(buffer.getvalue())
+            add("image", token=token("image", channel, index), camera_token=token(channel), filename_jpg=file,
+                timestamp=time_us - IMAGE_DELAY_US, ego_pose_token=token("ego", time_us))  # fmt: skip
+    for track in truth.tracks:
+        add("track", token=token(track.id), category_token=token("vehicle"))
+    (blobs / "MergedPointCloud").mkdir(parents=True)
+    for index, sweep in enumerate(truth.sweeps):
+        time_us, cloud = us(sweep.time_s), token("cloud", index)
+        file = f"{LOG}/MergedPointCloud/{cloud.hex()}.pcd"
+        points = read_points(truth, sweep)
+        (root / "sensor_blobs" / file).write_bytes(pcd(points.xyz, points.intensity))
+        add("lidar_pc", token=cloud, ego_pose_token=token("ego", time_us), lidar_token=token("lidar"), filename=file,
+            scene_token=token("scene-0000" if index < 3 else "scene-0001"), timestamp=time_us)  # fmt: skip
+        for track in truth.tracks:
+            pose = track.pose_at(sweep.time_s)
+            assert pose is not None
+            pose = SOURCE_FROM_WORLD @ pose
+            length, width, height = track.size_m.tolist()
+            add("lidar_box", token=token("box", track.id, index), lidar_pc_token=cloud, track_token=token(track.id),
+                x=pose[0, 3], y=pose[1, 3], z=pose[2, 3], yaw=yaw_of(pose), length=length, width=width, height=height,
+                confidence=0.9)  # fmt: skip
+    connection.commit()
+    connection.close()
+    return database
+
+
+def us(time_s: float) -> int:
+    """Time of the log's clock."""
+    return EPOCH_US + round(time_s * 1e6)
