@@ -23,6 +23,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, yaw_matrix, yaw_of
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers.box_keys import clip_track
+from mudg.data.importers.box_times import BoxTimes
 from mudg.data.importers.common import for_each
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.options import ImportOptions, holdout_split
@@ -32,6 +33,7 @@ from mudg.data.scenefile import SceneWriter
 Matrix = NDArray[np.float64]
 
 MAX_SPEED_M_S: Final = 100.0
+_SPEED_OVER_S: Final = 0.05
 _LEAST_UPRIGHT: Final = 0.5
 _EGO_MARGIN_S: Final = 0.6
 _EPOCH_S: Final = (1e8, 4.1e9)
@@ -89,6 +91,9 @@ class DriveLog:
 def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     """Write the chosen frames of ``drive`` as a scene at ``out``.
 
+    Boxes of moving objects are brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep
+    counts as one moment, without point times, and boxes stay as drawn.
+
     Images whose size is kept are copied byte for byte, after a check that they decode to their camera's size. At most two
     images or sweeps per worker are in memory, beside the few that wait for the disk.
 
@@ -105,6 +110,9 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     world_from_map = world_from_first(ego.world_from_ego[0])
     fits = {name: fit_images(camera, options) for name, camera in drive.cameras.items()}
     notes = [*drive.source.notes, *(fit.words for fit in fits.values() if fit.words)]
+    seen = BoxTimes([track for track in drive.tracks if clip_track(track, start_s, end_s) is not None])
+    if options.untwist == "no":
+        notes.append("sweeps count as moments: point times are left out")
     if options.frames is not None:
         notes.append(f"frames {options.frames[0]} to {options.frames[1] - 1} of camera {drive.reference}")
     for note in notes:
@@ -122,13 +130,16 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
                 writer.add_frame(ids[record], view, fit.image(record.path, str(record.path)))
                 return
             points = record.read()
+            if options.untwist == "no":
+                points = SweepPoints(points.xyz, points.intensity, np.zeros_like(points.dt_s))
+            seen.see(record.time_s, record.map_from_lidar, points)
             if len(points.xyz) == 0:
                 log.warn(f"{drive.source.dataset}: {record.path} has no points")
             writer.add_sweep(ids[record], record.sensor, time_s, world_from_map @ record.map_from_lidar, points)
 
         title = f"importing {drive.source.dataset}"
         for_each(records, convert, title=title, workers=options.workers, name=lambda record: str(record.path))
-        for track in drive.tracks:
+        for track in seen.at_sweep_times():
             kept = clip_track(track, start_s, end_s)
             if kept is not None:
                 poses = world_from_map @ kept.world_from_object
@@ -336,19 +347,23 @@ def check_motion(ego: EgoPath, where: str) -> None:
             got=f"its z axis rises by {upright:.2f} per metre",
             remedy="check the order of quaternions (w, x, y, z) and the axes",
         )
-    if len(ego.times_s) > 1:
-        steps = np.diff(ego.times_s)
-        # pose noise over a fraction of a millisecond is no speed
-        speed = np.linalg.norm(np.diff(ego.world_from_ego[:, :3, 3], axis=0), axis=1) / np.maximum(steps, 5e-3)
-        at = int(speed.argmax())
-        if speed[at] > MAX_SPEED_M_S:
-            raise InputError(
-                "the vehicle moves impossibly fast",
-                where=where,
-                got=f"{speed[at]:.0f} m/s at {ego.times_s[at] - ego.times_s[0]:.3f} s",
-                expected=f"under {MAX_SPEED_M_S:.0f} m/s",
-                remedy="check the units of times and translations, and that all poses are of one log",
-            )
+    if len(ego.times_s) < 2:
+        return
+    # over a twentieth of a second at least: pose noise over less is no speed
+    later = np.minimum(np.searchsorted(ego.times_s, ego.times_s + _SPEED_OVER_S), len(ego.times_s) - 1)
+    pairs = np.flatnonzero(ego.times_s[later] - ego.times_s >= _SPEED_OVER_S)
+    first, last = (pairs, later[pairs]) if len(pairs) else (np.array([0]), np.array([len(ego.times_s) - 1]))
+    places = ego.world_from_ego[:, :3, 3]
+    speed = np.linalg.norm(places[last] - places[first], axis=1) / (ego.times_s[last] - ego.times_s[first])
+    at = int(speed.argmax())
+    if speed[at] > MAX_SPEED_M_S:
+        raise InputError(
+            "the vehicle moves impossibly fast",
+            where=where,
+            got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
+            expected=f"under {MAX_SPEED_M_S:.0f} m/s",
+            remedy="check the units of times and translations, and that all poses are of one log",
+        )
 
 
 def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:
