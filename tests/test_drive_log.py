@@ -33,7 +33,7 @@ def made(folder: Path, *, offset_s: float = 0.03) -> DriveLog:
     Image.new("RGB", (32, 16), (9, 99, 199)).save(folder / "image.png")
 
     def place(time_s: float) -> np.ndarray:
-        return yaw_matrix(0.5, (1000 + 10 * time_s, 50.0, 7.0))
+        return yaw_matrix(0.5, (1000 + 10 * time_s * np.cos(0.5), 50.0 + 10 * time_s * np.sin(0.5), 7.0))
 
     cameras = {name: Camera(name, 32, 16, 30.0, 30.0, 16.0, 8.0) for name in "abc"}
     times = {"a": [0.1 * n for n in range(6)], "b": [0.1 * n + offset_s for n in range(6)], "c": [0.31]}
@@ -203,3 +203,13 @@ def test_boxes_without_returns_take_the_delay_of_their_neighbours_and_standing_o
     moved, kept = times.at_sweep_times()
     assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
     assert kept is standing
+
+
+def test_a_vehicle_that_slides_is_refused_and_one_that_reverses_is_not(tmp_path: Path) -> None:
+    drive = made(tmp_path / "log")
+    sliding = EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(0.8))
+    drive_log.check_motion(drive.ego, "log")
+    with pytest.raises(InputError, match="where it looks") as caught:
+        drive_log.check_motion(sliding, "log")
+    assert "46 degrees" in caught.value.got
+    drive_log.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")

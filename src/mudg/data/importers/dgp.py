@@ -330,11 +330,10 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     content = store.read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            size = sum(item.file_size for item in archive.infolist())
-        if size > _MAX_CLOUD_BYTES:
-            raise InputError("cloud is too large", where=where, got=f"{size} bytes unpacked")
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            data = arrays["data"]
+            size = archive.getinfo("data.npy").file_size
+            if size > _MAX_CLOUD_BYTES:
+                raise InputError("cloud is too large", where=where, got=f"{size} bytes unpacked")
+            data = np.lib.format.read_array(io.BytesIO(archive.read("data.npy")), allow_pickle=False)
     except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError) as error:
         raise InputError(
             "cloud is no npz file with an array 'data', or is cut off",

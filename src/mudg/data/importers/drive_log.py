@@ -35,6 +35,8 @@ Matrix = NDArray[np.float64]
 MAX_SPEED_M_S: Final = 100.0
 _SPEED_OVER_S: Final = 0.05
 _LEAST_UPRIGHT: Final = 0.5
+_DRIVES_M_S: Final = 1.0
+_LEAST_ALONG: Final = 0.8
 _EGO_MARGIN_S: Final = 0.6
 _EPOCH_S: Final = (1e8, 4.1e9)
 """Seconds since 1970 that a recording may carry: 1973 to 2099."""
@@ -337,7 +339,7 @@ def check_sensor_times(drive: DriveLog) -> None:
 
 
 def check_motion(ego: EgoPath, where: str) -> None:
-    """Refuse a vehicle that drives impossibly fast or lies on its side: units or the order of values are wrong then."""
+    """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are wrong then."""
     upright = float(np.median(ego.world_from_ego[:, 2, 2]))
     if upright < _LEAST_UPRIGHT:
         raise InputError(
@@ -353,8 +355,8 @@ def check_motion(ego: EgoPath, where: str) -> None:
     later = np.minimum(np.searchsorted(ego.times_s, ego.times_s + _SPEED_OVER_S), len(ego.times_s) - 1)
     pairs = np.flatnonzero(ego.times_s[later] - ego.times_s >= _SPEED_OVER_S)
     first, last = (pairs, later[pairs]) if len(pairs) else (np.array([0]), np.array([len(ego.times_s) - 1]))
-    places = ego.world_from_ego[:, :3, 3]
-    speed = np.linalg.norm(places[last] - places[first], axis=1) / (ego.times_s[last] - ego.times_s[first])
+    steps = ego.world_from_ego[last, :3, 3] - ego.world_from_ego[first, :3, 3]
+    speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
     at = int(speed.argmax())
     if speed[at] > MAX_SPEED_M_S:
         raise InputError(
@@ -364,6 +366,18 @@ def check_motion(ego: EgoPath, where: str) -> None:
             expected=f"under {MAX_SPEED_M_S:.0f} m/s",
             remedy="check the units of times and translations, and that all poses are of one log",
         )
+    drives = speed > _DRIVES_M_S
+    if drives.any():
+        forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
+        along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
+        if along < _LEAST_ALONG:
+            raise InputError(
+                "the vehicle does not drive where it looks",
+                where=where,
+                expected="vehicle axes x forward, y left, z up",
+                got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
+                remedy="check the order of quaternions (w, x, y, z) and the axes",
+            )
 
 
 def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:

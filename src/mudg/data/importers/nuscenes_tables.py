@@ -95,7 +95,8 @@ def _record_around(buffer: bytes, at: int) -> tuple[int, int]:
     return start, end
 
 
-_STRUCTURE: Final = re.compile(rb'"(?:[^"\\]|\\.)*"|[{}\[\]]', re.DOTALL)
+_STRUCTURE: Final = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*(?:"|\\?\Z)|[{}\[\]]', re.DOTALL)
+"""A text (to its closing quote, or to the end of the buffer) or a bracket."""
 
 
 def _object_end(buffer: bytes, start: int) -> int | None:
