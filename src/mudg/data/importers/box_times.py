@@ -42,6 +42,9 @@ class BoxTimes:
         if not np.any(points.dt_s):
             return
         lidar_from_map = invert(map_from_lidar)
+        order = np.argsort(points.xyz[:, 0])  # once a sweep: each box then looks at a slice of it only
+        xyz, dt_s = points.xyz[order], points.dt_s[order]
+        x, y = np.ascontiguousarray(xyz[:, 0]), np.ascontiguousarray(xyz[:, 1])
         for index in self._moving:
             track = self._tracks[index]
             key = int(np.searchsorted(track.times_s, time_s - _SAME_S))
@@ -50,11 +53,12 @@ class BoxTimes:
             lidar_from_box = lidar_from_map @ track.world_from_object[key]
             half = track.size_m / 2 + _GROWTH_M
             reach = float(np.linalg.norm(half))
-            center = lidar_from_box[:2, 3]
-            near = np.flatnonzero((np.abs(points.xyz[:, :2] - center.astype(np.float32)) < reach).all(1))
-            inside = (np.abs(transform_points(invert(lidar_from_box), points.xyz[near])) < half).all(1)
+            center_x, center_y = float(lidar_from_box[0, 3]), float(lidar_from_box[1, 3])
+            first, end = np.searchsorted(x, [np.float32(center_x - reach), np.float32(center_x + reach)])
+            near = first + np.flatnonzero(np.abs(y[first:end] - np.float32(center_y)) < reach)
+            inside = (np.abs(transform_points(invert(lidar_from_box), xyz[near])) < half).all(1)
             if inside.any():
-                self._late_s[index, key] = float(points.dt_s[near[inside]].mean(dtype=np.float64))
+                self._late_s[index, key] = float(dt_s[near[inside]].mean(dtype=np.float64))
 
     def at_sweep_times(self) -> list[Track]:
         """The tracks with boxes at their stamps, in the order given.
