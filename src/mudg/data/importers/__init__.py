@@ -91,5 +91,8 @@ RECOGNISERS: Mapping[str, Recogniser] = {
     "nuplan": _looks_like_nuplan,
     "custom": _looks_like_custom,
     "kitti": _looks_like_kitti,
+    "nuscenes": _looks_like_nuscenes,
+    "argoverse2": _looks_like_argoverse2,
+    "dgp": _looks_like_dgp,
 }
 """Format name -> whether a folder or file looks like it (by names of files, a few bytes at most). The first that says yes wins."""

@@ -1,0 +1,398 @@
+"""Argoverse 2 importer: one log of the sensor data set.
+
+=========================================== =====================================================================
+``sensors/cameras/<camera>/<ns>.jpg``       images named by their time: seven ring cameras at 20 Hz, two stereo cameras
+``sensors/lidar/<ns>.feather``              sweeps at 10 Hz: x, y, z in the vehicle's frame, intensity, offset_ns
+``city_SE3_egovehicle.feather``             vehicle poses, at every sensor's times
+``calibration/*.feather``                   intrinsics, and where the sensors sit
+``annotations.feather``                     boxes in the vehicle's frame at the sweeps' times (not in the test split)
+=========================================== =====================================================================
+
+Images are rectified by the publisher: the coefficients k1 to k3 describe the original lens and are kept for the record only.
+Sweeps are the returns of two sensors, compensated for the vehicle's motion to the time in their name; ``dt_s`` is the file's
+``offset_ns``. They are stored in the frame of the upper sensor, so that a sweep has the origin its rays came from (the lower
+one sits about 0.1 m below it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.geometry import invert, transform_points
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
+from mudg.data.importers import box_keys, common, drive_log
+from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
+from mudg.data.importers.options import ImportOptions
+
+Matrix = NDArray[np.float64]
+Columns = Mapping[str, NDArray[Any]]
+
+LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
+RING_CAMERAS: Final = (
+    "ring_front_center",
+    "ring_front_left",
+    "ring_front_right",
+    "ring_side_left",
+    "ring_side_right",
+    "ring_rear_left",
+    "ring_rear_right",
+)
+STEREO_CAMERAS: Final = ("stereo_front_left", "stereo_front_right")
+CAMERAS: Final[Mapping[str, str]] = {
+    "ring_front_center": "front",
+    "ring_front_left": "front_left",
+    "ring_front_right": "front_right",
+    "ring_side_left": "side_left",
+    "ring_side_right": "side_right",
+    "ring_rear_left": "rear_left",
+    "ring_rear_right": "rear_right",
+    "stereo_front_left": "stereo_left",
+    "stereo_front_right": "stereo_right",
+}
+SENSOR: Final = "lidar"
+_UPPER: Final = "up_lidar"
+MAX_GAP_S: Final = 0.55
+"""Boxes come with every sweep, 10 times a second; a track that is not seen for longer than this is split."""
+NANOSECONDS: Final = 10**9
+_POSE_SLACK_S: Final = 0.02
+_MAX_OFFSET_NS: Final = 500_000_000
+_POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+
+LABELS: Final[Mapping[str, str]] = {
+    "REGULAR_VEHICLE": "car",
+    "PEDESTRIAN": "pedestrian",
+    "OFFICIAL_SIGNALER": "pedestrian",
+    "BICYCLE": "bicycle",
+    "BICYCLIST": "rider",
+    "MOTORCYCLE": "motorcycle",
+    "MOTORCYCLIST": "rider",
+    "WHEELED_RIDER": "rider",
+    "WHEELED_DEVICE": "wheeled_device",
+    "BUS": "bus",
+    "SCHOOL_BUS": "bus",
+    "ARTICULATED_BUS": "bus",
+    "LARGE_VEHICLE": "truck",
+    "BOX_TRUCK": "truck",
+    "TRUCK": "truck",
+    "TRUCK_CAB": "truck",
+    "VEHICULAR_TRAILER": "trailer",
+    "RAILED_VEHICLE": "tram",
+    "STROLLER": "stroller",
+    "WHEELCHAIR": "wheelchair",
+    "DOG": "animal",
+    "ANIMAL": "animal",
+    "BOLLARD": "bollard",
+    "CONSTRUCTION_CONE": "traffic_cone",
+    "CONSTRUCTION_BARREL": "construction_barrel",
+    "STOP_SIGN": "traffic_sign",
+    "SIGN": "traffic_sign",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign",
+    "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
+    "MESSAGE_BOARD_TRAILER": "message_board_trailer",
+    "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
+}
+"""The data set's categories in the product's words."""
+
+
+def looks_like_argoverse2(source: Path) -> bool:
+    """Whether a folder is an Argoverse 2 log, or holds some."""
+    return bool(_logs(source))
+
+
+def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one log into the scene directory ``out``; see the module text for what is read.
+
+    Args:
+        source: a log's folder, or a folder of logs.
+        options: ``sequence`` names the log (its beginning is enough) where there are several; ``frames`` counts images of
+            the first chosen camera; ``cameras`` by either name, the seven ring cameras by default.
+
+    Raises:
+        UsageError: there are several logs and none was chosen, or there is no such log or camera.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+        ResourceError: pyarrow, which reads Feather files, is not installed.
+    """
+    if not source.is_dir():
+        raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
+    drive_log.refuse_untwist(options, "Argoverse 2", str(source))
+    return drive_log.write_log(read_log(_choose_log(source, options), options), out, options)
+
+
+def _logs(source: Path) -> list[Path]:
+    """Log folders: ``source`` itself, or its sub-folders."""
+    if not source.is_dir():
+        return []
+    if (source / "city_SE3_egovehicle.feather").is_file():
+        return [source]
+    return sorted(path.parent for path in source.glob("*/city_SE3_egovehicle.feather"))
+
+
+def _choose_log(source: Path, options: ImportOptions) -> Path:
+    logs = _logs(source)
+    if not logs:
+        raise InputError(
+            "no Argoverse 2 log found",
+            where=str(source),
+            expected="city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders",
+            got=", ".join(sorted(path.name for path in source.iterdir())[:10]) or "an empty folder",
+            remedy="give the folder of one log of the sensor data set",
+        )
+    matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
+    if len(matching) != 1:
+        names = ", ".join(path.name for path in logs[:8]) + (f", ... ({len(logs)} in all)" if len(logs) > 8 else "")
+        raise UsageError(
+            "the folder holds several logs" if matching else "there is no such log",
+            where=str(source),
+            expected=f"--sequence with one of {names}",
+            got=options.sequence or "none chosen",
+        )
+    return matching[0]
+
+
+def read_log(folder: Path, options: ImportOptions) -> DriveLog:
+    """What the log's tables and file names tell; no image or sweep is opened."""
+    where = str(folder)
+    log.info(f"argoverse2: {folder}")
+    image_folder, sweep_folder = folder / "sensors" / "cameras", folder / "sensors" / "lidar"
+    there = {raw: name for raw, name in CAMERAS.items() if (image_folder / raw).is_dir()}
+    if not there:
+        raise InputError(
+            "the log has no images",
+            where=str(image_folder),
+            expected="folders ring_front_center, ring_front_left, ... with images named by nanoseconds",
+            remedy="download the sensor data set's camera archives, too; a scene is made of images",
+        )
+    absent = [name for name in RING_CAMERAS if name not in there]
+    if absent and not options.cameras and not options.skip_missing:
+        raise InputError(
+            "cameras are missing in the log",
+            where=str(image_folder),
+            got=f"no folder {', '.join(absent)}",
+            expected="seven ring cameras",
+            remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing",
+        )
+    chosen = drive_log.choose_cameras(options, there, [CAMERAS[name] for name in RING_CAMERAS], where)
+    files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
+    scans = _files_by_time(sweep_folder, (".feather",)) if sweep_folder.is_dir() else {}
+    stamps = [stamp for found in (*files.values(), scans) for stamp in found]
+    if not stamps:
+        raise InputError("the log has no images", where=str(image_folder))
+    zero_ns = min(stamps)
+    mounts = read_mounts(folder / "calibration" / "egovehicle_SE3_sensor.feather")
+    ego = read_ego(folder / "city_SE3_egovehicle.feather", zero_ns)
+
+    def map_from_ego(stamp: int) -> Matrix:
+        return drive_log.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, ego_where)
+
+    ego_where = str(folder / "city_SE3_egovehicle.feather")
+    images = [
+        ImageRecord(name, (stamp - zero_ns) / NANOSECONDS, map_from_ego(stamp) @ mount, path)
+        for name, found in files.items()
+        for mount in [_mount(mounts, chosen[name], where)]
+        for stamp, path in found.items()
+    ]
+    upper = _mount(mounts, _UPPER, where) if scans else np.eye(4)
+    sweeps = [
+        SweepRecord(
+            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper)
+        )
+        for t, path in scans.items()
+    ]
+    notes = [] if sweeps else ["no LiDAR sweeps in the log"]
+    tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns)
+    cameras = read_cameras(folder / "calibration" / "intrinsics.feather", chosen)
+    source = Source("argoverse2", LICENCE, None, (*notes, *track_notes))
+    name = folder.resolve().name
+    return DriveLog(name, cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+
+
+def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    """Files called by nanoseconds, in order of time."""
+    found = sorted(
+        (int(path.stem), path) for path in folder.iterdir() if path.stem.isdigit() and path.suffix.lower() in suffixes
+    )
+    drive_log.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
+    return dict(found)
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+
+
+def read_feather(path: Path, columns: Sequence[str]) -> Columns:
+    """Named columns of a Feather (Arrow IPC) file as arrays of one length.
+
+    Raises:
+        ResourceError: pyarrow is not installed.
+        InputError: missing, cut off, without one of the columns, or with empty values.
+    """
+    try:
+        import pyarrow
+        import pyarrow.feather
+    except ImportError as error:
+        raise ResourceError(
+            "reading Argoverse 2 needs pyarrow, which is not installed",
+            where=str(path),
+            remedy="pip install 'mudg[data]'",
+        ) from error
+    if not path.is_file():
+        raise InputError("file not found", where=str(path), remedy="is the log complete?")
+    try:
+        table = pyarrow.feather.read_table(str(path), memory_map=False)
+        missing = [name for name in columns if name not in table.schema.names]
+        if missing:
+            raise InputError(
+                "table lacks columns",
+                where=str(path),
+                expected=", ".join(columns),
+                got=", ".join(table.schema.names),
+                remedy="is this a file of another data set or version?",
+            )
+        empty = [name for name in columns if table.column(name).null_count]
+        if empty:
+            raise InputError("table has rows without a value", where=f"{path}: {', '.join(empty)}")
+        return {name: table.column(name).to_numpy() for name in columns}
+    except (pyarrow.ArrowException, OSError, MemoryError) as error:
+        raise InputError(
+            "file is no Feather table, or is cut off", where=str(path), got=str(error), remedy="copy the file again"
+        ) from error
+
+
+def _numbers(columns: Columns, names: Sequence[str], where: str) -> Matrix:
+    """Columns as finite f64[n, k]."""
+    try:
+        table = np.stack([columns[name].astype(np.float64) for name in names], 1)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            "column does not hold numbers", where=f"{where}: {', '.join(names)}", got=str(error)
+        ) from error
+    bad = ~np.isfinite(table).all(1)
+    if bad.any():
+        raise InputError(
+            "table holds values that are not finite",
+            where=f"{where}: {', '.join(names)}",
+            got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}",
+        )
+    return table
+
+
+def _stamps(columns: Columns, where: str) -> NDArray[np.int64]:
+    stamps = columns["timestamp_ns"]
+    if stamps.dtype.kind not in "iu":
+        raise InputError("time stamps are not whole numbers", where=f"{where}: timestamp_ns", got=str(stamps.dtype))
+    stamps = stamps.astype(np.int64)
+    drive_log.check_epoch(stamps, NANOSECONDS, f"{where}: timestamp_ns")
+    return stamps
+
+
+def _poses(columns: Columns, where: str) -> list[Matrix]:
+    rows = _numbers(columns, _POSE, where)
+    return [common.pose_from_quaternion(row[:4], row[4:], f"{where}: row {index}") for index, row in enumerate(rows)]
+
+
+def read_ego(path: Path, zero_ns: int) -> EgoPath:
+    """Vehicle poses in the city's frame; times in seconds since ``zero_ns``."""
+    columns = read_feather(path, ("timestamp_ns", *_POSE))
+    stamps = _stamps(columns, str(path))
+    if len(stamps) == 0:
+        raise InputError("table of vehicle poses is empty", where=str(path))
+    return drive_log.ego_path([(int(t) - zero_ns) / NANOSECONDS for t in stamps], _poses(columns, str(path)))
+
+
+def read_mounts(path: Path) -> dict[str, Matrix]:
+    """Sensor name -> ego-from-sensor f64[4, 4]."""
+    columns = read_feather(path, ("sensor_name", *_POSE))
+    return dict(zip(map(str, columns["sensor_name"]), _poses(columns, str(path)), strict=True))
+
+
+def _mount(mounts: Mapping[str, Matrix], sensor: str, where: str) -> Matrix:
+    if sensor not in mounts:
+        raise InputError(
+            "calibration lacks a sensor",
+            where=f"{where}/calibration/egovehicle_SE3_sensor.feather",
+            expected=sensor,
+            got=", ".join(mounts),
+        )
+    return mounts[sensor]
+
+
+def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
+    """Cameras by scene name. Pixel centres are whole numbers in the data set: half a pixel is added here.
+
+    ``distortion`` is the original lens in OpenCV's order (k1, k2, p1, p2, k3); the images are rectified.
+    """
+    where = str(path)
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
+    columns = read_feather(path, ("sensor_name", *names))
+    rows = dict(zip(map(str, columns["sensor_name"]), _numbers(columns, names, where).tolist(), strict=True))
+    cameras = {}
+    for name, raw in chosen.items():
+        if raw not in rows:
+            raise InputError("calibration lacks a camera", where=where, expected=raw, got=", ".join(rows))
+        fx, fy, cx, cy, k1, k2, k3, width, height = rows[raw]
+        lens = (k1, k2, 0.0, 0.0, k3)
+        cameras[name] = Camera(name, int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, distortion=lens)
+    return cameras
+
+
+def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], list[str]]:
+    """Tracks in the city's frame, and notes; no file is no tracks."""
+    where = str(path)
+    if not path.is_file():
+        return [], ["no annotations in this log: everything counts as static"]
+    names = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE)
+    columns = read_feather(path, names)
+    stamps, poses = _stamps(columns, where), _poses(columns, where)
+    sizes = _numbers(columns, ("length_m", "width_m", "height_m"), where)
+    map_from_ego = {
+        int(t): drive_log.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where) for t in set(stamps)
+    }
+    unknown: set[str] = set()
+    boxes = []
+    for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+        label = box_keys.label_of(str(columns["category"][row]), LABELS, unknown)
+        size = box_keys.box_size(*sizes[row], f"{where}: row {row}")
+        time_s = (int(stamp) - zero_ns) / NANOSECONDS
+        track = str(columns["track_uuid"][row])
+        boxes.append(box_keys.BoxKey(track, label, time_s, size, map_from_ego[int(stamp)] @ pose))
+    box_keys.warn_unknown("argoverse2", unknown)
+    return box_keys.build_tracks(boxes, MAX_GAP_S, where)
+
+
+def read_sweep(path: Path, ego_from_lidar: Matrix) -> SweepPoints:
+    """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
+
+    Raises:
+        InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
+    """
+    where = str(path)
+    columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
+    xyz_ego = _numbers(columns, ("x", "y", "z"), where)
+    intensity = _numbers(columns, ("intensity",), where)[:, 0]
+    offset_ns = columns["offset_ns"]
+    if offset_ns.dtype.kind not in "iu" or (
+        len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
+    ):
+        raise InputError(
+            "point times are no nanoseconds of one turn",
+            where=f"{where}: offset_ns",
+            expected="whole nanoseconds since the sweep's time, under half a second",
+            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}",
+        )
+    if len(intensity) and (intensity.min() < 0 or intensity.max() > 255):
+        raise InputError(
+            "intensity is out of range",
+            where=where,
+            expected="0 to 255",
+            got=f"{intensity.min():g} to {intensity.max():g}",
+        )
+    xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
+    dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
+    return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s)

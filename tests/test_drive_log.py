@@ -1,0 +1,215 @@
+"""Logs with sensors on their own clocks: choosing frames, the split, missing files, boxes brought to the sweeps' times."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import yaw_matrix
+from mudg.base.types import Camera, EgoPath, Source, SweepPoints, Track
+from mudg.data.importers import box_keys, drive_log
+from mudg.data.importers.box_keys import BoxKey, build_tracks, clip_track
+from mudg.data.importers.box_times import BoxTimes
+from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, nearest_index, write_log
+from mudg.data.importers.options import ImportOptions
+
+UP = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+
+
+def points(count: int = 3) -> SweepPoints:
+    xyz = np.arange(3 * count, dtype=np.float32).reshape(-1, 3) + 5
+    return SweepPoints(xyz, np.zeros(count, np.float32), np.zeros(count, np.float32))
+
+
+def made(folder: Path, *, offset_s: float = 0.03) -> DriveLog:
+    """Camera a at 10 Hz, b at 10 Hz a little later, c with one image only; sweeps at 20 Hz; the vehicle drives 10 m/s."""
+    folder.mkdir()
+    Image.new("RGB", (32, 16), (9, 99, 199)).save(folder / "image.png")
+
+    def place(time_s: float) -> np.ndarray:
+        return yaw_matrix(0.5, (1000 + 10 * time_s * np.cos(0.5), 50.0 + 10 * time_s * np.sin(0.5), 7.0))
+
+    cameras = {name: Camera(name, 32, 16, 30.0, 30.0, 16.0, 8.0) for name in "abc"}
+    times = {"a": [0.1 * n for n in range(6)], "b": [0.1 * n + offset_s for n in range(6)], "c": [0.31]}
+    images = []
+    for name, stamps in times.items():
+        for number, time_s in enumerate(stamps):
+            path = folder / f"{name}{number}.png"
+            path.write_bytes((folder / "image.png").read_bytes())
+            images.append(ImageRecord(name, time_s, place(time_s) @ UP, path))
+    sweeps = [
+        SweepRecord("lidar", 0.05 * n, place(0.05 * n), folder / "image.png", partial(points, 3)) for n in range(11)
+    ]
+    ego = EgoPath(np.arange(-20, 80) * 0.01, np.stack([place(0.01 * n) for n in range(-20, 80)]))
+    source = Source("made", "none")
+    return DriveLog("log", cameras, "a", images[::-1], sweeps[::-1], [], ego, source, str(folder))
+
+
+def test_nearest_index_gives_ties_to_the_earlier() -> None:
+    assert nearest_index(np.array([0.0, 1.0, 4.0]), np.array([-5, 0.4, 0.5, 0.6, 2.5, 2.6, 99])).tolist() == [
+        0, 0, 0, 1, 1, 2, 2,
+    ]  # fmt: skip
+    assert nearest_index(np.array([3.0]), np.array([-1.0, 9.0])).tolist() == [0, 0]
+
+
+def test_frames_are_counted_by_the_reference_and_take_what_lies_nearest(tmp_path: Path) -> None:
+    scene = write_log(made(tmp_path / "log"), tmp_path / "out", ImportOptions(frames=(2, 4), test_every=0))
+    assert [f.id for f in scene.frames_of("a")] == ["a/000000", "a/000001"]
+    assert np.allclose([f.view.time_s for f in scene.frames_of("a")], [0.0, 0.1])  # zero is the earliest record
+    assert np.allclose([f.view.time_s for f in scene.frames_of("b")], [0.03, 0.13])
+    assert np.allclose([f.view.time_s for f in scene.frames_of("c")], [0.11])
+    assert np.allclose([s.time_s for s in scene.sweeps], [0.0, 0.05, 0.1, 0.15])  # halfway goes to the earlier frame
+    assert np.allclose(scene.ego.world_from_ego[0][:3, 3], 0)
+    assert np.allclose(scene.ego.world_from_ego[0][:3, :3], np.eye(3))
+    assert any("frames 2 to 3 of camera a" in note for note in scene.source.notes)
+
+
+def test_cameras_of_one_moment_are_held_out_together(tmp_path: Path) -> None:
+    scene = write_log(made(tmp_path / "log"), tmp_path / "out", ImportOptions(test_every=3))
+    assert sorted(i for i, s in scene.split.items() if s == "test") == ["a/000003", "b/000003", "c/000000"]
+
+
+def test_workers_and_resolution_change_nothing_but_size(tmp_path: Path) -> None:
+    drive = made(tmp_path / "log")
+    one = write_log(drive, tmp_path / "one", ImportOptions(resolution=16))
+    four = write_log(drive, tmp_path / "four", ImportOptions(resolution=16, workers=4))
+    assert (tmp_path / "one" / "scene.json").read_bytes() == (tmp_path / "four" / "scene.json").read_bytes()
+    assert (one.cameras["a"].width, four.cameras["a"].fx) == (16, 15.0)
+
+
+def test_missing_files_are_counted_per_sensor_or_left_out(tmp_path: Path) -> None:
+    drive = made(tmp_path / "log")
+    (tmp_path / "log" / "b2.png").unlink()
+    with pytest.raises(InputError, match="missing") as caught:
+        write_log(drive, tmp_path / "out", ImportOptions())
+    assert caught.value.got == "b lacks 1 (first: b2.png)"
+    assert not (tmp_path / "out").exists()
+    scene = write_log(drive, tmp_path / "out", ImportOptions(skip_missing=True))
+    assert len(scene.frames_of("b")) == 5
+
+
+def test_ranges_beyond_the_log_and_cameras_without_images_are_refused(tmp_path: Path) -> None:
+    drive = made(tmp_path / "log")
+    with pytest.raises(UsageError, match="no frame") as caught:
+        write_log(drive, tmp_path / "out", ImportOptions(frames=(6, 9)))
+    assert "0 to 5" in caught.value.expected
+    with pytest.raises(InputError, match="no images") as lacking:
+        write_log(
+            replace(drive, images=[i for i in drive.images if i.camera != "c"]), tmp_path / "out", ImportOptions()
+        )
+    assert lacking.value.got == "c"
+    twice = replace(drive, images=[*drive.images, drive.images[0]])
+    with pytest.raises(InputError, match="same time"):
+        write_log(twice, tmp_path / "out", ImportOptions())
+
+
+def test_impossible_motion_is_refused(tmp_path: Path) -> None:
+    drive = made(tmp_path / "log")
+    fast = replace(drive, ego=EgoPath(drive.ego.times_s / 1000, drive.ego.world_from_ego))
+    with pytest.raises(InputError, match="impossibly fast"):
+        write_log(fast, tmp_path / "out", ImportOptions())
+    lying = replace(drive, ego=EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ UP))
+    with pytest.raises(InputError, match="upright"):
+        write_log(lying, tmp_path / "out", ImportOptions())
+
+
+@pytest.mark.parametrize(
+    ("stamp", "per_second"),
+    [(1_532_402_927_647, 10**6), (1_532_402_927_647_951_000, 10**6), (315_966_265_259_836, 10**9)],
+)
+def test_stamps_in_another_unit_are_refused(stamp: int, per_second: int) -> None:
+    with pytest.raises(InputError, match="another unit"):
+        drive_log.check_epoch(np.array([stamp]), per_second, "table")
+    drive_log.check_epoch(np.array([1_532_402_927 * per_second, 1_532_402_947 * per_second]), per_second, "table")
+
+
+# --- tracks ---------------------------------------------------------------------------------------------------------
+
+
+def key(time_s: float, x: float, track: str = "7", size: tuple[float, float, float] = (4.0, 2.0, 1.5)) -> BoxKey:
+    return BoxKey(track, "car", time_s, size, yaw_matrix(0.0, (x, 0.0, 0.0)))
+
+
+def test_tracks_are_sorted_and_split_at_gaps() -> None:
+    tracks, notes = build_tracks([key(t, t) for t in (2.0, 0.0, 0.5, 1.0, 5.0)], 1.1, "table")
+    assert [(t.id, t.times_s.tolist()) for t in tracks] == [("7", [0.0, 0.5, 1.0, 2.0]), ("7.1", [5.0])]
+    assert notes == ["1 tracks were split where a box is not seen for more than 1.1 s"]
+    with pytest.raises(InputError, match="two boxes"):
+        build_tracks([key(1.0, 0.0), key(1.0, 1.0)], 1.1, "table")
+
+
+def test_swapped_sides_are_refused_when_most_vehicles_have_them() -> None:
+    wide = (2.0, 4.0, 1.5)
+    build_tracks([key(0, 0, "a"), key(0, 9, "b"), key(0, 20, "c", wide)], 1, "table")
+    with pytest.raises(InputError, match="swapped") as caught:
+        build_tracks([key(0, 0, "a", wide), key(0, 9, "b"), key(0, 20, "c", wide)], 1, "table")
+    assert "2 of 3" in caught.value.got
+
+
+def test_clip_keeps_one_key_beyond_each_end() -> None:
+    track = build_tracks([key(0.5 * n, n) for n in range(9)], 1, "table")[0][0]
+    kept = clip_track(track, 1.2, 2.0)
+    assert kept is not None
+    assert kept.times_s.tolist() == [1.0, 1.5, 2.0]
+    assert clip_track(track, 1.2, 2.1).times_s.tolist() == [1.0, 1.5, 2.0, 2.5]  # type: ignore[union-attr]
+    assert clip_track(track, 4.1, 5.0) is None
+    assert clip_track(track, -3.0, -0.1) is None
+
+
+def test_unknown_categories_keep_their_last_word() -> None:
+    unknown: set[str] = set()
+    assert box_keys.label_of("vehicle.hover Craft", {"vehicle.car": "car"}, unknown) == "hover_craft"
+    assert box_keys.label_of("vehicle.car", {"vehicle.car": "car"}, unknown) == "car"
+    assert unknown == {"vehicle.hover Craft"}
+
+
+def drawn(speed: float, delays: list[float], x0: float = 20.0) -> tuple[Track, list[SweepPoints]]:
+    """A car along x, boxes drawn around returns taken ``delays`` after each sweep's time; sweeps every 0.1 s at the origin."""
+    poses, sweeps = [], []
+    for number, late in enumerate(delays):
+        x = x0 + speed * (0.1 * number + late)
+        poses.append(yaw_matrix(0.0, (x, 3.0, 0.0)))
+        xyz = np.array([[x - 1.9, 3.5, 0.2], [x - 1.9, 2.5, 0.4], [60.0, 3.0, 0.0]], np.float32)
+        dt_s = np.array([late - 0.004, late + 0.004, -9.0], np.float32)
+        sweeps.append(SweepPoints(xyz, np.zeros(3, np.float32), dt_s))
+    times = 0.1 * np.arange(len(delays))
+    return Track("1", "car", np.array([4.0, 2.0, 1.5]), times, np.stack(poses)), sweeps
+
+
+@pytest.mark.parametrize(
+    "delays", [[0.08] * 6, [0.02, 0.03, 0.04, 0.05, 0.06, 0.07], [0.09, 0.1, 0.1, 0.0, 0.01, 0.02]]
+)
+def test_boxes_come_to_the_sweeps_times(delays: list[float]) -> None:
+    track, sweeps = drawn(10.0, delays)
+    times = BoxTimes([track])
+    for number, sweep in reversed(list(enumerate(sweeps))):
+        times.see(0.1 * number, np.eye(4), sweep)
+    (moved,) = times.at_sweep_times()
+    assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
+    assert np.abs(track.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() > 0.5
+
+
+def test_boxes_without_returns_take_the_delay_of_their_neighbours_and_standing_ones_stay() -> None:
+    track, sweeps = drawn(10.0, [0.08] * 6)
+    standing, _ = drawn(0.5, [0.08] * 6)
+    times = BoxTimes([track, standing])
+    times.see(0.2, np.eye(4), sweeps[2])
+    moved, kept = times.at_sweep_times()
+    assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
+    assert kept is standing
+
+
+def test_a_vehicle_that_slides_is_refused_and_one_that_reverses_is_not(tmp_path: Path) -> None:
+    drive = made(tmp_path / "log")
+    sliding = EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(0.8))
+    drive_log.check_motion(drive.ego, "log")
+    with pytest.raises(InputError, match="where it looks") as caught:
+        drive_log.check_motion(sliding, "log")
+    assert "46 degrees" in caught.value.got
+    drive_log.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")

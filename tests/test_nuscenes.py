@@ -1,0 +1,375 @@
+"""nuScenes importer: a release written from a known log, broken releases, the reader of large tables, and the real key frame."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import roundtrip
+import write_nuscenes as made
+from roundtrip import needs_native
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import invert, project, transform_points
+from mudg.base.types import Scene
+from mudg.data.importers import IMPORTERS, RECOGNISERS
+from mudg.data.importers.nuscenes import camera_from_intrinsics, point_times, read_scan
+from mudg.data.importers.nuscenes_tables import find_records, iter_records
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scenefile import read_points
+
+Rows = list[dict[str, Any]]
+
+
+def ingest(source: Path, out: Path, **options: object) -> Scene:
+    given = {"sequence": "scene-0007", "cameras": ("front", "front_left"), **options}
+    return IMPORTERS["nuscenes"](source, out, ImportOptions(**given))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
+
+
+@pytest.fixture(scope="module")
+def release(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made.write_nuscenes(truth, tmp_path_factory.mktemp("release"))
+
+
+# --- round trips ----------------------------------------------------------------------------------------------------
+
+
+@needs_native
+def test_round_trip(truth: Scene, release: Path, tmp_path: Path) -> None:
+    assert RECOGNISERS["nuscenes"](release)
+    scene = ingest(release, tmp_path / "out", untwist="no")
+    roundtrip.assert_same_log(scene, truth, labels=made.READ_BACK, dt_s=None)
+    assert scene.id == "scene-0007"
+    assert "CC BY-NC-SA" in scene.source.licence
+    assert np.allclose(scene.ego.world_from_ego[0], np.eye(4), atol=1e-9)
+
+
+@needs_native
+def test_sweeps_between_key_frames_are_read_and_boxes_are_interpolated(truth: Scene, tmp_path: Path) -> None:
+    release = made.write_nuscenes(truth, tmp_path / "release", key_every=2)
+    assert list((release / "sweeps" / "LIDAR_TOP").iterdir())
+    scene = ingest(release / "v1.0-mini", tmp_path / "out", untwist="no")  # the table folder serves, too
+    assert [len(track.times_s) for track in scene.tracks] == [3] * len(truth.tracks)
+    roundtrip.assert_same_log(scene, truth, labels=made.READ_BACK, box_pose=0.05)  # cars brake between keys
+
+
+@needs_native
+def test_frames_and_cameras_are_chosen(truth: Scene, release: Path, tmp_path: Path) -> None:
+    scene = ingest(release, tmp_path / "out", cameras=("CAM_FRONT_LEFT",), frames=(1, 3), untwist="no")
+    assert list(scene.cameras) == ["front_left"]
+    assert len(scene.frames) == len(scene.sweeps) == 2
+    seen = truth.frames_of("front_left")
+    expected = invert(seen[1].view.world_from_cam) @ seen[2].view.world_from_cam
+    found = invert(scene.frames[0].view.world_from_cam) @ scene.frames[1].view.world_from_cam
+    assert np.abs(found - expected).max() < 1e-6
+
+
+@needs_native
+def test_point_times_bring_boxes_to_the_sweeps_time(truth: Scene, release: Path, tmp_path: Path) -> None:
+    scene, plain = ingest(release, tmp_path / "out"), ingest(release, tmp_path / "plain", untwist="no")
+    dt_s = np.concatenate([read_points(scene, sweep).dt_s for sweep in scene.sweeps])
+    assert -0.05 <= dt_s.min() < -0.04 < -0.01 < dt_s.max() <= 0
+    assert not any(read_points(plain, sweep).dt_s.any() for sweep in plain.sweeps)
+    ahead = [
+        (one.world_from_object[:, :3, 3] - other.world_from_object[:, :3, 3], one)
+        for one, other in zip(scene.tracks, plain.tracks, strict=True)
+    ]
+    moved = [(step, track) for step, track in ahead if np.abs(step).max() > 0.05]
+    assert moved  # boxes are drawn where the beam met the car, up to 0.05 s before the stamp: they come forward
+    for step, track in moved:
+        travel = track.world_from_object[-1, :3, 3] - track.world_from_object[0, :3, 3]
+        assert (step @ travel > 0).all()
+        assert np.abs(step).max() <= 0.055 * np.linalg.norm(travel) / (track.times_s[-1] - track.times_s[0])
+
+
+@needs_native
+def test_riders_follow_from_attributes_and_a_release_without_boxes_has_no_tracks(
+    truth: Scene, release: Path, tmp_path: Path
+) -> None:
+    copy = shutil.copytree(release, tmp_path / "release")
+
+    def to_bicycle(rows: Rows) -> None:
+        rows[0]["name"] = "vehicle.bicycle"
+
+    made.edit(copy, "category", to_bicycle)
+    made.edit(copy, "sample_annotation", lambda rows: [r.update(attribute_tokens=[made.token("ridden")]) for r in rows])
+    scene = ingest(copy, tmp_path / "out")
+    assert "cyclist" in {track.label for track in scene.tracks}
+    (copy / "v1.0-mini" / "sample_annotation.json").unlink()
+    bare = ingest(copy, tmp_path / "bare")
+    assert bare.tracks == ()
+    assert any("no annotations" in note for note in bare.source.notes)
+
+
+@needs_native
+def test_scene_must_be_chosen_and_releases_side_by_side_are_told_apart(release: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="several scenes") as several:
+        ingest(release, tmp_path / "out", sequence="")
+    assert "scene-0001, scene-0007" in several.value.expected
+    with pytest.raises(UsageError, match="no such scene"):
+        ingest(release, tmp_path / "out", sequence="scene-0008")
+    copy = shutil.copytree(release, tmp_path / "release")
+    shutil.copytree(copy / "v1.0-mini", copy / "v1.0-trainval")
+    assert ingest(copy, tmp_path / "out").id == "scene-0007"
+    with pytest.raises(UsageError, match="no such scene"):
+        ingest(copy, tmp_path / "other", sequence="v1.0-test/scene-0007")
+    scene = ingest(copy, tmp_path / "other", sequence="v1.0-trainval/scene-0007")
+    assert any("v1.0-trainval" in note for note in scene.source.notes)
+
+
+# --- what is wrong is said ------------------------------------------------------------------------------------------
+
+
+def first(rows: Rows, **values: object) -> dict[str, Any]:
+    return next(row for row in rows if all(row.get(key) == value for key, value in values.items()))
+
+
+def of_scene(rows: Rows) -> dict[str, Any]:
+    return next(r for r in rows if "LIDAR_TOP" in r["filename"] and r["ego_pose_token"] == r["token"])
+
+
+def all_stamps(factor: float) -> Callable[[Rows], None]:
+    return lambda rows: [row.update(timestamp=int(row["timestamp"] * factor)) for row in rows]  # type: ignore[func-returns-value]
+
+
+BROKEN: dict[str, tuple[str, Callable[[Rows], object], str]] = {
+    "dangling ego pose": ("sample_data", lambda r: of_scene(r).update(ego_pose_token="f" * 32), "points nowhere"),
+    "dangling calibration": (
+        "sample_data", lambda r: of_scene(r).update(calibrated_sensor_token="f" * 32), "points nowhere"),
+    "dangling sample": ("sample", lambda r: first(r, prev="").update(next="f" * 32), "points nowhere"),
+    "dangling instance": ("sample_annotation", lambda r: r[0].update(instance_token="f" * 32), "points nowhere"),
+    "chain in a circle": ("sample", lambda r: r[0].update(next=r[0]["prev"] or r[0]["token"]), "circle"),
+    "milliseconds": ("sample", all_stamps(1e-3), "another unit"),
+    "nanoseconds": ("sample_data", all_stamps(1e3), "another unit"),
+    "chain backwards in time": (
+        "sample", lambda r: r[1].update(timestamp=r[1]["timestamp"] + 10**6), "do not increase"),
+    "a sweep of another day": (
+        "sample_data", lambda r: of_scene(r).update(timestamp=made.START_US + 86_400 * 10**6), "hours|outside"),
+    "width and length swapped": (
+        "sample_annotation", lambda r: [x.update(size=[x["size"][i] for i in (1, 0, 2)]) for x in r], "swapped"),
+    "size of zero": ("sample_annotation", lambda r: r[0].update(size=[0.0, 4.0, 1.5]), "makes no sense"),
+    "scaled rotation": (
+        "ego_pose", lambda r: r[0].update(rotation=[2 * v for v in r[0]["rotation"]]), "length 1"),
+    "quaternions x y z w": (
+        "ego_pose", lambda r: [x.update(rotation=[*x["rotation"][1:], x["rotation"][0]]) for x in r], "upright"),
+    "three rotation values": ("ego_pose", lambda r: r[0].update(rotation=[1, 0, 0]), "missing or malformed"),
+    "translation is a text": ("ego_pose", lambda r: r[0].update(translation=["1", 2, 3]), "missing or malformed"),
+    "intrinsics sheared": (
+        "calibrated_sensor", lambda r: [x["camera_intrinsic"][0].__setitem__(1, 5.0) for x in r if x["camera_intrinsic"]],
+        "intrinsics are malformed"),
+    "file outside the release": (
+        "sample_data", lambda r: of_scene(r).update(filename="../../etc/passwd"), "file name contains"),
+    "missing timestamp": ("sample_data", lambda r: of_scene(r).pop("timestamp"), "missing or malformed"),
+    "two records with one token": ("sample_data", lambda r: r.append(of_scene(r)), "two records"),
+    "other image size": (
+        "sample_data", lambda r: [x.update(width=97) for x in r if "CAM_FRONT/" in x["filename"]], "camera's size"),
+    "no camera": ("sensor", lambda r: [x.update(channel="X") for x in r if "CAM" in x["channel"]], "no such camera"),
+}  # fmt: skip
+
+
+@needs_native
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_tables_are_refused_in_words(name: str, release: Path, tmp_path: Path) -> None:
+    table, change, words = BROKEN[name]
+    copy = tmp_path / "release"
+    shutil.copytree(release / "v1.0-mini", copy / "v1.0-mini")
+    for folder in ("samples", "sweeps"):
+        if (release / folder).is_dir():
+            (copy / folder).symlink_to(release / folder)
+    made.edit(copy, table, lambda rows: [change(rows), None][1])  # type: ignore[func-returns-value]
+    with pytest.raises((InputError, UsageError), match=words) as caught:
+        ingest(copy, tmp_path / "out")
+    assert caught.value.where
+    assert not (tmp_path / "out").exists()
+
+
+@needs_native
+def test_broken_files_are_refused_in_words(release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = shutil.copytree(release, tmp_path / "release")
+    scan = sorted((copy / "samples" / "LIDAR_TOP").iterdir())[2]
+    content = scan.read_bytes()
+    cases = {
+        "cut off": content[:-3],
+        "not finite": np.full((4, 5), np.nan, "<f4").tobytes(),
+        "no ring": np.full((4, 5), 40, "<f4").tobytes(),
+    }
+    for words, wrong in cases.items():
+        scan.write_bytes(wrong)
+        with pytest.raises(InputError, match=words) as caught:
+            ingest(copy, tmp_path / "out")
+        assert scan.name in caught.value.where
+    scan.unlink()
+    with pytest.raises(InputError, match="missing") as missing:
+        ingest(copy, tmp_path / "out")
+    assert "lidar_top lacks 1" in missing.value.got
+    scan.write_bytes(b"")  # no points is odd, not wrong
+    scene = ingest(copy, tmp_path / "out")
+    assert len(read_points(scene, scene.sweeps[2]).xyz) == 0
+    assert "has no points" in capsys.readouterr().err
+    image = sorted((copy / "samples" / "CAM_FRONT").iterdir())[1]
+    image.write_bytes(image.read_bytes()[:200])
+    with pytest.raises(InputError, match="decoded") as cut:
+        ingest(copy, tmp_path / "out2")
+    assert image.name in cut.value.where
+    table = copy / "v1.0-mini" / "sample_data.json"
+    table.write_bytes(table.read_bytes()[:-200])
+    with pytest.raises(InputError, match="cut off"):
+        ingest(copy, tmp_path / "out2")
+    with pytest.raises(InputError, match="no nuScenes tables"):
+        ingest(copy / "samples", tmp_path / "out2")
+
+
+@needs_native
+def test_default_cameras_must_all_be_there_and_unknown_categories_are_named(
+    release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(InputError, match="cameras are missing") as caught:
+        ingest(release, tmp_path / "out", cameras=())
+    assert "--cameras front front_left" in caught.value.remedy
+    with pytest.raises(UsageError, match="already compensated"):
+        ingest(release, tmp_path / "out", untwist="yes")
+    copy = shutil.copytree(release, tmp_path / "release")
+    made.edit(copy, "category", lambda rows: rows[0].update(name="vehicle.hovercraft"))
+    scene = ingest(copy, tmp_path / "out", cameras=(), skip_missing=True)
+    assert "hovercraft" in {track.label for track in scene.tracks}
+    assert "vehicle.hovercraft" in capsys.readouterr().err
+
+
+# --- the reader of tables -------------------------------------------------------------------------------------------
+
+ODD = [
+    {"token": f"t{n}", "group": f"g{n % 3}", "text": text, "list": [n, [1.5, -2e-3]], "null": None}
+    for n, text in enumerate(['plain', 'a } b', '{"group": "g1"}', 'end },\n{ "group": "g0" ', '\\" ] [ {', '\u00e9\u4e2d', ''])
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("buffer_bytes", [1, 7, 64, 1000, 1 << 20])
+@pytest.mark.parametrize("indent", [None, 0, 2])
+def test_large_tables_give_the_same_records_whatever_the_buffer(
+    tmp_path: Path, buffer_bytes: int, indent: int | None
+) -> None:
+    path = tmp_path / "table.json"
+    path.write_text(json.dumps(ODD, indent=indent))
+    assert list(iter_records(path, buffer_bytes=buffer_bytes)) == ODD
+    for group in ("g0", "g1", "g2"):
+        wanted = [row for row in ODD if row["group"] == group]
+        assert list(find_records(path, "group", {group}, buffer_bytes=buffer_bytes)) == wanted
+    assert list(find_records(path, "token", {"t3", "t5", "x"}, buffer_bytes=buffer_bytes)) == [ODD[3], ODD[5]]
+    path.write_text("[ \n ] ")
+    assert list(iter_records(path, buffer_bytes=buffer_bytes)) == []
+    assert list(find_records(path, "token", {"t"}, buffer_bytes=buffer_bytes)) == []
+
+
+@pytest.mark.parametrize("read", [lambda p: list(iter_records(p)), lambda p: list(find_records(p, "token", {"t0"}))])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[{"token": "t0"}, {"token": "t1"', "cut off"),
+        ('[{"token": "t0"}', "cut off"),
+        ('{"token": "t0"}', "start as a JSON array"),
+        ("", "start as a JSON array"),
+        ('[{"token": "t0", "x": NaN}]', "not valid JSON"),
+        ('[{"token": "t0" "x": 1}]', "not valid JSON"),
+    ],
+)
+def test_malformed_tables_are_refused(tmp_path: Path, read: Callable[[Path], Rows], text: str, words: str) -> None:
+    path = tmp_path / "table.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read(path)
+    assert str(path) in caught.value.where
+    path.unlink()
+    with pytest.raises(InputError, match="table is missing"):
+        read(path)
+
+
+# --- sweeps and cameras -----------------------------------------------------------------------------------------------
+
+
+def test_point_times_follow_columns_or_azimuth(tmp_path: Path) -> None:
+    columns = 400
+    azimuth = np.deg2rad(-177) - 2 * np.pi * (np.arange(columns) + 0.5) / columns
+    rows = np.zeros((columns, 32, 5), "<f4")
+    rows[..., 0], rows[..., 1] = 20 * np.cos(azimuth)[:, None], 20 * np.sin(azimuth)[:, None]
+    rows[..., 3], rows[..., 4] = 51, np.arange(32)
+    flat = rows.reshape(-1, 5)
+    by_column = point_times(flat[:, :3], flat[:, 4])
+    assert by_column[0] == pytest.approx(-0.05 * 399 / 400)
+    assert by_column[-1] == 0
+    by_azimuth = point_times(flat[:-1, :3], flat[:-1, 4])
+    assert np.abs(by_azimuth - by_column[:-1]).max() < 0.05 / 400
+    flat[5, :3] = (0.2, 0.4, -0.1)  # the roof
+    path = tmp_path / "scan.bin"
+    path.write_bytes(flat.tobytes())
+    points = read_scan(path)
+    assert len(points.xyz) == len(flat) - 1
+    assert np.allclose(points.intensity, 0.2)
+
+
+def test_intrinsics_get_half_a_pixel() -> None:
+    camera = camera_from_intrinsics("front", 1600, 900, [[1266.4, 0, 816.3], [0, 1266.5, 491.5], [0, 0, 1]], "here")
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1266.4, 1266.5, 816.8, 492.0)
+
+
+# --- real data --------------------------------------------------------------------------------------------------------
+
+
+def test_real_key_frame_counts_and_places(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    source = shared_data("nuscenes_one_sample")
+    assert [name for name, looks_like in RECOGNISERS.items() if looks_like(source)] == ["nuscenes"]
+    scene = IMPORTERS["nuscenes"](source, tmp_path / "out", ImportOptions())
+    assert [f.id for f in scene.frames] == [f"{c}/000000" for c in scene.cameras]
+    assert len(scene.frames) == 6
+    sample = json.loads((source / "info.json").read_bytes())["data_list"][0]
+    boxes = [item for item in sample["instances"] if item["bbox_label_3d"] >= 0]
+    assert len(scene.tracks) == len(boxes) == 68
+    (sweep,) = scene.sweeps
+    points = read_points(scene, sweep)
+    world = transform_points(sweep.world_from_lidar, points.xyz.astype(np.float64))
+    assert 26_000 < len(world) < 26_400  # of 34,688 rows: the rest is the car itself
+    assert np.linalg.norm(points.xyz[:, :2], axis=1).min() > 1.0
+    inside = [
+        int((np.abs(transform_points(invert(t.world_from_object[0]), world)) <= t.size_m / 2).all(1).sum())
+        for t in scene.tracks
+    ]
+    declared = [item["num_lidar_pts"] for item in boxes]
+    off = sorted(abs(a - b) for a, b in zip(inside, declared, strict=True))
+    assert (inside[declared.index(495)], off[-1], off[-2]) == (479, 16, 5)
+    assert np.percentile(off, 95) <= 2
+    front = scene.frames[0].view
+    uv, z = project(front, world)
+    seen = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < 1600) & (uv[:, 1] < 900)
+    assert abs(int(seen.sum()) - 3060) < 5
+    # 2-D rectangles of the record hold the projected corners of its boxes (pixel centres at whole numbers there)
+    for item in sample["cam_instances"]["CAM_FRONT"]:
+        left, top, right, bottom = item["bbox"]
+        x, y, depth = item["bbox_3d"][:3]  # bottom centre, camera axes
+        fx, cx = front.camera.fx, front.camera.cx
+        if 0 < left and right < 1599:
+            assert left - 1 <= fx * x / depth + cx - 0.5 <= right + 1
+
+
+def test_real_camera_times_agree_with_the_turn(shared_data: Callable[[str], Path]) -> None:
+    """Each camera is triggered when the beam passes it: point times at its azimuth must be its time before the stamp."""
+    source = shared_data("nuscenes_one_sample")
+    sample = json.loads((source / "info.json").read_bytes())["data_list"][0]
+    rows = np.fromfile(next(source.glob("*.pcd.bin")), "<f4").reshape(-1, 5)
+    dt_s = point_times(rows[:, :3], rows[:, 4])
+    far = np.linalg.norm(rows[:, :2], axis=1) > 3
+    for name, image in sample["images"].items():
+        if name == "CAM_BACK_LEFT":
+            continue  # at the seam
+        axis = invert(np.array(image["lidar2cam"]))[:3, 2]
+        off = np.angle(np.exp(1j * (np.arctan2(rows[:, 1], rows[:, 0]) - np.arctan2(axis[1], axis[0]))))
+        at = dt_s[far & (np.abs(off) < 0.02)].mean()
+        assert abs(at - (image["timestamp"] - sample["timestamp"])) < 0.004
