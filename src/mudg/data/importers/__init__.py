@@ -28,12 +28,26 @@ def _looks_like_kitti(source: Path) -> bool:
     return looks_like_kitti(source)
 
 
+def _waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
+    from mudg.data.importers.waymo import import_waymo
+
+    return import_waymo(source, out, options)
+
+
+def _looks_like_waymo(source: Path) -> bool:
+    from mudg.data.importers.waymo import looks_like_waymo
+
+    return looks_like_waymo(source)
+
+
 IMPORTERS: Mapping[str, Importer] = {
     "kitti": _kitti,
+    "waymo": _waymo,
 }
 """Format name -> importer ``(source, out, options) -> Scene``."""
 
 RECOGNISERS: Mapping[str, Recogniser] = {
     "kitti": _looks_like_kitti,
+    "waymo": _looks_like_waymo,
 }
 """Format name -> whether a folder or file looks like it (by names of files, a few bytes at most). The first that says yes wins."""
