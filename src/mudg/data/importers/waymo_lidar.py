@@ -24,6 +24,7 @@ from mudg.data.importers.waymo_log import LaserCalibration, LaserScan, Matrix
 TURN_S: Final = 0.1
 _MIN_MOTION_M: Final = 0.3
 _MAX_FIT_ERROR_S: Final = 0.004
+_CLOCK_ERROR_S: Final = 0.0025
 _MIN_ROWS_SHARE: Final = 0.05
 
 
@@ -182,8 +183,13 @@ def measure_turn(
 
 
 def median_clock(turns: Sequence[tuple[float, float]]) -> TurnClock:
-    """The clock of a log from the turns that could be measured; the nominal one without any."""
+    """The clock of a log from the turns that could be measured.
+
+    Where they agree with the nominal turn within what the measurement can tell, and without any, it is the nominal one.
+    """
     if not turns:
         return TurnClock()
-    start, duration = np.median(np.array(turns), axis=0)
-    return TurnClock(float(start), float(duration), True)
+    start, duration = (float(value) for value in np.median(np.array(turns), axis=0))
+    if max(abs(start), abs(start + duration - TURN_S)) <= _CLOCK_ERROR_S:
+        return TurnClock()
+    return TurnClock(start, duration, True)
