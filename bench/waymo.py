@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import argparse
 import io
+import multiprocessing
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -37,7 +37,9 @@ def jpeg(width: int, height: int, rng: np.random.Generator) -> bytes:
     patches = Image.fromarray(rng.integers(0, 255, (height // 40, width // 40, 3), dtype=np.uint8))
     pixels = np.asarray(patches.resize((width, height), Image.Resampling.BICUBIC)).astype(int)
     buffer = io.BytesIO()
-    Image.fromarray((pixels + rng.integers(-9, 9, pixels.shape)).clip(0, 255).astype(np.uint8)).save(buffer, "JPEG", quality=80)
+    Image.fromarray((pixels + rng.integers(-9, 9, pixels.shape)).clip(0, 255).astype(np.uint8)).save(
+        buffer, "JPEG", quality=80
+    )
     return buffer.getvalue()
 
 
@@ -49,11 +51,25 @@ def full_size_log(frames: int) -> write_waymo.Log:
         yaw = {1: 0.0, 2: 0.8, 3: -0.8, 4: 1.6, 5: -1.6}[number]
         lens = [2050.0, 2050.0, 960.0, height / 2, 0.04, -0.33, 0.001, -0.001, 0.0]
         log.cameras.append(
-            {"number": number, "width": width, "height": height, "intrinsic": lens, "extrinsic": yaw_matrix(yaw, (1.5, 0, 2.1))}
+            {
+                "number": number,
+                "width": width,
+                "height": height,
+                "intrinsic": lens,
+                "extrinsic": yaw_matrix(yaw, (1.5, 0, 2.1)),
+            }
         )
     for number in range(1, 6):
         beams = np.linspace(-0.31, 0.045, 64) if number == 1 else ()
-        log.lasers.append({"number": number, "inclinations": beams, "min": -1.57, "max": 0.52, "extrinsic": yaw_matrix(2.5, (1.4, 0, 2.2))})
+        log.lasers.append(
+            {
+                "number": number,
+                "inclinations": beams,
+                "min": -1.57,
+                "max": 0.52,
+                "extrinsic": yaw_matrix(2.5, (1.4, 0, 2.2)),
+            }
+        )
     images = {number: jpeg(*size, rng) for number, size in SIZES.items()}
     for index in range(frames):
         pose = yaw_matrix(0.7, (-25211.0 + index, 42391.0, -160.0))
@@ -77,23 +93,40 @@ def full_size_log(frames: int) -> write_waymo.Log:
                 poses[..., 3] += np.linspace(-0.5, 0.5, columns, dtype=np.float32)
             frame["lasers"].append({"number": number, "returns": returns, "poses": poses})
         frame["boxes"] = [
-            {"id": f"object{n}", "type": 1, "centre": (10.0 + n, 5.0, 1.0), "size": (4.5, 2.0, 1.6), "heading": 0.1} for n in range(60)
+            {"id": f"object{n}", "type": 1, "centre": (10.0 + n, 5.0, 1.0), "size": (4.5, 2.0, 1.6), "heading": 0.1}
+            for n in range(60)
         ]
         log.frames.append(frame)
     return log
 
 
+def write_logs(folder: Path, frames: int) -> None:
+    """The log in both formats. In a process of its own: the peak memory of a child counts from that of its parent."""
+    log = full_size_log(frames)
+    write_waymo.masked = masked_crc32c  # the writer's own goes through every byte by itself
+    path = write_waymo.write_tfrecord(log, folder / "one" / "log.tfrecord")
+    write_waymo.write_parquet(log, folder / "two")
+    sys.stdout.write(f"{path.stat().st_size / frames / 1e6:.1f} MB a record, {frames} frames\n")
+    sys.stdout.flush()
+
+
 def one_import(source: Path, frames: int, workers: int) -> tuple[float, float]:
     """Processor seconds and peak memory in MB of an import in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "mudg", "ingest", str(source), "--out", f"{folder}/scene", "--frames", f"0:{frames}",
-                   "--workers", str(workers)]  # fmt: skip
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        assert process.stderr is not None
-        said = process.stderr.read()
+        arguments = [
+            "ingest",
+            str(source),
+            "--out",
+            f"{folder}/scene",
+            "--frames",
+            f"0:{frames}",
+            "--workers",
+            str(workers),
+        ]
+        process = subprocess.Popen([sys.executable, "-m", "mudg", *arguments], stderr=subprocess.DEVNULL)
         _, status, usage = os.wait4(process.pid, 0)
         if status:
-            raise SystemExit(said.decode())
+            raise SystemExit(f"mudg {' '.join(arguments)} failed")
     return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20)
 
 
@@ -102,24 +135,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=10)
     parser.add_argument("--workers", type=int, default=1)
-    arguments = parser.parse_args()
+    options = parser.parse_args()
     data = os.urandom(8_000_000)
     start = time.process_time()
     for _ in range(10):
         crc32c(data)
-    print(f"checksum {80 / (time.process_time() - start):.0f} MB/s")
+    sys.stdout.write(f"checksum {80 / (time.process_time() - start):.0f} MB/s\n")
+    sys.stdout.flush()
     with tempfile.TemporaryDirectory() as folder:
-        log = full_size_log(arguments.frames)
-        write_waymo.masked = masked_crc32c  # the writer's own goes through every byte by itself
-        record_bytes = write_waymo.write_tfrecord(log, Path(folder, "one", "log.tfrecord")).stat().st_size / arguments.frames
-        write_waymo.write_parquet(log, Path(folder, "two"))
-        del log
-        print(f"{record_bytes / 1e6:.1f} MB a record, {arguments.frames} frames, {arguments.workers} worker(s)")
+        writer = multiprocessing.get_context("spawn").Process(target=write_logs, args=(Path(folder), options.frames))
+        writer.start()
+        writer.join()
         for name in ("one", "two"):
-            short, _ = one_import(Path(folder, name), SHORT, arguments.workers)
-            long, peak = one_import(Path(folder, name), arguments.frames, arguments.workers)
-            print(f"format {name}: {(long - short) / (arguments.frames - SHORT):.2f} processor s per frame, peak {peak:.0f} MB")
-    print(f"(this process itself: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB)")
+            short, _ = one_import(Path(folder, name), SHORT, options.workers)
+            long, peak = one_import(Path(folder, name), options.frames, options.workers)
+            per_frame = (long - short) / (options.frames - SHORT)
+            sys.stdout.write(
+                f"format {name}: {per_frame:.2f} processor s per frame, peak {peak:.0f} MB, {options.workers} workers\n"
+            )
+            sys.stdout.flush()
 
 
 if __name__ == "__main__":
