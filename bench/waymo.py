@@ -76,8 +76,9 @@ def full_size_log(frames: int) -> write_waymo.Log:
         frame = {"timestamp_us": write_waymo.EPOCH_US + index * 100_000, "pose": pose, "lasers": [], "boxes": []}
         time_s = frame["timestamp_us"] / 1e6 + 0.05
         frame["images"] = [
-            {"number": number, "image": image, "pose": pose, "velocity": np.zeros(6), "pose_time": time_s + 0.0125 * number, "shutter": 0.002,
-             "trigger": time_s - 0.02, "done": time_s + 0.02, "panoptic": None} for number, image in images.items()
+            {"number": number, "image": image, "pose": pose, "velocity": np.zeros(6), "pose_time": time_s + 0.0125 * number,
+             "shutter": 0.002, "trigger": time_s - 0.02, "done": time_s + 0.02, "panoptic": None}
+            for number, image in images.items()
         ]  # fmt: skip
         for number in range(1, 6):
             rows, columns = (64, 2650) if number == 1 else (200, 600)

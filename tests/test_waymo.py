@@ -296,6 +296,7 @@ def bare(log: made.Log) -> made.Log:
 def write(log: made.Log, form: str, folder: Path) -> Path:
     if form == "v1":
         return made.write_tfrecord(log, folder / f"segment-{log.name}_with_camera_labels.tfrecord")
+    pytest.importorskip("pyarrow")
     return made.write_parquet(log, folder)
 
 
@@ -503,6 +504,14 @@ def spoil_exposure(log: made.Log) -> None:
     log.frames[0]["images"][0]["shutter"] = 0.5
 
 
+def spoil_twice(log: made.Log) -> None:
+    log.frames[1]["lasers"].append(log.frames[1]["lasers"][0])
+
+
+def spoil_two_images(log: made.Log) -> None:
+    log.frames[1]["images"][1]["number"] = 1
+
+
 def spoil_intrinsics(log: made.Log) -> None:
     log.cameras[0]["intrinsic"][2] = np.nan
 
@@ -512,7 +521,7 @@ BOTH = {
     spoil_box: "box makes no sense", spoil_rows: "row for every beam", spoil_numbers: "not finite", spoil_image: "cannot be decoded",
     spoil_camera: "frame lacks images or scans", spoil_laser: "frame lacks images or scans", spoil_calibration: "no calibration",
     spoil_laser_calibration: "no calibration", spoil_pixel_poses: "differ in size", spoil_exposure: "exposure times contradict",
-    spoil_intrinsics: "intrinsics",
+    spoil_intrinsics: "intrinsics", spoil_twice: "two scans of one LiDAR", spoil_two_images: "two images of one camera",
 }  # fmt: skip
 
 
@@ -666,6 +675,12 @@ def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monk
     (root / "camera_calibration" / f"{bare.name}.parquet").unlink()
     with pytest.raises(InputError, match="a component of the log is missing"):
         ingest(root, tmp_path / "scene")
+    pyarrow = pytest.importorskip("pyarrow")
+    holes = pyarrow.table({"a": [1, None, 3]})
+    pytest.importorskip("pyarrow.parquet").write_table(holes, tmp_path / "holes.parquet")
+    with pytest.raises(InputError, match="empty value") as hole:
+        Table(tmp_path / "holes.parquet").columns(("a",))
+    assert hole.value.where.endswith("row 1")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ResourceError, match="pyarrow") as caught:
         Table(pose)
@@ -699,15 +714,9 @@ def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -
 
 def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
-    scene = ingest(path, tmp_path / "scene", resolution=480)
+    scene = ingest(path, tmp_path / "scene", resolution=480, cameras=("front", "side_right"))
     assert scene.id == "1024360143612057520_3580_000_3600_000"
-    assert [frame.view.camera.name for frame in scene.frames] == [
-        "side_left",
-        "front_left",
-        "front",
-        "front_right",
-        "side_right",
-    ]
+    assert [frame.view.camera.name for frame in scene.frames] == ["front", "side_right"]  # as the LiDAR passes them
     assert (scene.cameras["front"].width, scene.cameras["front"].height) == (480, 320)
     counts = {
         label: sum(track.label == label for track in scene.tracks)
@@ -724,8 +733,8 @@ def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> N
         assert (semantics == 255).mean() < 0.2
         assert not np.isin(semantics[: len(semantics) // 8], [0, 1]).any()  # no road up there
     headings = {f.view.camera.name: np.rad2deg(np.arctan2(*f.view.world_from_cam[[1, 0], 2])) for f in scene.frames}
-    expected = {"front": 0, "front_left": 45, "front_right": -45, "side_left": 90, "side_right": -90}
-    assert all(abs(headings[name] - angle) < 5 for name, angle in expected.items())
+    assert abs(headings["front"]) < 3
+    assert abs(headings["side_right"] + 90) < 3
 
 
 def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_data: Callable[[str], Path]) -> None:
@@ -785,6 +794,7 @@ def test_the_real_frame_without_images_is_refused_in_words(shared_data: Callable
 
 
 def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
+    pytest.importorskip("pyarrow")
     table = Table(shared_data("waymo_frame") / "v2_vehicle_pose.parquet")
     column = "[VehiclePoseComponent].world_from_vehicle.transform"
     found = table.columns(("key.segment_context_name", "key.frame_timestamp_micros", column))

@@ -297,8 +297,12 @@ def _plan(
         camera, lens = waymo_camera.recorded_camera(waymo.cameras[name], first.shots[name])
         fits[name] = fit_images(camera, options, lens)
         notes += [fits[name].words] if fits[name].words else []
-    if any(fit.camera.readout_s > 0 for fit in fits.values()):
-        notes.append("rolling shutters, left to right; a view is that of the middle column")
+    rolling = sorted({waymo.cameras[name].direction for name, fit in fits.items() if fit.camera.readout_s > 0})
+    if rolling:
+        ways = ", ".join(
+            waymo_camera.DIRECTIONS[d] if 0 <= d < len(waymo_camera.DIRECTIONS) else f"code {d}" for d in rolling
+        )
+        notes.append(f"shutters roll {ways}; a view is that of the middle of the exposure")
     return _Plan(
         waymo, world_from_global, start_us, turn, {number: value for number, (value, _) in middles.items()}, fits
     )
@@ -320,7 +324,7 @@ def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> waymo_lidar
         if TOP in before.lasers
     ]
     turns = []
-    for _, index in sorted(moved, reverse=True)[:_CLOCK_FRAMES]:
+    for index in sorted(index for _, index in sorted(moved, reverse=True)[:_CLOCK_FRAMES]):
         shots = [shot for frame in frames[index - 1 : index + 2] for shot in frame.shots.values()]
         path = {shot.pose_time_s: shot.global_from_vehicle[:3, 3] for shot in shots}
         times = np.array(sorted(path))
@@ -340,8 +344,9 @@ def _write_frame(writer: SceneWriter, plan: _Plan, frame: FrameRecord, content: 
         where = f"{frame.where}: image of camera {name}"
         labels: dict[str, NDArray[Any]] = {}
         if name in content.panoptic:
-            found = waymo_camera.panoptic_labels(content.panoptic[name], fit.recorded, f"{where}: panoptic label")
-            labels = {key: fit.ids(ids) for key, ids in found.items()}
+            panoptic = content.panoptic[name]
+            ids = waymo_camera.panoptic_ids(panoptic, fit.recorded, f"{where}: panoptic label")
+            labels = waymo_camera.panoptic_labels(fit.ids(ids), panoptic.divisor)
         image = content.images[name]
         if fit.keeps_bytes:
             decode_image(image, where, fit.recorded)  # refuses a damaged image with its place in the log

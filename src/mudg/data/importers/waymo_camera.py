@@ -33,6 +33,10 @@ from mudg.data.importers.waymo_log import (
 )
 
 MAX_POSE_SHIFT_S: Final = 0.05
+DIRECTIONS: Final = ("in an unknown direction", "downwards", "left to right", "upwards", "right to left", "not at all")
+"""How a camera reads its image, by the data set's number."""
+
+GLOBAL_SHUTTER: Final = 5
 EGO_CLASS: Final = 1
 SKY_CLASS: Final = 25
 TRAIN_IDS: Final[Mapping[int, int]] = {
@@ -49,7 +53,8 @@ def recorded_camera(calibration: CameraCalibration, shot: CameraShot) -> tuple[C
     """The camera as recorded, and its lens (None where the coefficients are all zero)."""
     fx, fy, cx, cy, *coefficients = calibration.intrinsic
     camera = Camera(
-        calibration.name, calibration.width, calibration.height, fx, fy, cx, cy, tuple(coefficients), readout_s(shot)
+        calibration.name, calibration.width, calibration.height, fx, fy, cx, cy, tuple(coefficients),
+        0.0 if calibration.direction == GLOBAL_SHUTTER else readout_s(shot),
     )  # fmt: skip
     return camera, brown_conrady(*coefficients) if any(coefficients) else None
 
@@ -79,10 +84,8 @@ def vehicle_from_cam(calibration: CameraCalibration) -> Matrix:
     return calibration.vehicle_from_camera @ CAM_FROM_EGO_AXES.T
 
 
-def panoptic_labels(label: Panoptic, camera: Camera, where: str) -> dict[str, NDArray[Any]]:
-    """Labels of one recorded image: ``semantics`` u8[H, W] train ids, ``instance`` i32[H, W], ``sky`` and ``ego`` bool[H, W].
-
-    An instance is called class * divisor + number, 0 where there is none: it means the same thing in this one image only.
+def panoptic_ids(label: Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
+    """Values of a panoptic label, i32[H, W]: class * divisor + instance.
 
     Raises:
         InputError: no 16-bit PNG of the camera's size, or no divisor.
@@ -96,12 +99,20 @@ def panoptic_labels(label: Panoptic, camera: Camera, where: str) -> dict[str, ND
             if image.size != (camera.width, camera.height) or not image.mode.startswith("I"):
                 raise InputError(
                     "panoptic label is not a 16-bit image of its camera's size", where=where,
-                    expected=f"{camera.width}x{camera.height}, 16 bits", got=f"{image.width}x{image.height}, mode {image.mode}",
+                    expected=f"{camera.width}x{camera.height}, 16 bits",
+                    got=f"{image.width}x{image.height}, mode {image.mode}",
                 )  # fmt: skip
-            ids = np.array(image).astype(np.int32)
+            return np.array(image).astype(np.int32)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError("panoptic label cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
-    classes, numbers = np.divmod(ids, label.divisor)
+
+
+def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[Any]]:
+    """Labels of one image: ``semantics`` u8[H, W] train ids, ``instance`` i32[H, W], ``sky`` and ``ego`` bool[H, W].
+
+    An instance is called class * divisor + number, 0 where there is none: it means the same thing in this one image only.
+    """
+    classes, numbers = np.divmod(ids, divisor)
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(TRAIN_IDS)] = list(TRAIN_IDS.values())
     return {

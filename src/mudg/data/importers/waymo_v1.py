@@ -188,6 +188,8 @@ def _frame_record(message: dict[str, Any], number: int, where: str) -> FrameReco
     lasers = tuple(
         LASERS[item["name"]] for item in message["lasers"] if item.get("name", 0) in LASERS and _has_ranges(item)
     )
+    if len(set(lasers)) < len(lasers):
+        raise InputError("frame has two scans of one LiDAR", where=where, got=", ".join(lasers))
     boxes = tuple(_box(item, where) for item in message["labels"])
     return FrameRecord(number, timestamp_us, _transform(message, "pose", where), shots, lasers, boxes, where)
 

@@ -183,7 +183,7 @@ class ParquetLog:
             _TIME, _CAMERA, f"{prefix}pose.transform", f"{prefix}pose_timestamp", f"{params}shutter",
             f"{params}camera_trigger_time", f"{params}camera_readout_done_time", *velocity,
         )  # fmt: skip
-        table = self._images.columns(names)
+        table = self._images.columns(names[:4], optional=names[4:])
         shots: dict[int, dict[str, CameraShot]] = {}
         for row, (time, number) in enumerate(zip(table[_TIME], table[_CAMERA], strict=True)):
             name = CAMERAS.get(number)
@@ -224,8 +224,12 @@ class ParquetLog:
         keys = self._lidar.columns((_TIME, _LASER))
         found: dict[int, tuple[str, ...]] = {}
         for time, number in zip(keys[_TIME], keys[_LASER], strict=True):
-            if number in LASERS:
-                found[int(time)] = (*found.get(int(time), ()), LASERS[number])
+            if number not in LASERS:
+                continue
+            others = found.get(int(time), ())
+            if LASERS[number] in others:
+                raise InputError("frame has two scans of one LiDAR", where=str(self._lidar.path), got=LASERS[number])
+            found[int(time)] = (*others, LASERS[number])
         return found
 
     def _conditions(self) -> str:
@@ -233,7 +237,7 @@ class ParquetLog:
         if table is None:
             return ""
         names = tuple(f"[StatsComponent].{name}" for name in ("time_of_day", "weather", "location"))
-        found = table.columns(names)
+        found = table.columns((), optional=names)
         return ", ".join(str(found[name][0]) for name in names if found[name] and found[name][0])
 
     def _path(self, component: str) -> Path | None:
@@ -252,7 +256,7 @@ def _cameras(table: Table) -> Iterator[tuple[str, CameraCalibration]]:
     prefix = "[CameraCalibrationComponent]."
     intrinsic = [f"{prefix}intrinsic.{name}" for name in _INTRINSIC]
     rest = [f"{prefix}{name}" for name in ("extrinsic.transform", "width", "height", "rolling_shutter_direction")]
-    found = table.columns((_CAMERA, *intrinsic, *rest))
+    found = table.columns((_CAMERA, *intrinsic, *rest[:3]), optional=rest[3:])
     for row, number in enumerate(found[_CAMERA]):
         name = CAMERAS.get(number)
         if name is None:
@@ -272,7 +276,7 @@ def _lasers(table: Table) -> Iterator[tuple[str, LaserCalibration]]:
         f"{prefix}{name}"
         for name in ("extrinsic.transform", "beam_inclination.min", "beam_inclination.max", "beam_inclination.values")
     ]
-    found = table.columns((_LASER, *names))
+    found = table.columns((_LASER, *names[:3]), optional=names[3:])
     for row, number in enumerate(found[_LASER]):
         name = LASERS.get(number)
         if name is None:
@@ -310,12 +314,17 @@ class Table:
         self._by_time: dict[str, dict[int, list[tuple[str, int]]]] = {}
         self._streams: dict[tuple[str, ...], tuple[int, Iterator[Any]]] = {}
 
-    def columns(self, names: Sequence[str]) -> dict[str, list[Any]]:
-        """Whole columns as lists of plain values."""
-        self._check(names)
+    def columns(self, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
+        """Whole columns as lists of plain values; None may stand in the ``optional`` ones only."""
+        self._check((*names, *optional))
         with _reading(self.path, self._arrow):
-            found = self._file.read(columns=list(names))
-            return {name: found.column(name).to_pylist() for name in names}
+            found = self._file.read(columns=[*names, *optional])
+            empty = [name for name in names if found.column(name).null_count]
+            values = {name: found.column(name).to_pylist() for name in (*names, *optional)}
+        if empty:
+            row = values[empty[0]].index(None)
+            raise InputError("table has an empty value", where=f"{self.path}: row {row}", got=", ".join(empty))
+        return values
 
     def rows(self, timestamp_us: int, sensor: str, names: Mapping[int, str]) -> list[tuple[str, int]]:
         """Sensor names and rows of one frame, in the order of the file."""
@@ -329,8 +338,11 @@ class Table:
         return self._by_time[sensor].get(timestamp_us, [])
 
     def value(self, row: int, column: str) -> Any:
-        """One value as a plain one (bytes, number)."""
-        return self._row(row, (column,)).column(0)[0].as_py()
+        """One value as a plain one (bytes, number, list)."""
+        value = self._row(row, (column,)).column(0)[0].as_py()
+        if value is None:
+            raise InputError("table has an empty value", where=f"{self.path}: row {row}", got=column)
+        return value
 
     def image(self, row: int, prefix: str, channels: int) -> NDArray[np.float32] | None:
         """A range image [H, W, channels] kept as values and shape; None where it is not recorded."""
