@@ -346,6 +346,38 @@ def test_round_trip(
 
 
 @roundtrip.needs_native
+@pytest.mark.parametrize("hold, words", [("start", "at the timestamp"), ("pose", "at the frame's pose")])
+def test_the_moment_of_the_boxes_is_found(
+    hold: str, words: str, city: tuple[Scene, tuple[Track, ...]], tmp_path: Path
+) -> None:
+    log = made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS, boxes_hold=hold)
+    for frame in log.frames:
+        frame["lasers"][0]["projections"] = None
+    scene = ingest(write(log, "v1", tmp_path / "log"), tmp_path / "scene")
+    assert any(note.startswith(f"boxes hold {words} (") for note in scene.source.notes)
+    roundtrip.assert_same_log(scene, city[0], labels=made.LABELS, box_pose=0.04, cloud_m=2e-4)
+
+
+def test_points_count_for_the_moment_that_puts_them_inside() -> None:
+    box = WaymoBox("a", "vehicle", (10.0, 4.0, 1.0), (4.0, 2.0, 1.5), 0.3)
+    forward = yaw_matrix(0.3)[:3, 0]
+    along, across = np.meshgrid(np.linspace(-1.99, 1.99, 20), np.linspace(-0.99, 0.99, 9))
+    grid = np.stack([along.ravel(), across.ravel(), np.full(along.size, 0.1)], 1)
+    on_box = transform_points(yaw_matrix(0.3, box.centre), grid)
+    seen = np.linspace(0.03, 0.04, len(grid))
+    for index, held in enumerate((0.035, 0.0, 0.05)):
+        points = on_box + (seen - held)[:, None] * 20.0 * forward
+        counts = waymo_tracks.points_inside(box, 20.0 * forward, points, seen, 0.035, 0.05)
+        assert counts[index] == len(grid)
+        assert counts.argmax() == index
+        assert np.delete(counts, index).max() < 0.95 * len(grid)
+        assert waymo_tracks.choose_moment(counts) == waymo_tracks.MOMENTS[index]
+    low = on_box - [0, 0, 0.75]
+    assert waymo_tracks.points_inside(box, np.zeros(3), low, seen, 0.0, 0.0).tolist() == [0, 0, 0]  # the road
+    assert waymo_tracks.choose_moment(np.array([100, 104, 90])) == "seen"
+
+
+@roundtrip.needs_native
 def test_both_formats_and_any_number_of_workers_give_the_same_scene(bare: made.Log, tmp_path: Path) -> None:
     one = ingest(write(bare, "v1", tmp_path / "one"), tmp_path / "a", workers=3)
     two = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b", workers=1)

@@ -52,6 +52,7 @@ def log_of(
     beams: NDArray[np.float64],
     columns: int,
     global_from_world: Matrix = GLOBAL_FROM_WORLD,
+    boxes_hold: str = "seen",
 ) -> Log:
     """The scene as a Waymo log.
 
@@ -61,6 +62,8 @@ def log_of(
         beams: elevations f64[H], radians, upwards.
         columns: of the range images.
         global_from_world: where the data set's world lies.
+        boxes_hold: whether boxes stand where their objects were when the LiDAR looked at them (``seen``), at the beginning of
+            the turn (``start``) or in its middle (``pose``).
     """
     log = Log()
     mount = invert(truth.ego.pose_at(truth.sweeps[0].time_s)) @ truth.sweeps[0].world_from_lidar
@@ -80,7 +83,7 @@ def log_of(
         frame: dict[str, Any] = {"timestamp_us": EPOCH_US + round((sweep.time_s - 0.05) * 1e6), "pose": pose}
         frame["images"] = [_image(truth, name, index, global_from_world) for name in truth.cameras]
         frame["lasers"] = [_scan(truth, index, mount, beams, columns, global_from_world)]
-        frame["boxes"] = _boxes(truth, moving, sweep.time_s)
+        frame["boxes"] = _boxes(truth, moving, sweep.time_s, boxes_hold)
         log.frames.append(frame)
     return log
 
@@ -132,13 +135,14 @@ def _roll_pitch_yaw(pose: Matrix) -> list[float]:
     return [roll, pitch, np.arctan2(pose[1, 0], pose[0, 0]), *pose[:3, 3]]
 
 
-def _boxes(truth: Scene, moving: Sequence[Track], time_s: float) -> list[dict[str, Any]]:
+def _boxes(truth: Scene, moving: Sequence[Track], time_s: float, hold: str) -> list[dict[str, Any]]:
     vehicle = truth.ego.pose_at(time_s)
     own = {track.id: track for track in moving}
     boxes = []
     for track in truth.tracks:
         now = invert(vehicle) @ track.pose_at(time_s)
         late = ((0.5 - np.arctan2(now[1, 3], now[0, 3]) / (2 * np.pi)) % 1.0 - 0.5) * 0.1
+        late = {"seen": late, "start": -0.05, "pose": 0.0}[hold]
         seen = own[track.id].pose_at(time_s + late)
         shown = now if seen is None else invert(vehicle) @ seen
         boxes.append(

@@ -7,7 +7,7 @@ images      five cameras (``front``, ``front_left``, ``front_right``, ``side_lef
             of the middle column's exposure
 labels      panoptic labels, where an image has them: ``semantics``, ``instance``, ``sky``, ``ego``
 scans       five LiDARs (``lidar_top``, ``lidar_front``, ...), both returns, at the frame's pose; ``dt_s`` for the top one
-boxes       3D boxes of the LiDAR as tracks, carried to the frame's pose
+boxes       3D boxes as tracks, carried to the moment of the frame's pose (``waymo_tracks``)
 world       z up, origin and x axis at the vehicle's pose of the first imported frame; the offset stands in the scene's notes
 time        seconds since the first imported frame's timestamp
 =========== =============================================================================================================
@@ -28,14 +28,23 @@ from numpy.typing import NDArray
 
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import yaw_matrix, yaw_of
+from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
 from mudg.base.types import EgoPath, Scene, Source, View
 from mudg.data.importers import waymo_camera, waymo_lidar
 from mudg.data.importers.common import for_each, seconds
 from mudg.data.importers.images import ImageFit, fit_images
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.importers.waymo_log import TOP, FrameContent, FrameRecord, LaserScan, Matrix, WaymoLog
-from mudg.data.importers.waymo_tracks import TimedBoxes, build_tracks
+from mudg.data.importers.waymo_tracks import (
+    FAST_M_S,
+    MOMENTS,
+    Moment,
+    TimedBoxes,
+    build_tracks,
+    choose_moment,
+    points_inside,
+    velocities,
+)
 from mudg.data.importers.waymo_v1 import TfrecordLog
 from mudg.data.importers.waymo_v2 import REQUIRED, ParquetLog
 from mudg.data.scenefile import SceneWriter, decode_image
@@ -46,6 +55,7 @@ DOUBTFUL_PROJECTION_PX: Final = 30.0
 
 _SAME_POSE: Final = 1e-6
 _CLOCK_FRAMES: Final = 3
+_MOMENT_FRAMES: Final = 4
 _SUFFIX: Final = ".tfrecord"
 
 
@@ -76,7 +86,9 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     frames, notes = _usable_frames(waymo, options)
     cameras = _chosen_cameras(waymo, options, source)
     plan = _plan(waymo, frames, cameras, options, notes)
-    tracks, track_notes = build_tracks([plan.timed_boxes(frame) for frame in frames])
+    moment, words = _moment_of_boxes(waymo, frames, plan)
+    notes += [words] if words else []
+    tracks, track_notes = build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
     notes += track_notes
     check = _check_projections(waymo, frames, cameras, plan)
     notes += [check] if check else []
@@ -260,13 +272,21 @@ class _Plan:
         world_from_cam = self.world_from_global @ pose @ waymo_camera.vehicle_from_cam(self.waymo.cameras[camera])
         return View(self.fits[camera].camera, world_from_cam, time_s - self.start_us / 1e6)
 
-    def timed_boxes(self, frame: FrameRecord) -> TimedBoxes:
-        """The frame's boxes with the times at which the top LiDAR looked at them."""
+    def timed_boxes(self, frame: FrameRecord, moment: Moment) -> TimedBoxes:
+        """The frame's boxes with the times for which they hold."""
         late = np.zeros(len(frame.boxes))
-        if TOP in frame.lasers and len(frame.boxes):
-            centres = np.array([box.centre for box in frame.boxes])
-            late = self.dt_s(frame, waymo_lidar.turn_of_direction(centres, self.waymo.lasers[TOP]))
+        if moment == "start":
+            late -= self.middle_s[frame.number]
+        elif moment == "seen":
+            late = self.seen_s(frame) - self.middle_s[frame.number]
         return TimedBoxes(self.pose_s(frame), self.world_from_vehicle(frame), frame.boxes, late, frame.where)
+
+    def seen_s(self, frame: FrameRecord) -> NDArray[np.float64]:
+        """When the top LiDAR looked at each box, seconds after the timestamp; without one, the moment of the frame's pose."""
+        if TOP not in frame.lasers or not frame.boxes:
+            return np.full(len(frame.boxes), self.middle_s[frame.number])
+        centres = np.array([box.centre for box in frame.boxes])
+        return self.turn.after_timestamp_s(waymo_lidar.turn_of_direction(centres, self.waymo.lasers[TOP]))
 
 
 def _plan(
@@ -334,6 +354,34 @@ def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> waymo_lidar
             found = waymo_lidar.measure_turn(poses, frames[index].timestamp_us / 1e6, times, places)
             turns += [found] if found is not None else []
     return waymo_lidar.median_clock(turns)
+
+
+def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan) -> tuple[Moment, str]:
+    """For which moment the boxes of this log hold, by the points in the boxes of its fast objects; and words for the notes."""
+    boxes = [plan.timed_boxes(frame, "pose") for frame in frames]
+    fast = [
+        {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= FAST_M_S} for speeds in velocities(boxes)
+    ]
+    order = sorted(range(len(frames)), key=lambda index: -len(fast[index]))[:_MOMENT_FRAMES]
+    counts = np.zeros(len(MOMENTS), np.int64)
+    for index in sorted(order):
+        frame = frames[index]
+        if not fast[index] or TOP not in frame.lasers:
+            continue
+        points = _points(plan, frame, TOP, waymo.read(frame, ()).scans[TOP])
+        xyz = transform_points(waymo.lasers[TOP].vehicle_from_lidar, points.xyz)
+        seen = plan.turn.after_timestamp_s(points.turn)
+        rotation = plan.world_from_vehicle(frame)[:3, :3]
+        for box, late in zip(frame.boxes, plan.seen_s(frame), strict=True):
+            if box.id in fast[index]:
+                velocity = fast[index][box.id] @ rotation
+                counts += points_inside(box, velocity, xyz, seen, float(late), plan.middle_s[frame.number])
+    if not counts.any():
+        return ("seen" if any(TOP in frame.lasers for frame in frames) else "pose"), ""
+    moment = choose_moment(counts)
+    words = {"seen": "when the LiDAR passes them", "start": "at the timestamp", "pose": "at the frame's pose"}
+    tallies = ", ".join(f"{count} {words[name]}" for name, count in zip(MOMENTS, counts, strict=True))
+    return moment, f"boxes hold {words[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
 
 
 # --- writing --------------------------------------------------------------------------------------------------------

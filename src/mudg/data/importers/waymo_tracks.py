@@ -1,15 +1,16 @@
-"""Boxes per frame -> tracks in the world.
+"""Boxes per frame -> tracks in the world, and the question for which moment a box holds.
 
-Annotators draw boxes around the points they see, and the points of a frame were measured over a tenth of a second: a box holds
-where its object was when the LiDAR passed it. Each box is therefore carried, with its object's own speed, to the moment that all
-of the frame's points are given for.
+The points of a frame were measured over a tenth of a second, in which a car drives two metres. A box drawn around points holds where
+its object was when the LiDAR passed it; a description of the data set speaks of the frame's start instead. So the log is asked: under
+which of the ``Moment`` do most points near fast objects lie inside their boxes? Each box is then carried, with its object's own
+speed, to the moment that all of the frame's points are given for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,14 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Track
 from mudg.data.importers.waymo_log import Matrix, WaymoBox
+
+Moment = Literal["seen", "start", "pose"]
+"""A box holds when the LiDAR looked at its object, at the frame's timestamp, or at the moment of the frame's pose."""
+
+MOMENTS: Final[tuple[Moment, ...]] = ("seen", "start", "pose")
+FAST_M_S: Final = 3.0
+_CLEAR_GAIN: Final = 1.05
+_FLOOR_M: Final = 0.3
 
 MAX_GAP_S: Final = 0.55
 """A track that is not seen for longer than this is split: interpolating across would invent its path."""
@@ -107,3 +116,54 @@ def _velocity(times_s: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray
 def _names(members: Mapping[str, object]) -> dict[str, str]:
     """Ids as names of tracks; those that begin with a sign, as the data set's random ones may, get a letter in front."""
     return {box_id: box_id if box_id[0].isalnum() else f"t{box_id}" for box_id in members}
+
+
+def points_inside(
+    box: WaymoBox,
+    velocity_vehicle: NDArray[np.float64],
+    xyz_vehicle: NDArray[np.float64],
+    seen_s: NDArray[np.float64],
+    late_s: float,
+    middle_s: float,
+) -> NDArray[np.int64]:
+    """How many points lie inside a box if it holds at each of ``MOMENTS``, i64[3].
+
+    Args:
+        velocity_vehicle: of the object, f64[3] m/s along the vehicle's axes.
+        xyz_vehicle, seen_s: points f64[N, 3] and when each was measured, seconds after the frame's timestamp f64[N].
+        late_s: seconds after the frame's timestamp at which the LiDAR looked at the box.
+        middle_s: moment of the frame's pose, seconds after the timestamp.
+    """
+    offset = xyz_vehicle - box.centre
+    reach = max(box.size_m) / 2 + float(np.linalg.norm(velocity_vehicle)) * 0.2
+    near = (np.abs(offset) <= reach).all(1)
+    counts = np.zeros(len(MOMENTS), np.int64)
+    turn = yaw_matrix(box.heading)[:3, :3]
+    half = np.array(box.size_m) / 2
+    for index, held_s in enumerate((late_s, 0.0, middle_s)):
+        local = (offset[near] - (seen_s[near, None] - held_s) * velocity_vehicle) @ turn
+        counts[index] = ((np.abs(local) <= half) & (local[:, 2:] > _FLOOR_M - half[2])).all(1).sum()
+    return counts
+
+
+def choose_moment(counts: NDArray[np.int64]) -> Moment:
+    """The moment under which most points lie inside their boxes, sums i64[3]; ``seen`` unless another is clearly better."""
+    best = int(counts.argmax())
+    return MOMENTS[best] if counts[best] > _CLEAR_GAIN * counts[0] else MOMENTS[0]
+
+
+def velocities(frames: Sequence[TimedBoxes]) -> list[dict[str, NDArray[np.float64]]]:
+    """Velocity of every box in the world by id, f64[3] m/s, for each frame: between the frames beside it; zero for single boxes."""
+    centres = [{box.id: (frame.world_from_vehicle @ [*box.centre, 1.0])[:3] for box in frame.boxes} for frame in frames]
+    found: list[dict[str, NDArray[np.float64]]] = []
+    for index, here in enumerate(centres):
+        before, after = max(0, index - 1), min(len(frames) - 1, index + 1)
+        speeds = {}
+        for box_id, centre in here.items():
+            first = before if box_id in centres[before] else index
+            last = after if box_id in centres[after] else index
+            span = frames[last].time_s - frames[first].time_s
+            way = centres[last].get(box_id, centre) - centres[first].get(box_id, centre)
+            speeds[box_id] = way / span if span > 0 else np.zeros(3)
+        found.append(speeds)
+    return found
