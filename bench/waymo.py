@@ -124,7 +124,7 @@ def one_import(source: Path, frames: int, workers: int) -> tuple[float, float]:
             "--workers",
             str(workers),
         ]
-        process = subprocess.Popen([sys.executable, "-m", "mudg", *arguments], stderr=subprocess.DEVNULL)
+        process = subprocess.Popen([sys.executable, "-m", "mudg", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         _, status, usage = os.wait4(process.pid, 0)
         if status:
             raise SystemExit(f"mudg {' '.join(arguments)} failed")
