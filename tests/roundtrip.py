@@ -203,7 +203,8 @@ def _compare_sweep(
         if off > intensity:
             problems.append(f"sweep {b.id}: intensity differs by {off:.3g}")
     if dt_s is not None and near.any():
-        at, expected_at = other.dt_s + b.time_s - shift_s, one.dt_s[partner] + a.time_s
+        at, expected_at = (t.dt_s.astype(float) + s.time_s for t, s in ((other, b), (one, a)))
+        expected_at, at = expected_at[partner], at - shift_s
         if (off := float(np.abs(at - expected_at)[near].max())) > dt_s:
             problems.append(f"sweep {b.id}: point times differ by {off:.3g} s")
 

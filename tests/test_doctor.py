@@ -65,3 +65,16 @@ def test_scene_findings_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_no_scene_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["doctor", str(tmp_path / "nothing")]) == 3
     assert "does not exist" in capsys.readouterr().out
+
+
+def test_a_log_in_the_neutral_layout_is_checked_and_other_logs_are_told_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log"
+    log.mkdir()
+    (log / "log.json").write_text('{"format": "mudg-log", "version": 1, "name": "x"}')
+    assert cli.main(["doctor", str(log)]) == 3
+    assert "the field 'licence' is missing" in capsys.readouterr().out
+    (tmp_path / "drive" / "image_02").mkdir(parents=True)
+    assert cli.main(["doctor", str(tmp_path / "drive")]) == 3
+    assert "this is a log (kitti), not a scene" in capsys.readouterr().out

@@ -32,7 +32,9 @@ def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path)
     direct = IMPORTERS["kitti"](drive, tmp_path / "direct", ImportOptions())
     assert scene_to_json_text(scene) == scene_to_json_text(direct)
     summary = store.read_json(tmp_path / "out" / "run.json")["summary"]
+    assert summary.pop("alignment").keys() == {"front"}
     assert summary == {"frames": 6, "sweeps": 6, "tracks": 1, "held_out": 1}
+    assert (tmp_path / "out" / "contact_sheet.jpg").read_bytes()[:2] == b"\xff\xd8"
 
 
 def test_flags_reach_the_importer(tmp_path: Path) -> None:
@@ -41,6 +43,67 @@ def test_flags_reach_the_importer(tmp_path: Path) -> None:
     assert len(scene.frames) == 5
     assert sorted(i for i, s in scene.split.items() if s == "test") == ["front/000002", "front/000004"]
     assert not read_points(scene, scene.sweeps[0]).dt_s.any()
+
+
+def test_images_are_resized_with_their_camera_and_points_stay_on_them(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    full = IMPORTERS["kitti"](drive, tmp_path / "full", ImportOptions())
+    small = read_scene(ingest.run(IngestConfig(resolution="31"), drive, tmp_path / "small"))
+    a, b = full.cameras["front"], small.cameras["front"]
+    assert max(b.width, b.height) == 31
+    assert b == a.resized(b.width, b.height)
+    assert read_image(small, small.frames[0]).shape == (b.height, b.width, 3)
+    assert (small.frames[3].view.world_from_cam == full.frames[3].view.world_from_cam).all()
+    assert any("resized" in note for note in small.source.notes)
+
+
+def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    out = ingest.run(IngestConfig(workers=1), drive, tmp_path / "one")
+    listed = store.read_json(out / "manifest.json")["files"]
+    again = store.read_json(ingest.run(IngestConfig(workers=3), drive, tmp_path / "three") / "manifest.json")["files"]
+    assert {n: f for n, f in listed.items() if not n.startswith("run.")} == {
+        n: f for n, f in again.items() if not n.startswith("run.")
+    }
+    made_ns = (out / "scene.json").stat().st_mtime_ns
+    ingest.run(IngestConfig(workers=2), drive, out)
+    assert (out / "scene.json").stat().st_mtime_ns == made_ns
+
+
+@pytest.mark.parametrize(
+    ("words", "out", "expected"),
+    [
+        (["log", "o"], None, ("auto", "log", "o")),
+        (["log"], "o", ("auto", "log", "o")),
+        (["kitti", "log", "o"], None, ("kitti", "log", "o")),
+        (["kitti", "log"], "o", ("kitti", "log", "o")),
+        (["city", "o"], None, ("auto", "city", "o")),
+    ],
+)
+def test_words_of_the_command_line(words: list[str], out: str | None, expected: tuple[str, str, str]) -> None:
+    asked = ingest.asked(words, Path(out) if out else None, IngestConfig())
+    assert (asked.config.format, asked.log, str(asked.out)) == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "out", "expected"),
+    [
+        ([], None, "no log"),
+        (["log"], None, "no folder"),
+        (["kitti", "log"], None, "no folder"),
+        (["waymoo", "log", "o"], None, "too many words"),
+        (["log", "o", "p"], None, "too many words"),
+        (["log", "o"], "p", "too many words"),
+    ],
+)
+def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:
+    with pytest.raises(UsageError, match=expected):
+        ingest.asked(words, Path(out) if out else None, IngestConfig())
+    with pytest.raises(UsageError, match="two formats"):
+        ingest.asked(["custom", "log", "o"], None, IngestConfig(format="kitti"))
+    with pytest.raises(UsageError, match="no such format") as caught:
+        ingest.run(IngestConfig(format="rosbag"), "log", Path("o"))
+    assert "kitti" in caught.value.expected
 
 
 def test_unknown_folders_and_missing_ones_are_named(tmp_path: Path) -> None:

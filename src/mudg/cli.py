@@ -35,19 +35,46 @@ TERMINATED = 143
 def _ingest(args: f.Ingest) -> dict[str, Any]:
     from mudg.stages import ingest
 
-    return {"scene": ingest.run(args.settings, args.log, args.out, overwrite=args.overwrite)}
+    asked = ingest.asked(args.words, args.out, args.settings, many=args.list is not None)
+    if args.list is not None:
+        return ingest.run_many(asked.config, args.list, asked.out, args.shard, args.jobs, args.overwrite)
+    _only_with_list(args)
+    return {"scene": ingest.run(asked.config, asked.log, asked.out, overwrite=args.overwrite)}
 
 
 def _annotate(args: f.Annotate) -> dict[str, Any]:
     from mudg.stages import annotate
 
-    return {"scene": annotate.run(args.settings, args.scene, args.out, overwrite=args.overwrite)}
+    if args.list is not None:
+        return annotate.run_many(args.settings, args.list, _root_of(args), args.shard, args.jobs, args.overwrite)
+    _only_with_list(args)
+    return {"scene": annotate.run(args.settings, _scene_of(args), args.out, overwrite=args.overwrite)}
 
 
 def _fuse(args: f.Fuse) -> dict[str, Any]:
     from mudg.stages import fuse
 
-    return {"fused": fuse.run(args.settings, args.scene, args.out, overwrite=args.overwrite)}
+    if args.list is not None:
+        return fuse.run_many(args.settings, args.list, _root_of(args), args.shard, args.jobs, args.overwrite)
+    _only_with_list(args)
+    return {"fused": fuse.run(args.settings, _scene_of(args), args.out, overwrite=args.overwrite)}
+
+
+def _only_with_list(args: f.Many) -> None:
+    if args.shard or args.jobs:
+        raise UsageError("--shard and --jobs go with --list", remedy="leave them out, or give --list FILE")
+
+
+def _scene_of(args: f.Annotate | f.Fuse) -> Path:
+    if args.scene is None:
+        raise UsageError("no scene was given", expected="a scene made by mudg ingest, or --list FILE")
+    return args.scene
+
+
+def _root_of(args: f.Annotate | f.Fuse) -> Path:
+    if args.scene is not None:
+        raise UsageError("give a scene or a list, not both", got=f"{args.scene} and --list {args.list}")
+    return args.out
 
 
 def _learn(args: f.Learn) -> dict[str, Any]:
@@ -149,17 +176,19 @@ VERBS: dict[str, Verb] = {
     ),
     "ingest": Verb(
         "Driving log (or the built-in city) -> scene directory.",
-        ("mudg ingest city --out scenes/city", "mudg ingest ~/kitti/2011_09_26_drive_0001_sync --out scenes/kitti"),
+        ("mudg ingest city scenes/city", "mudg ingest ~/kitti/2011_09_26_drive_0001_sync scenes/kitti --resolution 960",
+         "mudg ingest custom my_log scenes/mine --cameras front --frames 0:40",
+         "mudg ingest kitti --list drives.txt --out scenes --shard 0/4 --jobs 2"),
         _ingest,
     ),
     "annotate": Verb(
         "Scene without labels -> semantics, sky and depth, each with a confidence.",
-        ("mudg annotate scenes/kitti --out scenes/kitti_labelled",),
+        ("mudg annotate scenes/kitti --out scenes/kitti_labelled", "mudg annotate --list scenes --out labelled"),
         _annotate,
     ),
     "fuse": Verb(
         "Scene -> one coloured cloud of the static world, one per moving object.",
-        ("mudg fuse scenes/city --out runs/fused",),
+        ("mudg fuse scenes/city --out runs/fused", "mudg fuse --list labelled --out fused --jobs 2"),
         _fuse,
     ),
     "learn": Verb(
@@ -231,7 +260,8 @@ def overview() -> str:
         "",
         "Settings: defaults < --config FILE.yaml < flags; the resolved settings lie beside every result as run.yaml.",
         "Every step reuses a finished result that verifies, and continues an interrupted one.",
-        "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerics, 130 interrupted.",
+        "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerics, 130 interrupted;",
+        "with --list, 10 + n: n scenes failed (99: 89 or more).",
     ]
     return "\n".join(lines)
 

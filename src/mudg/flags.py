@@ -44,29 +44,49 @@ class Output(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ingest(Output):
+class Many(Common):
+    """Flags of commands that go over a list of scenes too."""
+
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace the result of other settings or inputs in the output folder instead of refusing."""
+    list: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Many at once: a file with one source a line (SOURCE [name=NAME] ...), or a folder of them. Each goes to OUT/NAME."""
+    shard: Annotated[str, arg(metavar="i/n")] = ""
+    """With --list: take every n-th entry from the i-th on, i from 0 to n-1."""
+    jobs: Annotated[int, arg(metavar="INT")] = 0
+    """With --list: scenes worked on at a time (0 = one per processor)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ingest(Many):
     """Flags of ``mudg ingest``."""
 
-    log: Positional[str]
-    """Folder of a dataset log (its format is recognised), or the word city."""
+    words: Annotated[tuple[str, ...], tyro.conf.Positional, arg(metavar="[FORMAT] LOG [OUT]")] = ()
+    """A dataset log, a scene, or the word city; its format is recognised unless named before it; the folder to write after it."""
+    out: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Folder to write, where it is not given after the log. A finished result of the same settings and inputs is reused."""
     settings: Annotated[stage_config.IngestConfig, arg(name="")] = stage_config.IngestConfig()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Annotate(Output):
+class Annotate(Many):
     """Flags of ``mudg annotate``."""
 
-    scene: Positional[Path]
+    scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
     """Scene made by ingest."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """Folder to write. A finished result of the same settings and inputs is verified and reused."""
     settings: Annotated[stage_config.AnnotateConfig, arg(name="")] = stage_config.AnnotateConfig()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fuse(Output):
+class Fuse(Many):
     """Flags of ``mudg fuse``."""
 
-    scene: Positional[Path]
+    scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
     """Scene made by ingest or annotate."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """Folder to write. A finished result of the same settings and inputs is verified and reused."""
     settings: Annotated[stage_config.FuseConfig, arg(name="")] = stage_config.FuseConfig()
 
 
@@ -184,7 +204,7 @@ class Doctor(Common):
     """Flags of ``mudg doctor``."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
-    """Scene to check; without it, the machine is reported."""
+    """Scene, or log in the neutral layout, to check; without it, the machine is reported."""
 
 
 FLAGS: dict[str, type[Common]] = {

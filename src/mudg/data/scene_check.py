@@ -11,7 +11,7 @@ import numpy as np
 
 from mudg.base import geometry, log
 from mudg.base.errors import MudgError
-from mudg.base.types import Frame, Scene, Sweep
+from mudg.base.types import Frame, Scene, Sweep, SweepPoints, Track
 from mudg.data import scene_read
 
 Level = Literal["error", "warning", "note"]
@@ -20,6 +20,13 @@ MAX_SPEED_M_S = 70.0
 MAX_TIME_S = 24 * 3600.0
 MAX_TRACK_GAP_S = 1.0
 SAME_MOMENT_S = 0.06
+MAX_GAP_STEPS = 1.8
+MIN_STEP_M = 0.05
+MIN_COURSE_M = 3.0
+
+
+Say = Callable[[Level, str, str], None]
+Complain = Callable[[MudgError], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +47,7 @@ def check_scene(path: Path | str) -> list[Finding]:
     findings: list[Finding] = []
 
     def complain(problem: MudgError) -> None:
-        words = "; ".join(
-            part
-            for part in (
-                problem.what,
-                _and("expected", problem.expected),
-                _and("got", problem.got),
-                _and("what to do", problem.remedy),
-            )
-            if part
-        )
-        findings.append(Finding("error", problem.where or str(path), words))
+        findings.append(finding_of(problem, str(path)))
 
     def say(level: Level, where: str, words: str) -> None:
         findings.append(Finding(level, where, words))
@@ -60,9 +57,7 @@ def check_scene(path: Path | str) -> list[Finding]:
     except MudgError as problem:
         complain(problem)
         return findings
-    _check_motion(scene, say)
-    _check_tracks(scene, say)
-    _check_relations(scene, say)
+    check_records(scene, say)
     with log.task("checking files", len(scene.frames) + len(scene.sweeps)) as bar:
         for frame in scene.frames:
             _check_frame(scene, frame, complain, say)
@@ -70,16 +65,40 @@ def check_scene(path: Path | str) -> list[Finding]:
         for sweep in scene.sweeps:
             _check_sweep(scene, sweep, complain, say)
             bar.advance()
+    return worst_first(findings)
+
+
+def worst_first(findings: list[Finding]) -> list[Finding]:
+    """Errors, then warnings, then notes; each in the order found."""
     rank = {"error": 0, "warning": 1, "note": 2}
     return sorted(findings, key=lambda finding: rank[finding.level])
 
 
+def finding_of(problem: MudgError, where: str) -> Finding:
+    """A raised problem as a finding; ``where`` stands in for a missing place."""
+    words = "; ".join(
+        part
+        for part in (
+            problem.what,
+            _and("expected", problem.expected),
+            _and("got", problem.got),
+            _and("what to do", problem.remedy),
+        )
+        if part
+    )
+    return Finding("error", problem.where or where, words)
+
+
+def check_records(scene: Scene, say: Say) -> None:
+    """What can be said without opening images and clouds: motion, boxes, how things relate."""
+    _check_motion(scene, say)
+    _check_gaps(scene, say)
+    _check_tracks(scene, say)
+    _check_relations(scene, say)
+
+
 def _and(name: str, value: str) -> str:
     return f"{name}: {value}" if value else ""
-
-
-Say = Callable[[Level, str, str], None]
-Complain = Callable[[MudgError], None]
 
 
 def _check_motion(scene: Scene, say: Say) -> None:
@@ -132,6 +151,46 @@ def _check_motion(scene: Scene, say: Say) -> None:
             )
 
 
+def _check_gaps(scene: Scene, say: Say) -> None:
+    """Images or sweeps that seem to be missing: a step in time much longer than usual."""
+    streams = {f"camera {name}": [f.view.time_s for f in scene.frames_of(name)] for name in scene.cameras}
+    for sweep in scene.sweeps:
+        streams.setdefault(f"sensor {sweep.sensor}", []).append(sweep.time_s)
+    for where, times in streams.items():
+        steps = np.diff(times)
+        if len(steps) < 3:
+            continue
+        usual = float(np.median(steps))
+        gaps = np.flatnonzero(steps > MAX_GAP_STEPS * usual)
+        if len(gaps):
+            missing = int(np.round(steps[gaps] / max(usual, 1e-9) - 1).sum())
+            say(
+                "warning",
+                where,
+                f"about {missing} records are missing: {len(gaps)} gaps, the first of {steps[gaps[0]]:.2f} s after "
+                f"{times[int(gaps[0])]:.2f} s (usual: {usual:.3f} s)",
+            )
+
+
+def _check_course(track: Track, where: str, say: Say) -> None:
+    """Whether a moving box looks where it goes: a quarter turn means swapped sides or another zero of the yaw."""
+    steps = np.diff(track.world_from_object[:, :2, 3], axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    moving = length > MIN_STEP_M
+    if length[moving].sum() < MIN_COURSE_M:
+        return
+    forward = track.world_from_object[:-1, :2, 0][moving]
+    turn = np.rad2deg(np.arccos(np.clip((forward * steps[moving]).sum(1) / length[moving], -1, 1)))
+    typical = float(np.median(turn))
+    if 60 < typical < 120:
+        sides = "its width is larger than its length: they are swapped" if track.size_m[1] > track.size_m[0] else (
+            "are width and length swapped, or is yaw counted from another axis?"
+        )  # fmt: skip
+        say("warning", where, f"it moves sideways, {typical:.0f} degrees from where it looks; {sides}")
+    elif typical > 150:
+        say("warning", where, "it moves backwards all the time; is its yaw turned by 180 degrees?")
+
+
 def _check_tracks(scene: Scene, say: Say) -> None:
     if not scene.tracks:
         say("note", "tracks", "no tracked boxes: everything counts as static")
@@ -154,6 +213,7 @@ def _check_tracks(scene: Scene, say: Say) -> None:
             speed = np.linalg.norm(np.diff(track.world_from_object[:, :3, 3], axis=0), axis=1) / steps
             if speed.max() > MAX_SPEED_M_S:
                 say("warning", where, f"it moves at {speed.max():.0f} m/s; check ids and poses")
+            _check_course(track, where, say)
         tilt = np.rad2deg(np.arccos(np.clip(track.world_from_object[:, 2, 2], -1, 1))).max()
         if tilt > 30:
             say(
@@ -194,9 +254,7 @@ def _overlaps(times_s: np.ndarray, scene: Scene) -> bool:
 
 def _check_frame(scene: Scene, frame: Frame, complain: Complain, say: Say) -> None:
     try:
-        image = scene_read.read_image(scene, frame)
-        if image.max() == image.min():
-            say("warning", f"frame {frame.id}", f"the image is one flat colour ({image.flat[0]})")
+        check_image(frame, scene_read.read_image(scene, frame), say)
     except MudgError as problem:
         complain(problem)
     for name in frame.labels:
@@ -208,12 +266,21 @@ def _check_frame(scene: Scene, frame: Frame, complain: Complain, say: Say) -> No
             complain(problem)
 
 
+def check_image(frame: Frame, image: np.ndarray, say: Say) -> None:
+    """What is odd about a decoded image u8[H, W, 3]."""
+    if image.max() == image.min():
+        say("warning", f"frame {frame.id}", f"the image is one flat colour ({image.flat[0]})")
+
+
 def _check_sweep(scene: Scene, sweep: Sweep, complain: Complain, say: Say) -> None:
     try:
-        points = scene_read.read_points(scene, sweep)
+        check_points(scene, sweep, scene_read.read_points(scene, sweep), say)
     except MudgError as problem:
         complain(problem)
-        return
+
+
+def check_points(scene: Scene, sweep: Sweep, points: SweepPoints, say: Say) -> None:
+    """What is odd about the points of a sweep."""
     where = f"sweep {sweep.id}"
     if len(points.xyz) == 0:
         say("warning", where, "it has no points")

@@ -104,12 +104,13 @@ def decode_image(content: bytes, where: str, camera: Camera | None = None) -> ND
                     expected="upright pixels",
                     remedy="apply the rotation and write the image again",
                 )
-            if image.mode not in ("RGB", "L", "P", "RGBA"):
+            sixteen_bits = content[:4] == b"\x89PNG" and content[24:25] == b"\x10"  # Pillow would drop the lower half
+            if image.mode not in ("RGB", "L", "P", "RGBA") or sixteen_bits:
                 raise InputError(
                     "image is not 8-bit RGB or grey",
                     where=where,
                     expected="8 bits a channel",
-                    got=f"mode {image.mode}",
+                    got="16 bits a channel" if sixteen_bits else f"mode {image.mode}",
                     remedy="convert it to 8-bit RGB",
                 )
             if image.mode == "RGBA" and image.getextrema()[3] != (255, 255):

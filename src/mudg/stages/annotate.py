@@ -7,6 +7,7 @@ copied as it is. What made the labels is written into the scene's notes, so that
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from mudg.base.types import Frame, Scene, Sweep
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
 from mudg.data.scenefile import SceneWriter, read_image, read_points, read_scene
 from mudg.models.labellers import LABELLERS, LabelInput, Labels
+from mudg.stages import batch
 from mudg.stages.config import AnnotateConfig
 from mudg.stages.ingest import add_frame_copy, add_rest
 
@@ -57,6 +59,19 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
             writer.finish()
     folder.finish({"labelled": len(missing), "labeller": config.labeller if missing else "labels present"})
     return folder.path
+
+
+def run_many(
+    config: AnnotateConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
+) -> dict[str, Any]:
+    """``run`` for every scene of a list; see ``stages/batch.py``."""
+    entries = batch.shard(batch.read_list(listed), shard)
+    work = functools.partial(_one_of_many, config)
+    return batch.run_batch("annotate", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+
+
+def _one_of_many(config: AnnotateConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
+    return run(config, Path(entry.source), out, overwrite=overwrite)
 
 
 def _label_frames(config: AnnotateConfig, scene: Scene, writer: SceneWriter, out: Path) -> None:

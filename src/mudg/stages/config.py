@@ -23,6 +23,8 @@ class IngestConfig:
     """Size of the scene's images: longest side, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are never enlarged."""
     workers: int = Field(default=0, ge=0)
     """Threads that convert frames (0 = one per processor). The result does not depend on it."""
+    contact_sheet: bool = True
+    """Draw contact_sheet.jpg: frames with LiDAR and boxes, and the scene from above."""
     test_every: int = Field(default=4, ge=0)
     """Hold out every n-th frame of all cameras for scoring (0 = hold out none)."""
     format: str = "auto"

@@ -10,9 +10,12 @@ from collections.abc import Mapping
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mudg.base.versions import version
+
+if TYPE_CHECKING:
+    from mudg.data.scene_check import Finding
 
 _CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
@@ -49,24 +52,57 @@ def report_machine() -> dict[str, Any]:
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
-    """Check a scene directory or zip and say in words what is wrong or odd.
+    """Check a scene directory or zip, or a log in the neutral layout, and say in words what is wrong or odd.
 
     Returns:
-        Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if the scene cannot be used.
+        Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a sound
+        scene, ``alignment`` tells for each camera whether LiDAR and image edges agree.
     """
-    from mudg.data.scene_check import check_scene
+    from mudg.data.importers import RECOGNISERS
+    from mudg.data.importers.custom import check_log
+    from mudg.data.scene_check import Finding, check_scene, worst_first
 
-    found = check_scene(scene)
+    kind = next((name for name, looks_like in RECOGNISERS.items() if looks_like(scene)), "")
+    is_log = kind == "custom" and not (scene / "scene.json").is_file()
+    found = check_log(scene) if is_log else check_scene(scene)
+    if kind and not is_log and not (scene / "scene.json").is_file():
+        found = [
+            Finding(
+                "error", str(scene), f"this is a log ({kind}), not a scene; make one with `mudg ingest {scene} OUT`"
+            )
+        ]
+    alignment: dict[str, Any] = {}
+    agreements: list[str] = []
+    if not is_log and not any(f.level == "error" for f in found):
+        alignment, agreements, doubts = _alignment(scene)
+        found = worst_first([*found, *doubts])
     count = {level: sum(f.level == level for f in found) for level in ("error", "warning", "note")}
-    lines = [f"{f.level}: {f.where}: {f.words}" for f in found]
+    lines = [f"{f.level}: {f.where}: {f.words}" for f in found] + agreements
     if count["error"]:
         lines.append(f"{scene} cannot be used: {count['error']} errors, {count['warning']} warnings")
     else:
         lines.append(f"{scene} can be used: {count['warning']} warnings, {count['note']} notes")
     return {
         "scene": scene, "findings": [{"level": f.level, "where": f.where, "words": f.words} for f in found],
-        "usable": not count["error"], "text": "\n".join(lines), "exit_code": 3 if count["error"] else 0,
+        "alignment": alignment, "usable": not count["error"], "text": "\n".join(lines), "exit_code": 3 if count["error"] else 0,
     }  # fmt: skip
+
+
+def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
+    """Records for JSON, sentences about cameras that fit or cannot be judged, and findings about those that do not."""
+    from mudg.data.scene_check import Finding
+    from mudg.data.scenefile import read_scene
+    from mudg.stages import alignment
+
+    found = alignment.camera_alignment(read_scene(path))
+    records = {name: alignment.record(one) for name, one in found.items()}
+    fine = [alignment.words(name, one) for name, one in found.items() if one.verdict != "doubtful"]
+    doubts = [
+        Finding("warning", f"camera {name}", alignment.words(name, one).partition(": ")[2])
+        for name, one in found.items()
+        if one.verdict == "doubtful"
+    ]
+    return records, fine, doubts
 
 
 def _machine() -> dict[str, str]:

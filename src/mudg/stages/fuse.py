@@ -6,6 +6,7 @@ Images of held-out frames give no colours, so that nothing of what is scored lat
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from mudg.base.types import Frame, FusedCloud, Scene
 from mudg.core.fusion import FusionReport, FusionRules, Shot, SweepShots, fuse_sweeps
 from mudg.data.cloudfile import write_fused
 from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+from mudg.stages import batch
 from mudg.stages.config import FuseConfig
 
 _VERSION = 1
@@ -56,6 +58,19 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
         draw_top_view(loaded, cloud, report).save(temporary)
     folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
     return folder.path
+
+
+def run_many(
+    config: FuseConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
+) -> dict[str, Any]:
+    """``run`` for every scene of a list; see ``stages/batch.py``."""
+    entries = batch.shard(batch.read_list(listed), shard)
+    work = functools.partial(_one_of_many, config)
+    return batch.run_batch("fuse", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+
+
+def _one_of_many(config: FuseConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
+    return run(config, Path(entry.source), out, overwrite=overwrite)
 
 
 def rules_of(config: FuseConfig) -> FusionRules:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
 from mudg.data.scene_files import open_files
 from mudg.data.scenefile import SceneWriter, read_label, read_points, read_scene
+from mudg.stages import alignment, batch, contact_sheet
 from mudg.stages.config import IngestConfig
 
 CITY = "city"
@@ -52,10 +55,83 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
         f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "
         f"tracked boxes; {held_out} images held out"
     )
-    folder.finish(
-        {"frames": len(scene.frames), "sweeps": len(scene.sweeps), "tracks": len(scene.tracks), "held_out": held_out}
-    )
+    summary = {
+        "frames": len(scene.frames),
+        "sweeps": len(scene.sweeps),
+        "tracks": len(scene.tracks),
+        "held_out": held_out,
+    }
+    if config.contact_sheet:
+        sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
+        log.info(f"ingest: look at {sheet}")
+    folder.finish({**summary, **({} if source == CITY else _alignment(scene))})
     return folder.path
+
+
+def _alignment(scene: Scene) -> dict[str, Any]:
+    """How the images fit the LiDAR, for the summary; a doubtful camera is said aloud."""
+    found = alignment.camera_alignment(scene)
+    for name, one in found.items():
+        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.words(name, one)}")
+    return {"alignment": {name: alignment.record(one) for name, one in found.items()}}
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a command line asks for: settings, the log (empty with a list), and the folder to write."""
+
+    config: IngestConfig
+    log: str
+    out: Path
+
+
+def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False) -> Asked:
+    """Understand ``[FORMAT] LOG [OUT]`` beside ``--out``; with a list, ``[FORMAT] [OUT]``.
+
+    Raises:
+        UsageError: words are missing or too many, or a format is given twice.
+    """
+    left = list(words)
+    formats = ("auto", *IMPORTERS)
+    logs = 0 if many else 1
+    named = len(left) > 0 and left[0] in formats and (len(left) > logs + (out is None) or not Path(left[0]).exists())
+    if named:
+        if config.format not in ("auto", left[0]):
+            raise UsageError("two formats are given", got=f"{left[0]} and --format {config.format}")
+        config = replace(config, format=left.pop(0))
+    usage = "mudg ingest [FORMAT] LOG OUT, or mudg ingest [FORMAT] --list FILE --out ROOT"
+    source = "" if many or not left else left.pop(0)
+    if not many and not source:
+        raise UsageError("no log was given", expected=usage)
+    if left and out is None:
+        out = Path(left.pop(0))
+    if left:
+        unknown = not many and not Path(source).exists() and source != CITY
+        got = f"{source!r}, which is no format ({', '.join(formats)})" if unknown else " ".join([source, *left])
+        raise UsageError("there are too many words", expected=usage, got=got)
+    if out is None:
+        raise UsageError("no folder to write was given", expected=usage)
+    return Asked(config, source, out)
+
+
+_OF_A_LINE = ("format", "sequence", "frames", "cameras", "poses", "boxes")
+
+
+def run_many(
+    config: IngestConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
+) -> dict[str, Any]:
+    """``run`` for every log of a list; see ``stages/batch.py``. A line may set format, sequence, frames, cameras (with
+    commas), poses and boxes for itself."""
+    entries = batch.shard(batch.read_list(listed, _OF_A_LINE), shard)
+    work = functools.partial(_one_of_many, config)
+    return batch.run_batch("ingest", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+
+
+def _one_of_many(config: IngestConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
+    own: dict[str, Any] = dict(entry.settings)
+    if "cameras" in own:
+        own["cameras"] = tuple(own["cameras"].split(","))
+    return run(replace(config, **own), entry.source, out, overwrite=overwrite)
 
 
 Maker = Callable[[IngestConfig, Path, Path], Scene]
@@ -63,12 +139,13 @@ Maker = Callable[[IngestConfig, Path, Path], Scene]
 
 def _maker(config: IngestConfig, source: Path) -> Maker:
     """Who can read ``source``."""
+    named = None if config.format == "auto" else _importer(config.format)
     if not source.exists():
         raise InputError(
             "driving log does not exist", where=str(source), expected=f"a folder, a scene zip, or the word {CITY}"
         )
-    if config.format != "auto":
-        return _importer(config.format)
+    if named is not None:
+        return named
     if is_scene(source):
         return _copy_scene
     for name, looks_like in RECOGNISERS.items():

@@ -40,13 +40,27 @@ def _looks_like_waymo(source: Path) -> bool:
     return looks_like_waymo(source)
 
 
+def _custom(source: Path, out: Path, options: ImportOptions) -> Scene:
+    from mudg.data.importers.custom import import_custom
+
+    return import_custom(source, out, options)
+
+
+def _looks_like_custom(source: Path) -> bool:
+    from mudg.data.importers.custom import looks_like_custom
+
+    return looks_like_custom(source)
+
+
 IMPORTERS: Mapping[str, Importer] = {
+    "custom": _custom,
     "kitti": _kitti,
     "waymo": _waymo,
 }
 """Format name -> importer ``(source, out, options) -> Scene``."""
 
 RECOGNISERS: Mapping[str, Recogniser] = {
+    "custom": _looks_like_custom,
     "kitti": _looks_like_kitti,
     "waymo": _looks_like_waymo,
 }

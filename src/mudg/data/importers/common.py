@@ -17,17 +17,18 @@ any number of workers.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, MudgError
-from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion
+from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, pose_at, transform_points
+from mudg.base.types import EgoPath
 
 Item = TypeVar("Item")
 Matrix = NDArray[np.float64]
@@ -38,14 +39,16 @@ PLAUSIBLE_PERIOD_S: Final = (2e-3, 20.0)
 """Typical time between two records of one sensor; outside of it the unit is taken to be wrong."""
 POSE_TOLERANCE: Final = 1e-3
 QUATERNION_TOLERANCE: Final = 1e-2
+MAX_EXTRAPOLATION_S: Final = 0.15
+_DESKEW_STEPS: Final = 32
 
 
 # --- work over frames -------------------------------------------------------------------------------------------------
 
 
 def processors() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Processors this process may use; MUDG_THREADS says otherwise."""
+    return native.default_threads()
 
 
 def for_each(
@@ -240,3 +243,86 @@ def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matri
             got=f"length {length:.6g}",
         )
     return from_rotation_translation(matrix_from_quaternion(q), t)
+
+
+def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> Matrix:
+    """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
+
+    Raises:
+        InputError: more than ``max_beyond_s`` outside.
+    """
+    inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
+    if inside is not None:
+        return inside
+    first = time_s < ego.times_s[0]
+    beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
+    if beyond > max_beyond_s:
+        raise InputError(
+            "vehicle poses do not cover the images and scans",
+            where="ego path",
+            got=f"{beyond:.2f} s outside",
+            expected="poses from the first to the last frame",
+        )
+    if len(ego.times_s) == 1:
+        return ego.world_from_ego[0]
+    near, far = (0, 1) if first else (-1, -2)
+    step = float(abs(ego.times_s[far] - ego.times_s[near]))
+    if beyond > step:
+        return ego.world_from_ego[near]
+    # mirror the motion of the neighbouring interval: the pose at "beyond" before the end, turned around
+    back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
+    end = ego.world_from_ego[near]
+    return end if back is None else end @ invert(back) @ end
+
+
+def deskew(
+    xyz: NDArray[np.float32], dt_s: NDArray[np.float32], world_from_lidar: Callable[[float], Matrix], time_s: float
+) -> NDArray[np.float32]:
+    """Bring points that were measured while the sensor moved to one moment.
+
+    Args:
+        xyz: f32[N, 3] metres, each in the sensor's frame at its own time.
+        dt_s: f32[N], that time less ``time_s``.
+        world_from_lidar: the sensor's pose f64[4, 4] at a time; asked at 33 moments, points in between are blended linearly.
+        time_s: the moment wanted.
+
+    Returns:
+        f32[N, 3] in the sensor's frame at ``time_s``.
+    """
+    if len(xyz) == 0 or not dt_s.any():
+        return xyz
+    low, high = float(dt_s.min()), float(dt_s.max())
+    moments = np.linspace(low, max(high, low + 1e-9), _DESKEW_STEPS + 1)
+    lidar_from_world = invert(world_from_lidar(time_s))
+    corrections = [lidar_from_world @ world_from_lidar(time_s + float(moment)) for moment in moments]
+    place = (dt_s.astype(np.float64) - low) / (moments[-1] - low) * _DESKEW_STEPS
+    step = np.clip(place.astype(int), 0, _DESKEW_STEPS - 1)
+    out = np.empty_like(xyz)
+    for index in range(_DESKEW_STEPS):
+        chosen = step == index
+        if chosen.any():
+            share = (place[chosen] - index)[:, None]
+            points = xyz[chosen].astype(np.float64)
+            before, after = (transform_points(corrections[n], points) for n in (index, index + 1))
+            out[chosen] = before + share * (after - before)
+    return out
+
+
+# --- moments ----------------------------------------------------------------------------------------------------------
+
+
+def moments(times_s: Mapping[str, Sequence[float]]) -> list[list[str]]:
+    """Group frames for ``holdout_split``: the first camera's images are the moments, others join the nearest one.
+
+    Args:
+        times_s: camera -> times of its frames in order; frame n of a camera has the id ``<camera>/00000n``.
+
+    Returns:
+        Frame ids of each moment, in time order.
+    """
+    clock = np.array(next((times for times in times_s.values() if len(times)), []))
+    groups: list[list[str]] = [[] for _ in clock]
+    for camera, times in times_s.items():
+        for index, time_s in enumerate(times):
+            groups[int(np.abs(clock - time_s).argmin())].append(f"{camera}/{index:06d}")
+    return groups

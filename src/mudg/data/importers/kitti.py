@@ -32,9 +32,11 @@ from numpy.typing import NDArray
 
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import invert, pose_at, transform_points
-from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
+from mudg.base.geometry import invert, transform_points
+from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers import kitti_boxes, kitti_poses
+from mudg.data.importers.common import for_each, pose_near
+from mudg.data.importers.images import ImageFit, fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, read_calibration_day, read_calibration_text
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import SceneWriter, decode_image
@@ -44,7 +46,6 @@ FRAME_PERIOD_S: Final = 0.1
 SENSOR: Final = "velodyne"
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI: Geiger, Lenz, Stiller, Urtasun; attribution, non-commercial, share-alike)"
 CAMERA_NAMES: Final = {"image_02": "front", "image_03": "front_stereo", "image_00": "grey", "image_01": "grey_stereo"}
-_MAX_EXTRAPOLATION_S: Final = 0.15
 _TURN_STEPS: Final = 36
 
 
@@ -104,26 +105,35 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes += track_notes
     if frames != list(range(len(frames))):
         notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
+    fits = _fit_cameras(files, calibration, frames, options)
+    notes += [fit.words for fit in fits.values() if fit.words]
     for note in notes:
         log.info(f"kitti: {note}")
     origin = Source("kitti", LICENCE, None, tuple(notes))
-    with SceneWriter(out, source.resolve().name, origin) as writer, log.task("importing KITTI", len(frames)) as bar:
-        cameras = _add_cameras(writer, files, calibration, frames)
-        for index, number in enumerate(frames):
-            for name, camera in cameras.items():
+    with SceneWriter(out, source.resolve().name, origin) as writer:
+        for fit in fits.values():
+            writer.add_camera(fit.camera)
+
+        def convert(item: tuple[int, int]) -> None:
+            index, number = item
+            for name, fit in fits.items():
                 time_s = clock.image_s[name][number]
-                pose = motion.velo_at(time_s) @ calibration.velo_from_cam(files.numbers[name])
-                writer.add_frame(f"{name}/{index:06d}", View(camera, pose, time_s), files.images[name][number])
+                view = View(fit.camera, motion.velo_at(time_s) @ calibration.velo_from_cam(files.numbers[name]), time_s)
+                writer.add_frame(f"{name}/{index:06d}", view, fit.image(files.images[name][number]))
             if number in files.scans:
                 points = read_scan(files.scans[number])
                 if motion.untwist:
                     points = untwist_scan(points, motion.velo_at, clock.scan_s[number])
                 writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, clock.scan_s[number], world_from_velo[number], points)
-            bar.advance()
+
+        for_each(
+            list(enumerate(frames)), convert, workers=options.workers, title="importing KITTI",
+            name=lambda item: f"frame {item[1]}",
+        )  # fmt: skip
         for track in tracks:
             writer.add_track(track)
         writer.set_ego(motion.ego)
-        moments = [[f"{name}/{index:06d}" for name in cameras] for index in range(len(frames))]
+        moments = [[f"{name}/{index:06d}" for name in fits] for index in range(len(frames))]
         writer.set_split(holdout_split(moments, options.test_every))
         return writer.finish()
 
@@ -357,7 +367,7 @@ class _Motion:
 
     def velo_at(self, time_s: float) -> Matrix:
         """World-from-velodyne at a time."""
-        return _pose_near(self.ego, time_s) @ self.ego_from_velo
+        return pose_near(self.ego, time_s) @ self.ego_from_velo
 
 
 def _find_motion(
@@ -458,32 +468,6 @@ def _ego_from_packets(path: Path, frames: Sequence[int], clock: _Clock) -> EgoPa
     return EgoPath(times[later], poses[later])
 
 
-def _pose_near(ego: EgoPath, time_s: float) -> Matrix:
-    """Ego pose at a time; up to 0.15 s outside the path it goes on as it did between its two nearest keys."""
-    inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
-    if inside is not None:
-        return inside
-    first = time_s < ego.times_s[0]
-    beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
-    if beyond > _MAX_EXTRAPOLATION_S:
-        raise InputError(
-            "vehicle poses do not cover the images and scans",
-            where="ego path",
-            got=f"{beyond:.2f} s outside",
-            expected="poses from the first to the last frame",
-        )
-    if len(ego.times_s) == 1:
-        return ego.world_from_ego[0]
-    near, far = (0, 1) if first else (-1, -2)
-    step = float(abs(ego.times_s[far] - ego.times_s[near]))
-    if beyond > step:
-        return ego.world_from_ego[near]
-    # mirror the motion of the neighbouring interval: the pose at "beyond" before the end, turned around
-    back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
-    end = ego.world_from_ego[near]
-    return end if back is None else end @ invert(back) @ end
-
-
 # --- boxes and scans ------------------------------------------------------------------------------------------------
 
 
@@ -575,13 +559,12 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
     return SweepPoints(xyz, points.intensity, dt_s)
 
 
-def _add_cameras(
-    writer: SceneWriter, files: KittiFiles, calibration: KittiCalibration, frames: Sequence[int]
-) -> dict[str, Camera]:
-    cameras = {}
+def _fit_cameras(
+    files: KittiFiles, calibration: KittiCalibration, frames: Sequence[int], options: ImportOptions
+) -> dict[str, ImageFit]:
+    fits = {}
     for name, found in files.images.items():
         first = found[frames[0]]
         height, width = decode_image(store.read_bytes(first), str(first)).shape[:2]
-        cameras[name] = calibration.camera(files.numbers[name], name, width, height)
-        writer.add_camera(cameras[name])
-    return cameras
+        fits[name] = fit_images(calibration.camera(files.numbers[name], name, width, height), options)
+    return fits

@@ -16,6 +16,7 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import EgoPath, Scene, Source, View
 from mudg.data.importers import kitti_boxes
+from mudg.data.importers.images import fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, nearest_rotation
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scenefile import SceneWriter, decode_image
@@ -56,14 +57,15 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
             expected="data_list[0] with images.CAM2, lidar_points and instances",
         ) from error
     height, width = decode_image(store.read_bytes(image_path), str(image_path)).shape[:2]
-    camera = calibration.camera(2, "front", width, height)
+    fit = fit_images(calibration.camera(2, "front", width, height), options)
     world_from_velo = np.eye(4)
     tracks, _ = kitti_boxes.build_tracks(boxes, {0: world_from_velo}, {0: 0.0}, where)
     log.info(f"kitti: one frame from {where}")
-    notes = ("single frame: nothing moves, the world is the velodyne's frame",)
+    notes = ("single frame: nothing moves, the world is the velodyne's frame", *([fit.words] if fit.words else []))
     with SceneWriter(out, source.resolve().name, Source("kitti", LICENCE, None, notes)) as writer:
-        writer.add_camera(camera)
-        writer.add_frame("front/000000", View(camera, world_from_velo @ calibration.velo_from_cam(2), 0.0), image_path)
+        writer.add_camera(fit.camera)
+        view = View(fit.camera, world_from_velo @ calibration.velo_from_cam(2), 0.0)
+        writer.add_frame("front/000000", view, fit.image(image_path))
         writer.add_sweep(f"{SENSOR}/000000", SENSOR, 0.0, world_from_velo, read_scan(scan_path))
         for track in tracks:
             writer.add_track(track)

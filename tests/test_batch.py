@@ -1,0 +1,137 @@
+"""Many scenes: lists, shards, failures that stop nothing else, repeats that redo nothing, exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import kitti_folders as made
+import pytest
+from toy_scene import ToyStreet
+
+from mudg import cli
+from mudg.base.errors import InputError, UsageError
+from mudg.data.scenefile import read_scene
+from mudg.stages import batch
+
+
+def ok(entry: batch.Entry, out: Path, overwrite: bool) -> Path:
+    """Works, fails or dies as its source says."""
+    if entry.source.endswith("bad"):
+        raise InputError("it is broken", where=entry.source, got="nothing")
+    if entry.source.endswith("killed"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if entry.source.endswith("bug"):
+        raise ZeroDivisionError
+    out.mkdir(parents=True)
+    (out / "threads").write_text(os.environ["MUDG_THREADS"])
+    return out
+
+
+def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text(
+        "# drives\n\na/drive_1\n'b/drive 2' name=two sequence=07\n/abs/drive_3.zip   # comment\ncity name=c\n"
+    )
+    entries = batch.read_list(tmp_path / "list.txt", ("sequence",))
+    assert [(e.name, e.source, dict(e.settings)) for e in entries] == [
+        ("drive_1", str(tmp_path / "a/drive_1"), {}),
+        ("two", str(tmp_path / "b/drive 2"), {"sequence": "07"}),
+        ("drive_3", "/abs/drive_3.zip", {}),
+        ("c", "city", {}),
+    ]
+    (tmp_path / "scenes").mkdir()
+    for name in ("b", "a", ".hidden"):
+        (tmp_path / "scenes" / name).mkdir()
+    assert [e.name for e in batch.read_list(tmp_path / "scenes")] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "names no scenes"), ("# nothing\n", "names no scenes"), ("a/x\nb/x\n", "one folder"), ("a b\n", "no setting"),
+        ("a speed=3\n", "no setting"), ("'a\n", "cannot be split"), ("a name=../up\n", "folder name"),
+    ],
+)  # fmt: skip
+def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "list.txt").write_text(text)
+    with pytest.raises(InputError, match=words):
+        batch.read_list(tmp_path / "list.txt")
+
+
+def test_shards_are_a_partition() -> None:
+    entries = [batch.Entry(str(n), str(n)) for n in range(10)]
+    parts = [batch.shard(entries, f"{i}/3") for i in range(3)]
+    assert sorted(int(e.name) for part in parts for e in part) == list(range(10))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    assert batch.shard(entries, "") == entries
+    for text in ("3/3", "1", "a/b", "-1/3", "1/0"):
+        with pytest.raises(UsageError, match="shard"):
+            batch.shard(entries, text)
+
+
+def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    entries = [batch.Entry(name, name) for name in ("bad", "good", "killed", "bug", "fine")]
+    result = batch.run_batch("ingest", entries, tmp_path, ok, jobs=2, shard_text="1/4")
+    assert result["exit_code"] == 13
+    states = {record["name"]: (record["state"], record["words"]) for record in result["scenes"]}
+    assert list(states) == ["bad", "good", "killed", "bug", "fine"]
+    assert states["bad"] == ("failed", "it is broken; bad; got nothing")
+    assert states["killed"][0] == "failed" and "signal 9" in states["killed"][1] and "memory" in states["killed"][1]
+    assert states["bug"][0] == "failed" and "code 1" in states["bug"][1]
+    assert states["good"][0] == states["fine"][0] == "done"
+    assert "2 of 5 scenes are there, 3 failed" in result["text"]
+    assert "ZeroDivisionError" in capfd.readouterr().err
+    written = json.loads((tmp_path / "status-1-of-4.json").read_text())
+    assert written["counts"] == {"done": 2, "reused": 0, "failed": 3}
+
+
+def test_many_logs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("one", "two"):
+        made.write_raw_drive(tmp_path / name)
+    drives = [next(p for p in (tmp_path / name).iterdir() if p.is_dir()) for name in ("one", "two")]
+    broken = drives[1] / "velodyne_points" / "data" / "0000000004.bin"
+    content = broken.read_bytes()
+    broken.write_bytes(content[:-5])
+    (tmp_path / "list.txt").write_text(f"{drives[0]} name=first frames=0:3\n{drives[1]} name=second\n")
+    words = [
+        "ingest",
+        "kitti",
+        "--list",
+        str(tmp_path / "list.txt"),
+        "--out",
+        str(tmp_path / "scenes"),
+        "--jobs",
+        "2",
+        "--quiet",
+    ]
+    assert cli.main(words) == 11
+    said = capsys.readouterr().out
+    assert "1 of 2 scenes are there, 1 failed" in said and "cut off" in said
+    assert len(read_scene(tmp_path / "scenes" / "first").frames) == 3
+    assert not (tmp_path / "scenes" / "second" / "scene.json").exists()
+    broken.write_bytes(content)
+    assert cli.main(words) == 0
+    table = capsys.readouterr().out
+    assert "reused" in table and "done" in table
+    assert len(read_scene(tmp_path / "scenes" / "second").frames) == 6
+
+
+@pytest.mark.slow
+def test_many_scenes_fused_by_shards(tmp_path: Path) -> None:
+    for index, name in enumerate(("one", "two", "three")):
+        ToyStreet(wall_x=20.0 + index).write(tmp_path / "scenes" / name, width=60, height=30)
+    (tmp_path / "scenes" / "status.json").write_text("{}")
+    words = ["fuse", "--list", str(tmp_path / "scenes"), "--out", str(tmp_path / "fused"), "--quiet", "--shard"]
+    assert cli.main([*words, "0/2"]) == 0
+    assert sorted(p.name for p in (tmp_path / "fused").iterdir()) == ["one", "status-0-of-2.json", "two"]
+    assert cli.main([*words, "1/2"]) == 0
+    assert (tmp_path / "fused" / "three" / "static.safetensors").is_file()
+
+
+def test_list_flags_alone_make_no_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["fuse", "scene", "--out", str(tmp_path / "o"), "--shard", "0/2"]) == 2
+    assert cli.main(["annotate", "--out", str(tmp_path / "o")]) == 2
+    assert cli.main(["fuse", "scene", "--list", "x", "--out", str(tmp_path / "o")]) == 2
+    assert "not both" in capsys.readouterr().err

@@ -1,0 +1,220 @@
+"""Point cloud files: what was written is read back, and what lies is refused before anything is allocated."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mudg.base.errors import InputError
+from mudg.data.importers import clouds
+
+XYZ = np.array([[1.5, -2, 3], [4, 5.25, -6], [0, 0, 0.5]], np.float32)
+LEVEL = np.array([0, 128, 255], np.uint16)
+
+
+def pcd_header(kind: str, points: int, fields: str = "x y z _ level", counts: str = "1 1 1 6 1") -> bytes:
+    sizes = " ".join({"level": "2", "_": "1"}.get(f, "4") for f in fields.split())
+    types = " ".join({"level": "U", "_": "U"}.get(f, "F") for f in fields.split())
+    return (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n"
+        f"COUNT {counts}\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {kind}\n"
+    ).encode()
+
+
+def lzf_literals(data: bytes) -> bytes:
+    """LZF that never refers back."""
+    pieces = [data[n : n + 32] for n in range(0, len(data), 32)]
+    return b"".join(bytes([len(piece) - 1]) + piece for piece in pieces)
+
+
+def pcd(kind: str) -> bytes:
+    if kind == "ascii":
+        rows = "".join(
+            f"{x} {y} {z} 0 0 0 0 0 0 {v}\n" for (x, y, z), v in zip(XYZ.tolist(), LEVEL.tolist(), strict=True)
+        )
+        return pcd_header(kind, 3) + rows.encode()
+    rows = [p.tobytes() + bytes(6) + v.tobytes() for p, v in zip(XYZ, LEVEL, strict=True)]
+    if kind == "binary":
+        return pcd_header(kind, 3) + b"".join(rows)
+    flat = XYZ.T.tobytes() + bytes(18) + LEVEL.tobytes()
+    packed = lzf_literals(flat)
+    return pcd_header(kind, 3) + np.array([len(packed), len(flat)], "<u4").tobytes() + packed
+
+
+def ply(order: str) -> bytes:
+    header = f"ply\nformat {order} 1.0\ncomment made by hand\nelement vertex 3\nproperty float x\nproperty float y\n"
+    header += (
+        "property float z\nproperty ushort level\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    if order == "ascii":
+        rows = "".join(f"{x} {y} {z} {v}\n" for (x, y, z), v in zip(XYZ.tolist(), LEVEL.tolist(), strict=True))
+        return (header + rows + "3 0 1 2\n").encode()
+    mark = "<" if "little" in order else ">"
+    rows = b"".join(
+        p.astype(f"{mark}f4").tobytes() + np.array([v], f"{mark}u2").tobytes() for p, v in zip(XYZ, LEVEL, strict=True)
+    )
+    return header.encode() + rows + b"\3" + np.arange(3, dtype=f"{mark}i4").tobytes()
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+GOOD = {
+    "a.pcd": pcd("ascii"), "b.pcd": pcd("binary"), "c.pcd": pcd("binary_compressed"),
+    "a.ply": ply("ascii"), "b.ply": ply("binary_little_endian"), "c.ply": ply("binary_big_endian"),
+    "a.npz": npz(xyz=XYZ, level=LEVEL),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_every_form_gives_the_same_points(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(GOOD[name])
+    cloud = clouds.read_cloud(tmp_path / name)
+    assert (cloud.xyz == XYZ).all()
+    assert (cloud.fields["level"] == LEVEL).all()
+    assert set(cloud.fields) == {"level"}
+    assert cloud.missing == 0
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_every_cut_is_refused_and_never_something_else(name: str) -> None:
+    reader = clouds.READERS[Path(name).suffix]
+    whole = GOOD[name]
+    # what may be lost unseen: faces behind the points, and in text the digits of the very last number
+    tail = {"b.ply": 13, "c.ply": 13, "a.ply": len(b"255\n3 0 1 2\n"), "a.pcd": len(b"255\n")}.get(name, 0)
+    for length in range(0, len(whole) - tail, 3):
+        with pytest.raises(InputError):
+            reader(whole[:length], "x")
+
+
+def test_kitti_rows(tmp_path: Path) -> None:
+    rows = np.concatenate([XYZ, [[0.5], [0.25], [1]]], 1).astype("<f4")
+    (tmp_path / "a.bin").write_bytes(rows.tobytes())
+    cloud = clouds.read_cloud(tmp_path / "a.bin")
+    assert (cloud.xyz == XYZ).all()
+    assert cloud.fields["intensity"].tolist() == [0.5, 0.25, 1]
+    (tmp_path / "a.bin").write_bytes(rows.tobytes()[:-2])
+    with pytest.raises(InputError, match="cut off"):
+        clouds.read_cloud(tmp_path / "a.bin")
+
+
+def test_missing_returns_are_left_out_and_half_missing_ones_refused(tmp_path: Path) -> None:
+    xyz = XYZ.copy()
+    xyz[1] = np.nan
+    (tmp_path / "a.npz").write_bytes(npz(xyz=xyz, level=LEVEL))
+    cloud = clouds.read_cloud(tmp_path / "a.npz")
+    assert cloud.missing == 1 and (cloud.xyz == XYZ[[0, 2]]).all() and cloud.fields["level"].tolist() == [0, 255]
+    xyz[0, 2] = np.inf
+    (tmp_path / "a.npz").write_bytes(npz(xyz=xyz))
+    with pytest.raises(InputError, match="not finite"):
+        clouds.read_cloud(tmp_path / "a.npz")
+
+
+def npy_lie() -> bytes:
+    """An archive whose array says it has 10^12 rows."""
+    honest = npz(xyz=np.zeros((1, 3)))
+    with zipfile.ZipFile(io.BytesIO(honest)) as archive:
+        member = archive.read("xyz.npy").replace(b"(1, 3), }" + b" " * 12, b"(1" + b"0" * 12 + b", 3), }")
+    assert b"1000000000000" in member
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("xyz.npy", member)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content", "words"),
+    [
+        (".pcd", pcd_header("binary", 10**7), "cut off"),
+        (".pcd", pcd_header("ascii", 10**7), "cut off"),
+        (".pcd", pcd_header("binary", 10**30), "count makes no sense"),
+        (
+            ".pcd",
+            pcd_header("binary_compressed", 10**7) + np.array([4, 26 * 10**7], "<u4").tobytes() + bytes(4),
+            "contradicts",
+        ),
+        (".pcd", pcd_header("binary", 3).replace(b"WIDTH 3", b"WIDTH 4") + bytes(99), "contradicts"),
+        (".pcd", pcd_header("zipped", 3) + bytes(99), "no known kind"),
+        (".pcd", pcd_header("binary", 3, "a b", "1 1").replace(b"TYPE F F", b"TYPE Q F") + bytes(99), "unknown type"),
+        (".pcd", b"not a cloud at all", "not a PCD file"),
+        (
+            ".ply",
+            b"ply\nformat ascii 1.0\nelement vertex 999999999\nproperty float x\nend_header\n1 2\n",
+            "count makes no sense",
+        ),
+        (
+            ".ply",
+            b"ply\nformat ascii 1.0\nelement vertex 9\nproperty list uchar int x\nend_header\n1 2\n",
+            "no known type",
+        ),
+        (".ply", b"ply\nformat ascii 1.0\nelement face 9\nelement vertex 9\nend_header\n", "do not come first"),
+        (".npz", npy_lie(), "declared size"),
+        (".npz", npz(xyz=np.array([[1, 2, object()]], object)), "plain numbers"),
+        (".npz", npz(points=XYZ), "no coordinates"),
+        (".npz", npz(xyz=XYZ, level=LEVEL[:2]), "does not fit"),
+    ],
+)
+def test_lies_are_refused(suffix: str, content: bytes, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        clouds.READERS[suffix](content, "cloud")
+
+
+def test_files_without_coordinates_or_of_another_kind_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.pcd").write_bytes(pcd_header("ascii", 1, "a b", "1 1") + b"1 2\n")
+    with pytest.raises(InputError, match="no coordinates") as caught:
+        clouds.read_cloud(tmp_path / "a.pcd")
+    assert "a, b" in caught.value.got
+    (tmp_path / "a.las").write_bytes(b"LASF")
+    with pytest.raises(InputError, match="format is not known"):
+        clouds.read_cloud(tmp_path / "a.las")
+
+
+def lzf_compress(data: bytes) -> bytes:
+    """A plain LZF packer: longest match of at least 3 bytes within 8192, else literals."""
+    out, literals, at = bytearray(), bytearray(), 0
+
+    def flush() -> None:
+        out.extend(lzf_literals(bytes(literals)))
+        literals.clear()
+
+    while at < len(data):
+        best, back = 0, 0
+        for distance in range(1, min(at, 300) + 1):
+            length = 0
+            while length < 264 and at + length < len(data) and data[at + length] == data[at + length - distance]:
+                length += 1
+            if length > best:
+                best, back = length, distance
+        if best < 3:
+            literals.append(data[at])
+            at += 1
+            continue
+        flush()
+        high, low = divmod(back - 1, 256)
+        out += bytes([(min(best - 2, 7) << 5) | high, *([best - 9] if best >= 9 else []), low])
+        at += best
+    flush()
+    return bytes(out)
+
+
+@given(st.lists(st.tuples(st.binary(min_size=1, max_size=5), st.integers(1, 60)), max_size=8))
+def test_lzf_unpacks_what_was_packed_overlaps_too(pieces: list[tuple[bytes, int]]) -> None:
+    data = b"".join(piece * times for piece, times in pieces)
+    assert clouds.lzf_decompress(lzf_compress(data), len(data), "x") == data
+
+
+@given(st.binary(max_size=60), st.integers(0, 300))
+def test_lzf_noise_is_refused_or_has_the_length_asked_for(noise: bytes, length: int) -> None:
+    try:
+        assert len(clouds.lzf_decompress(noise, length, "x")) == length
+    except InputError:
+        pass

@@ -1,0 +1,310 @@
+"""The neutral layout: round trips in every cloud form, the template converter, and each trap refused in words."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import roundtrip
+import write_custom
+from PIL import Image
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import invert
+from mudg.base.types import Scene, SweepPoints
+from mudg.data.importers import IMPORTERS, RECOGNISERS, common, custom
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scenefile import read_points
+
+pytestmark = roundtrip.needs_native
+LIDAR = "lidar"
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
+
+
+@pytest.fixture(scope="module")
+def written(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_custom.write_log(truth, tmp_path_factory.mktemp("written") / "log")
+
+
+@pytest.fixture
+def log(written: Path, tmp_path: Path) -> Iterator[Path]:
+    """A copy that may be damaged: files are links to the written ones, which nothing writes through."""
+    root = tmp_path / "log"
+    for path in written.rglob("*"):
+        target = root / path.relative_to(written)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_file():
+            target.write_bytes(path.read_bytes())
+    return root
+
+
+def edit(log: Path, change: Any) -> None:
+    content = json.loads((log / "log.json").read_text())
+    change(content)
+    (log / "log.json").write_text(json.dumps(content))
+
+
+def words_of(log: Path, level: str = "error") -> str:
+    return "\n".join(f"{f.where}: {f.words}" for f in custom.check_log(log) if f.level == level)
+
+
+# ---- round trips ----
+
+
+@pytest.mark.parametrize("suffix", list(write_custom.CLOUDS))
+def test_what_was_written_is_read_back(truth: Scene, tmp_path: Path, suffix: str) -> None:
+    log = write_custom.write_log(truth, tmp_path / "log", suffix)
+    assert [name for name, looks_like in RECOGNISERS.items() if looks_like(log)] == ["custom"]
+    scene = IMPORTERS["custom"](log, tmp_path / "scene", ImportOptions(workers=2))
+    roundtrip.assert_same_log(scene, truth, time_s=2e-9)
+    assert scene.sweeps[0].sensor == LIDAR
+    assert [i for i, s in scene.split.items() if s == "test"] == ["front/000004", "front_left/000004"]
+
+
+def test_the_template_converter_makes_a_log_that_is_the_recording(
+    truth: Scene, tmp_path: Path, repository: Path
+) -> None:
+    recording = write_custom.write_recording(truth, tmp_path / "recording")
+    script = repository / "docs" / "examples" / "convert_my_log.py"
+    assert len(script.read_text().splitlines()) < 100
+    (tmp_path / "log").mkdir()
+    subprocess.run([sys.executable, str(script), str(recording), str(tmp_path / "log")], check=True)
+    assert words_of(tmp_path / "log") == ""
+    scene = IMPORTERS["custom"](tmp_path / "log", tmp_path / "scene", ImportOptions())
+    roundtrip.assert_same_log(scene, truth, time_s=2e-9, dt_s=1e-7)
+
+
+def test_a_good_log_has_no_errors_or_warnings(written: Path) -> None:
+    assert [f for f in custom.check_log(written) if f.level != "note"] == []
+
+
+def test_frames_and_cameras_are_chosen_by_the_first_cameras_clock(written: Path, truth: Scene, tmp_path: Path) -> None:
+    options = ImportOptions(frames=(1, 4), cameras=("front_left",), resolution=(48, 32))
+    scene = IMPORTERS["custom"](written, tmp_path / "scene", options)
+    assert [f.id for f in scene.frames] == [f"front_left/{n:06d}" for n in range(3)]
+    assert len(scene.sweeps) == 3
+    camera, original = scene.cameras["front_left"], truth.cameras["front_left"]
+    assert (camera.width, camera.height, camera.fx, camera.cy) == (48, 32, original.fx / 2, original.cy / 2)
+    for wrong in ({"cameras": ("rear",)}, {"frames": (7, 9)}, {"sequence": "1"}):
+        with pytest.raises(UsageError):
+            IMPORTERS["custom"](written, tmp_path / "other", ImportOptions(**wrong))
+
+
+def test_twisted_sweeps_are_straightened_with_the_times_of_their_points(truth: Scene, tmp_path: Path) -> None:
+    """Points are twisted as a moving sensor would measure them; the import must undo it."""
+
+    def lidar_at(time_s: float) -> np.ndarray:
+        return common.pose_near(truth.ego, time_s) @ mounted
+
+    mounted = write_custom.rig(truth)[LIDAR]
+
+    def twist(log: dict[str, Any]) -> None:
+        for record, sweep in zip(log["sweeps"], truth.sweeps, strict=True):
+            points = read_points(truth, sweep)
+            twisted = points.xyz.copy()
+            for dt_s in np.unique(points.dt_s):
+                chosen = points.dt_s == dt_s
+                own_from_sweep = invert(lidar_at(sweep.time_s + float(dt_s))) @ lidar_at(sweep.time_s)
+                twisted[chosen] = points.xyz[chosen] @ own_from_sweep[:3, :3].T + own_from_sweep[:3, 3]
+            content = write_custom.npz(SweepPoints(twisted, points.intensity, points.dt_s))
+            (tmp_path / "log" / record["file"]).write_bytes(content)
+        log["lidars"][LIDAR] |= {"motion_compensated": False, "time_field": "t", "time_unit": "s"}
+
+    log = write_custom.write_log(truth, tmp_path / "log", edit=twist)
+    scene = IMPORTERS["custom"](log, tmp_path / "scene", ImportOptions())
+    roundtrip.assert_same_log(scene, truth, time_s=2e-9, dt_s=1e-7, cloud_m=2e-3)
+    raw = IMPORTERS["custom"](log, tmp_path / "raw", ImportOptions(untwist="no"))
+    with pytest.raises(AssertionError, match="of points lie within"):
+        roundtrip.assert_same_log(raw, truth, time_s=2e-9, cloud_m=2e-2)
+
+
+def test_point_times_of_the_epoch_keep_their_nanoseconds(truth: Scene, tmp_path: Path) -> None:
+    def absolute(log: dict[str, Any]) -> None:
+        for record, sweep in zip(log["sweeps"], truth.sweeps, strict=True):
+            points = read_points(truth, sweep)
+            times = record["time"] + np.round(points.dt_s.astype(np.float64) * 1e9).astype(np.int64)
+            np.savez(tmp_path / "log" / record["file"], xyz=points.xyz, stamp=times.astype(np.uint64))
+        log["lidars"][LIDAR] |= {"time_field": "stamp", "time_unit": "ns", "time_from": "log", "intensity_field": ""}
+
+    log = write_custom.write_log(truth, tmp_path / "log", edit=absolute)
+    scene = IMPORTERS["custom"](log, tmp_path / "scene", ImportOptions())
+    roundtrip.assert_same_log(scene, truth, time_s=2e-9, dt_s=1e-8, intensity=None)
+    edit(log, lambda content: content["lidars"][LIDAR].update(time_from="sweep"))
+    assert "far from their sweep's" in words_of(log)
+
+
+# ---- traps ----
+
+
+def scale(pose: list[list[float]], factor: float) -> None:
+    for row in pose[:3]:
+        row[:3] = [value * factor for value in row[:3]]
+
+
+def mirror(pose: list[list[float]]) -> None:
+    for row in pose[:3]:
+        row[1] = -row[1]
+
+
+def divide_times(log: dict[str, Any], by: int) -> None:
+    for record in [*log["ego"], *log["images"], *log["sweeps"], *(b for t in log["tracks"] for b in t["boxes"])]:
+        record["time"] //= by
+
+
+TRAPS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "images unsorted": (lambda l: l["images"].reverse(), ("timestamps do not increase", "images of front")),
+    "microseconds called ns": (lambda l: divide_times(l, 1000), ("another unit", "us")),
+    "milliseconds called ns": (lambda l: divide_times(l, 10**6), ("another unit", "ms")),
+    "scaled pose": (lambda l: scale(l["ego"][2]["world_from_ego"], 1000), ("pose is scaled", "ego[2]")),
+    "left-handed camera": (
+        lambda l: mirror(l["cameras"]["front"]["ego_from_camera"]), ("left-handed", "cameras.front.ego_from_camera")
+    ),
+    "Windows path": (
+        lambda l: l["images"][3].update(file="images\\front\\000001.png"), ("backslash", "images[3].file")
+    ),
+    "path that leads out": (lambda l: l["sweeps"][0].update(file="../../etc/passwd"), ("component '..'", "sweeps[0].file")),
+    "unknown camera": (lambda l: l["images"][0].update(camera="frnt"), ("does not have", "frnt", "images[0].camera")),
+    "camera without images": (
+        lambda l: l.update(images=[i for i in l["images"] if i["camera"] == "front"]), ("front_left has no images",)
+    ),
+    "LiDAR without sweeps": (lambda l: l.update(sweeps=[]), ("lidar has no sweeps",)),
+    "box without width": (lambda l: l["tracks"][0].update(size_m=[4.0, 0.0, 1.5]), ("box size makes no sense",)),
+    "two tracks of one id": (lambda l: l["tracks"][1].update(id=l["tracks"][0]["id"]), ("two tracks have one id",)),
+    "millimetre lens": (lambda l: l["cameras"]["front"].update(fx=0.0042), ("focal length makes no sense",)),
+    "misspelt field": (lambda l: l["cameras"]["front"].update(distortions=[1]), ("unknown field", "did you mean 'distortion'")),
+    "other clock": (
+        lambda l: [i.update(time=i["time"] + 9 * 10**9) for i in l["images"]], ("do not cover", "are the clocks the same")
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_traps_are_refused_in_words_by_doctor_and_ingest_alike(log: Path, tmp_path: Path, trap: str) -> None:
+    change, expected = TRAPS[trap]
+    edit(log, change)
+    found = words_of(log)
+    for words in expected:
+        assert words in found
+    with pytest.raises(InputError):
+        IMPORTERS["custom"](log, tmp_path / "scene", ImportOptions())
+    assert not (tmp_path / "scene").exists()
+
+
+def turn_grey(path: Path) -> None:
+    with Image.open(path) as opened:
+        grey = opened.convert("L")
+    grey.save(path)
+
+
+def damage_image(log: Path, kind: str) -> None:
+    path = log / "images" / "front" / "000002.png"
+    with Image.open(path) as opened:
+        image = opened.copy()
+    if kind == "grey":
+        turn_grey(path)
+    elif kind == "16 bits":
+        Image.fromarray(np.zeros((64, 96), np.uint16)).save(path)
+    elif kind == "EXIF":
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        image.save(path.with_suffix(".jpg"), exif=exif)
+        path.with_suffix(".jpg").replace(path)
+    elif kind == "another size":
+        image.resize((48, 32)).save(path)
+    elif kind == "cut off":
+        path.write_bytes(path.read_bytes()[:500])
+    else:
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("grey", "image is grey"), ("16 bits", "8-bit RGB"), ("EXIF", "stored rotated"), ("another size", "camera's size"),
+        ("cut off", "cannot be decoded"), ("missing", "file not found"),
+    ],
+)  # fmt: skip
+def test_bad_images_are_named(log: Path, tmp_path: Path, kind: str, words: str) -> None:
+    damage_image(log, kind)
+    found = words_of(log)
+    assert words in found and "000002" in found
+    with pytest.raises(InputError, match=words):
+        IMPORTERS["custom"](log, tmp_path / "scene", ImportOptions())
+
+
+def test_bad_clouds_are_named(log: Path, tmp_path: Path) -> None:
+    cloud = log / "lidar" / LIDAR / "000001.npz"
+    np.savez(cloud, xyz=np.zeros((0, 3), np.float32), intensity=np.zeros(0, np.float32))
+    np.savez(cloud.with_name("000002.npz"), xyz=np.ones((3, 3), np.float32), intensity=np.array([0, 17, 255]))
+    np.savez(cloud.with_name("000003.npz"), xyz=np.ones((3, 3), np.float32))
+    found = words_of(log)
+    for words in ("no points", "intensity is out of range", "intensity_max", "cloud has no intensity"):
+        assert words in found
+    with pytest.raises(InputError, match="no points") as caught:
+        IMPORTERS["custom"](log, tmp_path / "scene", ImportOptions())
+    assert "000001" in caught.value.where
+
+
+def test_a_missing_file_can_be_left_out(log: Path, tmp_path: Path) -> None:
+    (log / "images" / "front" / "000002.png").unlink()
+    (log / "lidar" / LIDAR / "000000.npz").unlink()
+    scene = IMPORTERS["custom"](log, tmp_path / "scene", ImportOptions(skip_missing=True))
+    assert (len(scene.frames_of("front")), len(scene.frames_of("front_left")), len(scene.sweeps)) == (4, 5, 4)
+
+
+def test_all_problems_are_listed_at_once_and_alike_ones_counted(log: Path) -> None:
+    damage_image(log, "grey")
+    for image in (log / "images" / "front_left").iterdir():
+        turn_grey(image)
+
+    def change(content: dict[str, Any]) -> None:
+        scale(content["cameras"]["front"]["ego_from_camera"], 2)
+        content["tracks"][0]["size_m"] = [-1, 2, 3]
+        content["sweeps"][1]["file"] = "lidar/none.npz"
+
+    edit(log, change)
+    found = words_of(log)
+    for words in ("pose is scaled", "box size makes no sense", "file not found", "image is grey"):
+        assert words in found
+    assert found.count("image is grey") == 5  # of front_left; front is left out with its pose
+    turn_grey(log / "images/front/000000.png")
+    edit(log, lambda content: scale(content["cameras"]["front"]["ego_from_camera"], 0.5))
+    found = words_of(log)
+    assert "2 more" in found
+
+
+def test_boxes_that_move_sideways_are_warned_about(log: Path, truth: Scene) -> None:
+    mover = max(
+        truth.tracks, key=lambda t: np.linalg.norm(t.world_from_object[-1, :3, 3] - t.world_from_object[0, :3, 3])
+    )
+    path_m = np.linalg.norm(mover.world_from_object[-1, :3, 3] - mover.world_from_object[0, :3, 3])
+    assert path_m > 3
+
+    def turn(content: dict[str, Any]) -> None:
+        track = next(t for t in content["tracks"] if t["id"] == mover.id)
+        length, width, height = track["size_m"]
+        track["size_m"] = [width, length, height]
+        for box in track["boxes"]:
+            pose = np.array(box["world_from_object"])
+            box["world_from_object"] = (
+                pose @ np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+            ).tolist()
+
+    edit(log, turn)
+    found = words_of(log, "warning")
+    assert "moves sideways" in found and "they are swapped" in found and mover.id in found
+
+
+def test_a_missing_sweep_is_warned_about(log: Path) -> None:
+    edit(log, lambda content: content["sweeps"].pop(2))
+    assert "about 1 records are missing" in words_of(log, "warning")
