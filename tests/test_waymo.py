@@ -8,6 +8,7 @@ import struct
 import sys
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -238,6 +239,20 @@ def test_boxes_are_carried_to_the_moment_of_the_points(late: np.ndarray) -> None
     (track,), notes = waymo_tracks.build_tracks(timed(times, late, velocity))
     assert np.abs(track.world_from_object[:, :3, 3] - (times[:, None] * velocity + [20, 5, 1])).max() < 1e-9
     assert (track.id, track.label, track.size_m.tolist(), notes) == ("t-a_b", "vehicle", [4.0, 2.0, 1.5], [])
+
+
+def test_tracks_cover_the_images_of_their_frames() -> None:
+    times, velocity = np.arange(4) * 0.1, np.array([12.0, -3.0, 0.0])
+    frames = [
+        replace(frame, images_s=(frame.time_s - 0.03, frame.time_s + 0.02))
+        for frame in timed(times, np.zeros(4), velocity)
+    ]
+    (track,), _ = waymo_tracks.build_tracks(frames)
+    assert track.times_s == pytest.approx([-0.03, 0, 0.1, 0.2, 0.3, 0.32])
+    assert np.abs(track.world_from_object[:, :3, 3] - (track.times_s[:, None] * velocity + [20, 5, 1])).max() < 1e-9
+    (alone,), _ = waymo_tracks.build_tracks(frames[:1])
+    assert alone.times_s == pytest.approx([-0.03, 0, 0.02])
+    assert np.ptp(alone.world_from_object, axis=0).max() == 0
 
 
 def test_tracks_are_split_at_gaps_and_odd_ones_named() -> None:
@@ -745,6 +760,7 @@ def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> N
     assert np.mean([track.size_m[0] > track.size_m[1] for track in cars]) > 0.9  # longer than wide
     assert scene.cameras["front"].readout_s == pytest.approx(0.044, abs=1e-3)
     for frame in scene.frames:
+        assert all(track.pose_at(frame.view.time_s) is not None for track in scene.tracks)
         assert frame.view.world_from_cam[2, 1] < -0.99  # the image's down is the world's down
         assert frame.view.center_world[2] == pytest.approx(2.1, abs=0.2)
         semantics = read_label(scene, frame, "semantics")

@@ -279,7 +279,9 @@ class _Plan:
             late -= self.middle_s[frame.number]
         elif moment == "seen":
             late = self.seen_s(frame) - self.middle_s[frame.number]
-        return TimedBoxes(self.pose_s(frame), self.world_from_vehicle(frame), frame.boxes, late, frame.where)
+        times = [waymo_camera.middle_of_exposure(shot)[1] - self.start_us / 1e6 for shot in frame.shots.values()]
+        images_s = (min(times), max(times)) if times else None
+        return TimedBoxes(self.pose_s(frame), self.world_from_vehicle(frame), frame.boxes, late, frame.where, images_s)
 
     def seen_s(self, frame: FrameRecord) -> NDArray[np.float64]:
         """When the top LiDAR looked at each box, seconds after the timestamp; without one, the moment of the frame's pose."""

@@ -27,6 +27,7 @@ MOMENTS: Final[tuple[Moment, ...]] = ("seen", "start", "pose")
 FAST_M_S: Final = 3.0
 _CLEAR_GAIN: Final = 1.05
 _FLOOR_M: Final = 0.3
+_SAME_TIME_S: Final = 1e-4
 
 MAX_GAP_S: Final = 0.55
 """A track that is not seen for longer than this is split: interpolating across would invent its path."""
@@ -42,8 +43,9 @@ class TimedBoxes:
     Args:
         time_s: moment the frame's points are given for.
         world_from_vehicle: f64[4, 4] at this moment.
-        late_s: for each box, seconds after ``time_s`` at which the LiDAR looked at it.
+        late_s: for each box, seconds after ``time_s`` for which it holds.
         where: file and record, for errors.
+        images_s: times of the frame's first and last image, which need the objects where they were then.
     """
 
     time_s: float
@@ -51,15 +53,20 @@ class TimedBoxes:
     boxes: Sequence[WaymoBox]
     late_s: NDArray[np.float64]
     where: str
+    images_s: tuple[float, float] | None = None
 
 
 def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
     """Tracks, and notes about what was done to them.
 
+    A track begins with the first image of its first frame and ends with the last image of its last one: some hundredths of a
+    second are added to either end with the object's velocity, or else images at the ends would lack the object.
+
     Raises:
         InputError: a box without an id, two boxes of one id in a frame, or a class that changes.
     """
     members: dict[str, list[tuple[float, float, Matrix, WaymoBox]]] = {}
+    images_s = {frame.time_s: frame.images_s or (frame.time_s, frame.time_s) for frame in frames}
     for frame in frames:
         seen: set[str] = set()
         for box, late in zip(frame.boxes, frame.late_s, strict=True):
@@ -83,18 +90,37 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
             )
         times, late = np.array([item[0] for item in found]), np.array([item[1] for item in found])
         poses = np.stack([item[2] for item in found])
-        poses[:, :3, 3] -= _velocity(times + late, poses[:, :3, 3]) * late[:, None]
+        velocity = _velocity(times + late, poses[:, :3, 3])
+        poses[:, :3, 3] -= velocity * late[:, None]
         size = np.median([box.size_m for *_, box in found], axis=0)
         pieces = np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > MAX_GAP_S) + 1)
         split += len(pieces) > 1
         for part, piece in enumerate(pieces):
             name = f"{names[box_id]}.{part}" if part else names[box_id]
-            tracks.append(Track(name, labels[0], size, times[piece], poses[piece]))
+            ends = (images_s[float(times[piece[0]])][0], images_s[float(times[piece[-1]])][1])
+            tracks.append(Track(name, labels[0], size, *_widened(times[piece], poses[piece], velocity[piece], ends)))
     notes = [f"{split} tracks are not seen for more than {MAX_GAP_S} s and were split"] if split else []
     unknown = sum(track.label == "unknown" for track in tracks)
     if unknown:
         notes.append(f"{unknown} boxes have a class that is not known and are called unknown")
     return tracks, notes
+
+
+def _widened(
+    times_s: NDArray[np.float64], poses: Matrix, velocity: NDArray[np.float64], ends_s: tuple[float, float]
+) -> tuple[NDArray[np.float64], Matrix]:
+    """Keys with one more at each end that lies outside of them."""
+    for end, place in zip(ends_s, (0, -1), strict=True):
+        beyond = end - times_s[place]
+        if (beyond < -_SAME_TIME_S) if place == 0 else (beyond > _SAME_TIME_S):
+            pose = poses[place].copy()
+            pose[:3, 3] += velocity[place] * beyond
+            at = 0 if place == 0 else len(times_s)
+            times_s, poses, velocity = (
+                np.insert(array, at, value, axis=0)
+                for array, value in ((times_s, end), (poses, pose), (velocity, velocity[place]))
+            )
+    return times_s, poses
 
 
 def _velocity(times_s: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
