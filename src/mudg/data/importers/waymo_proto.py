@@ -1,0 +1,262 @@
+"""Reading protocol-buffer messages by a table of the fields that are wanted; no generated code.
+
+A message is a row of fields, each a key (number and wire type, a varint) and a value. ``Message`` lists what to keep; all else is
+skipped by its wire type. Values of bytes fields are views of the input: nothing large is copied.
+
+Source: the protocol-buffer encoding guide; the field numbers of the Waymo Open Dataset's published message descriptions.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base.errors import InputError
+
+Kind = Literal["int", "float", "double", "bytes", "text", "message", "doubles", "floats", "ints", "messages"]
+
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_WIRE: Final[Mapping[Kind, int]] = {
+    "int": _VARINT, "ints": _VARINT, "double": _FIXED64, "doubles": _FIXED64, "float": _FIXED32, "floats": _FIXED32,
+    "bytes": _BYTES, "text": _BYTES, "message": _BYTES, "messages": _BYTES,
+}  # fmt: skip
+_DTYPE: Final[Mapping[Kind, str]] = {"doubles": "<f8", "floats": "<f4"}
+_MAX_FIELDS: Final = 4_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A field to keep: its name, what it holds, and for messages their description. Plural kinds are repeated."""
+
+    name: str
+    kind: Kind
+    message: Message | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message description: its name, for errors, and field number -> field."""
+
+    name: str
+    fields: Mapping[int, Field]
+
+
+def parse_message(data: bytes | memoryview, message: Message, where: str) -> dict[str, Any]:
+    """The wanted fields of a message.
+
+    Args:
+        data: the encoded message.
+        message: what to keep.
+        where: file and record, for errors.
+
+    Returns:
+        Field name -> value. Missing fields are left out, but repeated ones are always there: lists of dictionaries, or
+        arrays f64, f32 or i64 [n]. Bytes are ``memoryview``. The last one wins where a single field stands twice.
+
+    Raises:
+        InputError: cut off, a wire type that does not fit, or text that is not UTF-8.
+    """
+    view = memoryview(data)
+    values: dict[str, Any] = {}
+    parts: dict[int, list[Any]] = {
+        n: [] for n, f in message.fields.items() if f.kind in ("doubles", "floats", "ints", "messages")
+    }
+    place, end, seen = 0, len(view), 0
+    while place < end:
+        start = place
+        key, place = _varint(view, place, end, message, where)
+        number, wire = key >> 3, key & 7
+        seen += 1
+        if number == 0 or seen > _MAX_FIELDS:
+            raise _broken(
+                message, where, start, f"field number {number}" if number == 0 else f"more than {_MAX_FIELDS} fields"
+            )
+        raw, place = _value(view, place, end, wire, message, where)
+        field = message.fields.get(number)
+        if field is None:
+            continue
+        packed = wire == _BYTES and field.kind in ("doubles", "floats", "ints")
+        if wire != _WIRE[field.kind] and not packed:
+            raise _broken(
+                message, where, start, f"field {field.name} ({number}) has wire type {wire}, not {_WIRE[field.kind]}"
+            )
+        value = _decode(field, raw, packed, message, where, start)
+        if number in parts:
+            parts[number].append(value)
+        else:
+            values[field.name] = value
+    for number, found in parts.items():
+        field = message.fields[number]
+        values[field.name] = found if field.kind == "messages" else _joined(field.kind, found)
+    return values
+
+
+def _varint(view: memoryview, place: int, end: int, message: Message, where: str) -> tuple[int, int]:
+    start, value, shift = place, 0, 0
+    while place < end:
+        byte = view[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value & 0xFFFFFFFFFFFFFFFF, place
+        shift += 7
+        if shift > 63:
+            raise _broken(message, where, start, "a number of more than ten bytes")
+    raise _broken(message, where, start, "it ends inside a number")
+
+
+def _value(view: memoryview, place: int, end: int, wire: int, message: Message, where: str) -> tuple[Any, int]:
+    """The raw value at ``place`` (an int, or a view) and where the next field begins."""
+    if wire == _VARINT:
+        return _varint(view, place, end, message, where)
+    if wire == _BYTES:
+        length, place = _varint(view, place, end, message, where)
+    elif wire in (_FIXED32, _FIXED64):
+        length = 4 if wire == _FIXED32 else 8
+    else:
+        raise _broken(message, where, place, f"wire type {wire}")
+    if length > end - place:
+        raise _broken(message, where, place, f"a field of {length} bytes where {end - place} are left")
+    return view[place : place + length], place + length
+
+
+def _decode(field: Field, raw: Any, packed: bool, message: Message, where: str, start: int) -> Any:
+    if field.message is not None:
+        return parse_message(raw, field.message, where)
+    if field.kind in _DTYPE:
+        size = np.dtype(_DTYPE[field.kind]).itemsize
+        if len(raw) % size:
+            raise _broken(message, where, start, f"field {field.name} holds {len(raw)} bytes, no multiple of {size}")
+        return np.frombuffer(raw, _DTYPE[field.kind])
+    if field.kind == "ints":
+        return unpack_varints(raw, f"{where}: {message.name}.{field.name}") if packed else np.array([_signed(raw)])
+    if field.kind == "int":
+        return _signed(raw)
+    if field.kind == "text":
+        try:
+            return bytes(raw).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise _broken(message, where, start, f"field {field.name} is no text") from error
+    if field.kind == "bytes":
+        return raw
+    return struct.unpack("<d" if field.kind == "double" else "<f", raw)[0]
+
+
+def _joined(kind: Kind, found: list[NDArray[Any]]) -> NDArray[Any]:
+    if len(found) == 1:
+        return found[0]
+    return np.concatenate(found) if found else np.zeros(0, _DTYPE.get(kind, np.int64))
+
+
+def _signed(value: int) -> int:
+    return value - (1 << 64) if value >= 1 << 63 else value
+
+
+def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
+    """A row of varints, all at once: i64[n]; negative numbers take ten bytes each.
+
+    Raises:
+        InputError: the last number is cut off, or one is longer than ten bytes.
+    """
+    codes = np.frombuffer(data, np.uint8)
+    if len(codes) == 0:
+        return np.zeros(0, np.int64)
+    last = np.flatnonzero(codes < 0x80)
+    if len(last) == 0 or last[-1] != len(codes) - 1:
+        raise InputError("packed numbers are cut off", where=where)
+    first = np.r_[0, last[:-1] + 1]
+    lengths = last - first + 1
+    if lengths.max() > 10:
+        raise InputError("a packed number has more than ten bytes", where=where)
+    if lengths.max() == 1:
+        return codes.astype(np.int64)
+    shift = (np.arange(len(codes)) - np.repeat(first, lengths)).astype(np.uint64) * np.uint64(7)
+    return np.add.reduceat((codes & np.uint8(0x7F)).astype(np.uint64) << shift, first).view(np.int64)
+
+
+def _broken(message: Message, where: str, place: int, got: str) -> InputError:
+    return InputError(
+        "message cannot be decoded",
+        where=f"{where}: {message.name}, byte {place}",
+        expected="a protocol-buffer message of the Waymo Open Dataset",
+        got=got,
+        remedy="is this a file of another data set, or of the motion data?",
+    )
+
+
+# --- the messages of the data set -----------------------------------------------------------------------------------
+
+_TRANSFORM = Message("Transform", {1: Field("values", "doubles")})
+_CAMERA_CALIBRATION = Message(
+    "CameraCalibration",
+    {
+        1: Field("name", "int"), 2: Field("intrinsic", "doubles"), 3: Field("extrinsic", "message", _TRANSFORM),
+        4: Field("width", "int"), 5: Field("height", "int"), 6: Field("direction", "int"),
+    },
+)  # fmt: skip
+_LASER_CALIBRATION = Message(
+    "LaserCalibration",
+    {
+        1: Field("name", "int"), 2: Field("inclinations", "doubles"), 3: Field("inclination_min", "double"),
+        4: Field("inclination_max", "double"), 5: Field("extrinsic", "message", _TRANSFORM),
+    },
+)  # fmt: skip
+_STATS = Message("Stats", {2: Field("time_of_day", "text"), 3: Field("location", "text"), 4: Field("weather", "text")})
+CONTEXT: Final = Message(
+    "Context",
+    {
+        1: Field("name", "text"), 2: Field("cameras", "messages", _CAMERA_CALIBRATION),
+        3: Field("lasers", "messages", _LASER_CALIBRATION), 4: Field("stats", "message", _STATS),
+    },
+)  # fmt: skip
+_VELOCITY = Message(
+    "Velocity",
+    {
+        1: Field("v_x", "float"), 2: Field("v_y", "float"), 3: Field("v_z", "float"),
+        4: Field("w_x", "double"), 5: Field("w_y", "double"), 6: Field("w_z", "double"),
+    },
+)  # fmt: skip
+_PANOPTIC = Message("CameraSegmentationLabel", {1: Field("divisor", "int"), 2: Field("png", "bytes")})
+_CAMERA_IMAGE = Message(
+    "CameraImage",
+    {
+        1: Field("name", "int"), 2: Field("image", "bytes"), 3: Field("pose", "message", _TRANSFORM),
+        4: Field("velocity", "message", _VELOCITY), 5: Field("pose_time_s", "double"), 6: Field("shutter_s", "double"),
+        7: Field("trigger_s", "double"), 8: Field("done_s", "double"), 10: Field("panoptic", "message", _PANOPTIC),
+    },
+)  # fmt: skip
+_RANGE_IMAGE = Message(
+    "RangeImage", {2: Field("ranges", "bytes"), 3: Field("projections", "bytes"), 4: Field("poses", "bytes")}
+)
+_LASER = Message(
+    "Laser",
+    {
+        1: Field("name", "int"),
+        2: Field("return1", "message", _RANGE_IMAGE),
+        3: Field("return2", "message", _RANGE_IMAGE),
+    },
+)
+_BOX = Message(
+    "Box",
+    {
+        1: Field("x", "double"), 2: Field("y", "double"), 3: Field("z", "double"), 4: Field("width", "double"),
+        5: Field("length", "double"), 6: Field("height", "double"), 7: Field("heading", "double"),
+    },
+)  # fmt: skip
+_LABEL = Message("Label", {1: Field("box", "message", _BOX), 3: Field("type", "int"), 4: Field("id", "text")})
+FRAME: Final = Message(
+    "Frame",
+    {
+        1: Field("context", "bytes"), 2: Field("timestamp_us", "int"), 3: Field("pose", "message", _TRANSFORM),
+        4: Field("images", "messages", _CAMERA_IMAGE), 5: Field("lasers", "messages", _LASER),
+        6: Field("labels", "messages", _LABEL),
+    },
+)  # fmt: skip
+_SHAPE = Message("MatrixShape", {1: Field("dims", "ints")})
+MATRIX_FLOAT: Final = Message("MatrixFloat", {1: Field("data", "floats"), 2: Field("shape", "message", _SHAPE)})
+MATRIX_INT: Final = Message("MatrixInt32", {1: Field("data", "ints"), 2: Field("shape", "message", _SHAPE)})

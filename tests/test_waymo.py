@@ -1,0 +1,840 @@
+"""Waymo importer: checksums, messages and range images against slow twins; round trips of both formats; bad logs; the real frame."""
+
+from __future__ import annotations
+
+import copy
+import io
+import struct
+import sys
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import roundtrip
+import write_waymo as made
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, transform_points, yaw_matrix
+from mudg.base.types import Scene, Track
+from mudg.data.city import rig
+from mudg.data.importers import (
+    IMPORTERS,
+    RECOGNISERS,
+    waymo_camera,
+    waymo_lidar,
+    waymo_log,
+    waymo_proto,
+    waymo_tfrecord,
+    waymo_tracks,
+)
+from mudg.data.importers.options import ImportOptions
+from mudg.data.importers.waymo_log import CameraShot, LaserCalibration, LaserScan, WaymoBox
+from mudg.data.importers.waymo_v1 import TfrecordLog
+from mudg.data.importers.waymo_v2 import Table
+from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+
+COLUMNS = 240
+
+
+def ingest(source: Path, out: Path, **options: Any) -> Scene:
+    return IMPORTERS["waymo"](source, out, ImportOptions(**options))
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def random_pose(generator: np.random.Generator, reach_m: float = 3.0) -> np.ndarray:
+    return from_rotation_translation(
+        matrix_from_quaternion(generator.normal(size=4)), generator.uniform(-reach_m, reach_m, 3)
+    )
+
+
+# --- checksums and messages -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "data, crc", [(b"123456789", 0xE3069283), (bytes(32), 0x8A9136AA), (b"\xff" * 32, 0x62A8AB43), (b"", 0)]
+)
+def test_crc32c_has_the_published_values(data: bytes, crc: int) -> None:
+    assert waymo_tfrecord.crc32c(data) == crc
+
+
+@pytest.mark.parametrize("length", [1, 63, 64, 65, 2319, 2320, 2321, 2328, 3571, 45479, 45480, 45488, 80064, 123457])
+def test_crc32c_folded_equals_byte_by_byte(length: int) -> None:
+    data = rng(length).bytes(length)
+    assert waymo_tfrecord.crc32c(data) == made.crc32c_bitwise(data)
+
+
+@pytest.mark.parametrize("degree, lower", waymo_tfrecord.SPARSE_MULTIPLES)
+def test_sparse_multiples_are_multiples_of_the_polynomial(degree: int, lower: tuple[int, ...]) -> None:
+    value = 1 << degree
+    for exponent in lower:
+        value ^= 1 << exponent
+    polynomial = 0x11EDC6F41
+    for shift in range(degree - 32, -1, -1):
+        if value >> (shift + 32) & 1:
+            value ^= polynomial << shift
+    assert value == 0
+
+
+def test_varints_at_once_equal_varints_one_by_one() -> None:
+    values = np.concatenate([rng().integers(-(2**40), 2**40, 200), [0, -1, 127, 128, 2**62, -(2**63)], np.arange(300)])
+    data = b"".join(made.varint(int(value)) for value in values)
+    assert (waymo_proto.unpack_varints(data, "x") == values).all()
+    with pytest.raises(InputError, match="cut off"):
+        waymo_proto.unpack_varints(data + b"\x80", "x")
+    with pytest.raises(InputError, match="ten bytes"):
+        waymo_proto.unpack_varints(b"\x80" * 10 + b"\x01", "x")
+
+
+INNER = waymo_proto.Message(
+    "Inner", {1: waymo_proto.Field("values", "doubles"), 3: waymo_proto.Field("counts", "ints")}
+)
+OUTER = waymo_proto.Message(
+    "Outer",
+    {
+        1: waymo_proto.Field("name", "text"),
+        2: waymo_proto.Field("number", "int"),
+        4: waymo_proto.Field("inner", "messages", INNER),
+    },
+)
+
+
+def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() -> None:
+    packed = made.text(1, struct.pack("<2d", 1.5, -2)) + made.text(3, made.varint(7) + made.varint(-7))
+    plain = made.doubles(1, [1.5, -2]) + made.number(3, 7) + made.number(3, -7)
+    skipped = made.double(9, 1.0) + made.single(10, 1.0) + made.number(11, 300) + made.text(12, b"?")
+    data = made.text(1, "Straße".encode()) + skipped + made.number(2, -5) + made.text(4, packed) + made.text(4, plain)
+    found = waymo_proto.parse_message(data, OUTER, "x")
+    assert (found["name"], found["number"], len(found["inner"])) == ("Straße", -5, 2)
+    for inner in found["inner"]:
+        assert inner["values"].tolist() == [1.5, -2]
+        assert inner["counts"].tolist() == [7, -7]
+
+
+@pytest.mark.parametrize(
+    "data, word",
+    [
+        (b"\x0a\x05ab", "5 bytes where 2 are left"), (b"\x0a", "inside a number"), (b"\x0a\xff\xff\xff\xff\xff\xff\xff\x7f", "are left"),
+        (b"\x80" * 11, "ten bytes"), (b"\x0b", "wire type 3"), (b"\x00\x00", "field number 0"), (b"\x10\x80", "inside a number"),
+        (b"\x08\x01", "wire type 0, not 2"), (b"\x0a\x01\xff", "no text"), (b"\x22\x03\x0a\x01\x00", "no multiple of 8"),
+    ],
+)  # fmt: skip
+def test_broken_messages_are_named(data: bytes, word: str) -> None:
+    with pytest.raises(InputError, match="message cannot be decoded") as caught:
+        waymo_proto.parse_message(data, OUTER, "file: record 3")
+    assert word in caught.value.got
+    assert "record 3" in caught.value.where
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
+    for message in (waymo_proto.FRAME, waymo_proto.CONTEXT, waymo_proto.MATRIX_INT):
+        try:
+            waymo_proto.parse_message(data, message, "x")
+        except InputError:
+            continue
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("uneven", [True, False])
+@pytest.mark.parametrize("posed", [True, False])
+def test_points_equal_the_conversion_pixel_by_pixel(uneven: bool, posed: bool) -> None:
+    generator = rng(4)
+    rows, columns = 5, 12
+    beams = np.sort(generator.uniform(-0.4, 0.1, rows)) if uneven else ()
+    laser = LaserCalibration("top", tuple(beams), -0.4, 0.1, random_pose(generator))
+    image = generator.uniform(-2, 60, (rows, columns, 4)).astype(np.float32)
+    poses = generator.uniform(-1, 1, (rows, columns, 6)).astype(np.float32) if posed else None
+    frame_pose = random_pose(generator)
+    points = waymo_lidar.points_of_scan(LaserScan([image], poses), laser, frame_pose, "x")
+    expected = []
+    heading = np.arctan2(laser.vehicle_from_lidar[1, 0], laser.vehicle_from_lidar[0, 0])
+    for row in range(rows):
+        for column in range(columns):
+            reach = float(image[row, column, 0])
+            if reach <= 0:
+                continue
+            pitch = beams[rows - 1 - row] if uneven else -0.4 + (rows - 1 - row + 0.5) / rows * 0.5
+            azimuth = np.pi * (1 - 2 * (column + 0.5) / columns) - heading
+            local = reach * np.array([np.cos(azimuth) * np.cos(pitch), np.sin(azimuth) * np.cos(pitch), np.sin(pitch)])
+            vehicle = laser.vehicle_from_lidar @ np.r_[local, 1]
+            if poses is not None:
+                roll, tilt, yaw, *place = (float(v) for v in poses[row, column])
+                about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
+                about_y = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+                rotation = yaw_matrix(yaw)[:3, :3] @ about_y @ about_x
+                vehicle = invert(frame_pose) @ from_rotation_translation(rotation, place) @ vehicle
+            expected.append((invert(laser.vehicle_from_lidar) @ vehicle)[:3])
+    assert np.abs(points.xyz - np.array(expected)).max() < 1e-9
+    assert points.without_pose == 0
+
+
+def test_points_without_a_pose_are_left_out_and_counted() -> None:
+    image = np.ones((2, 8, 4), np.float32)
+    poses = np.full((2, 8, 6), 0.1, np.float32)
+    poses[1, 3:] = 0
+    laser = LaserCalibration("top", (), -0.2, 0.1, np.eye(4))
+    points = waymo_lidar.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
+    assert (points.without_pose, len(points.xyz)) == (10, 22)
+
+
+@pytest.mark.parametrize("start, duration", [(0.0, 0.1), (-0.004, 0.098), (0.1, -0.1)])
+def test_the_turn_is_measured_from_pixel_poses(start: float, duration: float) -> None:
+    def place(time: np.ndarray) -> np.ndarray:
+        return np.stack([100 + 12 * time, 0.3 * time, np.full_like(time, 4.0)], -1)
+
+    poses = np.zeros((4, 100, 6), np.float32)
+    poses[..., 3:] = place(start + (np.arange(100) + 0.5) / 100 * duration)
+    poses[2:, 40:] = 0
+    times = np.arange(-0.1, 0.25, 0.0125)
+    found = waymo_lidar.measure_turn(poses, 5.0, times + 5.0, place(times))
+    assert found is not None
+    assert np.abs(np.array(found) - [start, duration]).max() < 1e-5
+    assert waymo_lidar.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
+    nominal = waymo_lidar.TurnClock()
+    assert (waymo_lidar.median_clock([found]) == nominal) == (start == 0.0)
+
+
+def test_a_view_is_that_of_the_middle_of_the_exposure() -> None:
+    pose = yaw_matrix(0.4, (5.0, 6.0, 1.0))
+    velocity = np.array([10.0, -2.0, 0.5, 0, 0, 0.8])
+    shot = CameraShot(pose, 100.0, velocity, 0.002, 99.985, 100.027)
+    moved, time = waymo_camera.middle_of_exposure(shot)
+    late = time - 100.0
+    assert late == pytest.approx(0.006, abs=1e-9)
+    assert np.abs(moved - yaw_matrix(0.4 + 0.8 * late, pose[:3, 3] + velocity[:3] * late)).max() < 1e-12
+    assert waymo_camera.readout_s(shot) == pytest.approx(0.04)
+    unknown = CameraShot(pose, 100.0, None, 0.002, 99.985, 100.027)
+    assert waymo_camera.middle_of_exposure(unknown) == (pose, 100.0)
+
+
+def timed(times: np.ndarray, late: np.ndarray, velocity: np.ndarray, **changes: Any) -> list[waymo_tracks.TimedBoxes]:
+    """An object that drives straight, boxed where it is when it is seen."""
+    frames = []
+    for time, delay in zip(times, late, strict=True):
+        vehicle = yaw_matrix(0.1 * time, (3.0 * time, 0, 0))
+        world = yaw_matrix(0.5, velocity * (time + delay) + [20, 5, 1])
+        local = invert(vehicle) @ world
+        values = {"id": "-a_b", "label": "vehicle", "size_m": (4.0, 2.0, 1.5)} | changes
+        box = WaymoBox(centre=tuple(local[:3, 3]), heading=geometry.yaw_of(local), **values)  # type: ignore[arg-type]
+        frames.append(waymo_tracks.TimedBoxes(float(time), vehicle, [box], np.array([delay]), f"frame at {time}"))
+    return frames
+
+
+@pytest.mark.parametrize("late", [np.full(6, 0.03), np.array([0.049, 0.0495, -0.0495, -0.049, -0.04, -0.03])])
+def test_boxes_are_carried_to_the_moment_of_the_points(late: np.ndarray) -> None:
+    times, velocity = np.arange(6) * 0.1, np.array([12.0, -3.0, 0.0])
+    (track,), notes = waymo_tracks.build_tracks(timed(times, late, velocity))
+    assert np.abs(track.world_from_object[:, :3, 3] - (times[:, None] * velocity + [20, 5, 1])).max() < 1e-9
+    assert (track.id, track.label, track.size_m.tolist(), notes) == ("t-a_b", "vehicle", [4.0, 2.0, 1.5], [])
+
+
+def test_tracks_cover_the_images_of_their_frames() -> None:
+    times, velocity = np.arange(4) * 0.1, np.array([12.0, -3.0, 0.0])
+    frames = [
+        replace(frame, images_s=(frame.time_s - 0.03, frame.time_s + 0.02))
+        for frame in timed(times, np.zeros(4), velocity)
+    ]
+    (track,), _ = waymo_tracks.build_tracks(frames)
+    assert track.times_s == pytest.approx([-0.03, 0, 0.1, 0.2, 0.3, 0.32])
+    assert np.abs(track.world_from_object[:, :3, 3] - (track.times_s[:, None] * velocity + [20, 5, 1])).max() < 1e-9
+    (alone,), _ = waymo_tracks.build_tracks(frames[:1])
+    assert alone.times_s == pytest.approx([-0.03, 0, 0.02])
+    assert np.ptp(alone.world_from_object, axis=0).max() == 0
+
+
+def test_tracks_are_split_at_gaps_and_odd_ones_named() -> None:
+    times = np.array([0, 0.1, 0.2, 1.0, 1.1])
+    tracks, notes = waymo_tracks.build_tracks(timed(times, np.zeros(5), np.zeros(3), label="unknown", id="a"))
+    assert [(track.id, len(track.times_s)) for track in tracks] == [("a", 3), ("a.1", 2)]
+    assert "split" in notes[0]
+    assert "2 boxes have a class that is not known" in notes[1]
+    frames = timed(times, np.zeros(5), np.zeros(3))
+    doubled = waymo_tracks.TimedBoxes(0.0, np.eye(4), [frames[0].boxes[0]] * 2, np.zeros(2), "frame 7")
+    with pytest.raises(InputError, match="two boxes of one object"):
+        waymo_tracks.build_tracks([doubled])
+
+
+# --- round trips ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, tuple[Track, ...]]:
+    """A tiny city whose boxes stand upright in the vehicle, as the data set's do, and its tracks at all times."""
+    folder = tmp_path_factory.mktemp("city") / "truth"
+    truth = roundtrip.small_log(folder)
+    tracks = []
+    for track in truth.tracks:
+        poses = track.world_from_object.copy()
+        for index, time in enumerate(track.times_s):
+            vehicle = truth.ego.pose_at(float(time))
+            assert vehicle is not None
+            local = invert(vehicle) @ poses[index]
+            poses[index, :3, :3] = (vehicle @ yaw_matrix(geometry.yaw_of(local)))[:3, :3]
+        tracks.append(Track(track.id, track.label, track.size_m, track.times_s, poses))
+    fields = {name: getattr(truth, name) for name in truth.__dataclass_fields__}
+    return Scene(**{**fields, "tracks": tuple(tracks)}), read_scene(folder).tracks
+
+
+@pytest.fixture(scope="module")
+def written(city: tuple[Scene, tuple[Track, ...]], tmp_path_factory: pytest.TempPathFactory) -> made.Log:
+    beams = rig.lidar_elevations(roundtrip.SMALL)
+    return made.log_of(*city, beams=beams, columns=COLUMNS)
+
+
+@pytest.fixture
+def log(written: made.Log) -> made.Log:
+    """The city as a Waymo log that the test may change."""
+    return copy.deepcopy(written)
+
+
+@pytest.fixture
+def bare(log: made.Log) -> made.Log:
+    """The same without recorded projections, which take most of the time to write."""
+    for frame in log.frames:
+        frame["lasers"][0]["projections"] = None
+    return log
+
+
+def write(log: made.Log, form: str, folder: Path) -> Path:
+    if form == "v1":
+        return made.write_tfrecord(log, folder / f"segment-{log.name}_with_camera_labels.tfrecord")
+    pytest.importorskip("pyarrow")
+    return made.write_parquet(log, folder)
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form, workers", [("v1", 1), ("v2", 2)])
+def test_round_trip(
+    form: str, workers: int, city: tuple[Scene, tuple[Track, ...]], log: made.Log, tmp_path: Path
+) -> None:
+    truth, own = city
+    scene = ingest(write(log, form, tmp_path / "log"), tmp_path / "scene", workers=workers)
+    roundtrip.assert_same_log(scene, truth, labels=made.LABELS, cloud_m=2e-4, dt_s=1e-6, box_pose=0.03, intensity=1e-4)
+    assert scene.ego.world_from_ego[0] == pytest.approx(np.eye(4), abs=1e-12)
+    assert scene.frames[0].view.camera.readout_s == pytest.approx(made.READOUT_S, abs=1e-6)
+    assert any("points fall where the log says" in note and "front 0." in note for note in scene.source.notes)
+    assert any(form in note and "Day, sunny, location_sf" in note for note in scene.source.notes)
+    assert {scene.split[f"front/00000{n}"] for n in (0, 1, 2, 3)} == {"train"}
+    assert scene.split["front_left/000004"] == "test"
+    assert scene.frames[0].view.time_s == pytest.approx(0.05, abs=1e-6)  # the clock begins with the LiDAR's turn
+    at_first = truth.ego.pose_at(truth.sweeps[0].time_s)
+    assert at_first is not None
+    standing = {track.id for track in own if np.ptp(track.world_from_object, axis=0).max() < 1e-9}
+    assert standing & {track.id for track in truth.tracks}
+    uncarried_m = 0.0
+    for track in truth.tracks:
+        if track.id in standing:
+            found = scene.track(track.id).world_from_object
+            assert np.abs(found - invert(at_first) @ track.world_from_object).max() < 1e-6
+        for frame, pose in zip(log.frames, track.world_from_object, strict=True):
+            (box,) = (box for box in frame["boxes"] if box["id"] == track.id)
+            shown = transform_points(invert(made.GLOBAL_FROM_WORLD) @ frame["pose"], box["centre"][None])[0]
+            uncarried_m = max(uncarried_m, float(np.linalg.norm(shown - pose[:3, 3])))
+    assert uncarried_m > 0.2  # what boxes would be off without their times
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("hold, words", [("start", "at the timestamp"), ("pose", "at the frame's pose")])
+def test_the_moment_of_the_boxes_is_found(
+    hold: str, words: str, city: tuple[Scene, tuple[Track, ...]], tmp_path: Path
+) -> None:
+    log = made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS, boxes_hold=hold)
+    for frame in log.frames:
+        frame["lasers"][0]["projections"] = None
+    scene = ingest(write(log, "v1", tmp_path / "log"), tmp_path / "scene")
+    assert any(note.startswith(f"boxes hold {words} (") for note in scene.source.notes)
+    roundtrip.assert_same_log(scene, city[0], labels=made.LABELS, box_pose=0.04, cloud_m=2e-4)
+
+
+def test_points_count_for_the_moment_that_puts_them_inside() -> None:
+    box = WaymoBox("a", "vehicle", (10.0, 4.0, 1.0), (4.0, 2.0, 1.5), 0.3)
+    forward = yaw_matrix(0.3)[:3, 0]
+    along, across = np.meshgrid(np.linspace(-1.99, 1.99, 20), np.linspace(-0.99, 0.99, 9))
+    grid = np.stack([along.ravel(), across.ravel(), np.full(along.size, 0.1)], 1)
+    on_box = transform_points(yaw_matrix(0.3, box.centre), grid)
+    seen = np.linspace(0.03, 0.04, len(grid))
+    for index, held in enumerate((0.035, 0.0, 0.05)):
+        points = on_box + (seen - held)[:, None] * 20.0 * forward
+        counts = waymo_tracks.points_inside(box, 20.0 * forward, points, seen, 0.035, 0.05)
+        assert counts[index] == len(grid)
+        assert counts.argmax() == index
+        assert np.delete(counts, index).max() < 0.95 * len(grid)
+        assert waymo_tracks.choose_moment(counts) == waymo_tracks.MOMENTS[index]
+    low = on_box - [0, 0, 0.75]
+    assert waymo_tracks.points_inside(box, np.zeros(3), low, seen, 0.0, 0.0).tolist() == [0, 0, 0]  # the road
+    assert waymo_tracks.choose_moment(np.array([100, 104, 90])) == "seen"
+
+
+@roundtrip.needs_native
+def test_both_formats_and_any_number_of_workers_give_the_same_scene(bare: made.Log, tmp_path: Path) -> None:
+    one = ingest(write(bare, "v1", tmp_path / "one"), tmp_path / "a", workers=3)
+    two = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b", workers=1)
+    for name in ("tracks.json", "lidar/lidar_top/000002.safetensors", "images/front_left/000003.png"):
+        assert (Path(one.root) / name).read_bytes() == (Path(two.root) / name).read_bytes()
+    for a, b in zip(one.frames, two.frames, strict=True):
+        assert a.view.time_s == b.view.time_s
+        assert np.array_equal(a.view.world_from_cam, b.view.world_from_cam)
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_chosen_frames_and_cameras_far_from_the_origin(
+    form: str, city: tuple[Scene, tuple[Track, ...]], tmp_path: Path
+) -> None:
+    far = yaw_matrix(2.0, (-25211.25, 42391.08, -160.6))
+    log = made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS, global_from_world=far)
+    scene = ingest(write(log, form, tmp_path / "log"), tmp_path / "scene", frames=(1, 4), cameras=("front_left",))
+    truth = city[0]
+    assert [frame.id for frame in scene.frames] == [f"front_left/{n:06d}" for n in range(3)]
+    shift = scene.frames[0].view.world_from_cam @ invert(truth.frames_of("front_left")[1].view.world_from_cam)
+    for index, sweep in enumerate(scene.sweeps):
+        original = truth.sweeps[index + 1]
+        assert np.abs(sweep.world_from_lidar - shift @ original.world_from_lidar).max() < 1e-6
+        assert len(read_points(scene, sweep).xyz) == len(read_points(truth, original).xyz)
+    assert any(f"({far[0, 3]:.0f}" in note.replace(".", "")[:60] or "-25" in note for note in scene.source.notes)
+    with pytest.raises(UsageError, match="no such camera"):
+        ingest(
+            tmp_path / "log" if form == "v2" else next((tmp_path / "log").iterdir()), tmp_path / "c", cameras=("rear",)
+        )
+
+
+@roundtrip.needs_native
+def test_images_are_rectified_and_other_lidars_read(bare: made.Log, tmp_path: Path) -> None:
+    lens = [60.0, 60.0, 47.0, 33.0, 0.05, -0.3, 0.002, -0.001, 0.0]
+    width, height = bare.cameras[0]["width"], bare.cameras[0]["height"]
+    bare.cameras[0]["intrinsic"] = lens
+    point = np.array([0.25, -0.2, 1.0])  # in the camera, z forward
+    x, y = point[:2]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (lens[4] + r2 * lens[5])
+    u = lens[0] * (x * radial + 2 * lens[6] * x * y + lens[7] * (r2 + 2 * x * x)) + lens[2]
+    v = lens[1] * (y * radial + lens[6] * (r2 + 2 * y * y) + 2 * lens[7] * x * y) + lens[3]
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    blob = 255 * np.exp(-((rows - v) ** 2 + (columns - u) ** 2) / 8)
+    buffer = io.BytesIO()
+    Image.fromarray(np.repeat(blob.round().astype(np.uint8)[..., None], 3, 2)).save(buffer, "PNG")
+    image = np.full((4, 30, 4), -1, np.float32)
+    image[1, 7, :2] = 12.0, 0.5
+    for frame in bare.frames:
+        frame["images"][0]["image"] = buffer.getvalue()
+        frame["lasers"].append({"number": 3, "returns": [image], "poses": None})
+    bare.lasers.append(
+        {"number": 3, "inclinations": (), "min": -1.0, "max": 0.2, "extrinsic": yaw_matrix(1.5, (3.2, 1.0, 0.9))}
+    )
+    scene = ingest(write(bare, "v1", tmp_path / "log"), tmp_path / "scene")
+    camera = scene.cameras["front"]
+    assert camera.distortion == tuple(lens[4:])
+    pixels = read_image(scene, scene.frames_of("front")[0])[..., 0].astype(float)
+    centre = np.array([(pixels * columns).sum(), (pixels * rows).sum()]) / pixels.sum()
+    expected = np.array([camera.fx * x + camera.cx, camera.fy * y + camera.cy])
+    assert np.abs(centre - expected).max() < 0.1
+    assert np.abs(expected - [u, v]).max() > 0.5  # the lens does move it
+    sweep = next(sweep for sweep in scene.sweeps if sweep.sensor == "lidar_side_left")
+    points = read_points(scene, sweep)
+    azimuth, pitch = np.pi * (1 - 15 / 30) - 1.5, 0.2 - 1.5 / 4 * 1.2
+    local = 12 * np.array([np.cos(azimuth) * np.cos(pitch), np.sin(azimuth) * np.cos(pitch), np.sin(pitch)])
+    assert np.abs(points.xyz - local).max() < 1e-5
+    assert (points.dt_s == 0).all()
+    assert points.intensity[0] == pytest.approx(np.tanh(0.5), abs=1e-6)
+    assert len(scene.sweeps) == 10
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_panoptic_labels(form: str, bare: made.Log, tmp_path: Path) -> None:
+    width, height = bare.cameras[0]["width"], bare.cameras[0]["height"]
+    ids = np.zeros((height, width), int)
+    ids[:10] = 25 * made.DIVISOR
+    ids[10:20] = 10 * made.DIVISOR + 4
+    ids[20:30, ::2] = 1 * made.DIVISOR
+    ids[30:] = 22 * made.DIVISOR
+    bare.frames[1]["images"][0]["panoptic"] = made.panoptic_png(ids)
+    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene", workers=2)
+    labelled = [frame.id for frame in scene.frames if frame.labels]
+    assert labelled == ["front/000001"]
+    frame = scene.frames_of("front")[1]
+    semantics = read_label(scene, frame, "semantics")
+    assert [int(semantics[row, 0]) for row in (0, 10, 20, 40)] == [10, 12, 255, 0]
+    assert (read_label(scene, frame, "sky") == (ids == 25000)).all()
+    assert (read_label(scene, frame, "ego") == (ids == 1000)).all()
+    assert (read_label(scene, frame, "instance") == np.where(ids == 10004, 10004, 0)).all()
+
+
+# --- bad logs ---------------------------------------------------------------------------------------------------------
+
+
+def spoil_scale(log: made.Log) -> None:
+    log.cameras[0]["extrinsic"] = log.cameras[0]["extrinsic"] * [[2.0], [2], [2], [1]]
+
+
+def spoil_hand(log: made.Log) -> None:
+    log.lasers[0]["extrinsic"] = log.lasers[0]["extrinsic"] @ np.diag([1, -1, 1, 1.0])
+
+
+def spoil_order(log: made.Log) -> None:
+    log.frames[1], log.frames[2] = log.frames[2], log.frames[1]
+
+
+def spoil_unit(log: made.Log) -> None:
+    for frame in log.frames:
+        frame["timestamp_us"] //= 1000
+
+
+def spoil_image_clock(log: made.Log) -> None:
+    log.frames[2]["images"][1]["pose_time"] *= 1e3
+
+
+def spoil_box(log: made.Log) -> None:
+    log.frames[1]["boxes"][0]["size"] = (4.0, -2.0, 1.5)
+
+
+def spoil_rows(log: made.Log) -> None:
+    log.lasers[0]["inclinations"] = log.lasers[0]["inclinations"][:-1]
+
+
+def spoil_numbers(log: made.Log) -> None:
+    log.frames[3]["lasers"][0]["returns"][0][0, 0, 0] = np.inf
+
+
+def spoil_image(log: made.Log) -> None:
+    log.frames[1]["images"][0]["image"] = log.frames[1]["images"][0]["image"][:300]
+
+
+def spoil_camera(log: made.Log) -> None:
+    del log.frames[2]["images"][1]
+
+
+def spoil_laser(log: made.Log) -> None:
+    del log.frames[2]["lasers"][0]
+
+
+def spoil_calibration(log: made.Log) -> None:
+    del log.cameras[1]
+
+
+def spoil_laser_calibration(log: made.Log) -> None:
+    log.lasers[0]["number"] = 9
+
+
+def spoil_pixel_poses(log: made.Log) -> None:
+    log.frames[2]["lasers"][0]["poses"] = log.frames[2]["lasers"][0]["poses"][:, ::2]
+
+
+def spoil_exposure(log: made.Log) -> None:
+    log.frames[0]["images"][0]["shutter"] = 0.5
+
+
+def spoil_twice(log: made.Log) -> None:
+    log.frames[1]["lasers"].append(log.frames[1]["lasers"][0])
+
+
+def spoil_two_images(log: made.Log) -> None:
+    log.frames[1]["images"][1]["number"] = 1
+
+
+def spoil_intrinsics(log: made.Log) -> None:
+    log.cameras[0]["intrinsic"][2] = np.nan
+
+
+BOTH = {
+    spoil_scale: "pose is scaled", spoil_hand: "left-handed", spoil_unit: "not of one time", spoil_image_clock: "not of one time",
+    spoil_box: "box makes no sense", spoil_rows: "row for every beam", spoil_numbers: "not finite", spoil_image: "cannot be decoded",
+    spoil_camera: "frame lacks images or scans", spoil_laser: "frame lacks images or scans", spoil_calibration: "no calibration",
+    spoil_laser_calibration: "no calibration", spoil_pixel_poses: "differ in size", spoil_exposure: "exposure times contradict",
+    spoil_intrinsics: "intrinsics", spoil_twice: "two scans of one LiDAR", spoil_two_images: "two images of one camera",
+}  # fmt: skip
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+@pytest.mark.parametrize("spoil", BOTH, ids=lambda function: function.__name__)
+def test_what_makes_no_sense_is_refused(
+    spoil: Callable[[made.Log], None], form: str, bare: made.Log, tmp_path: Path
+) -> None:
+    spoil(bare)
+    with pytest.raises(InputError, match=BOTH[spoil]) as caught:
+        ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene")
+    assert str(tmp_path) in caught.value.where
+    assert list(tmp_path.iterdir()) == [tmp_path / "log"]
+
+
+@roundtrip.needs_native
+def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(bare: made.Log, tmp_path: Path) -> None:
+    spoil_order(bare)
+    with pytest.raises(InputError, match="timestamps do not increase"):
+        ingest(write(bare, "v1", tmp_path / "one"), tmp_path / "a")
+    scene = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b")
+    assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx(0.05 + np.arange(5) * 0.1, abs=1e-6)
+    bare.frames[3]["timestamp_us"] = bare.frames[2]["timestamp_us"]
+    with pytest.raises(InputError, match="a frame twice"):
+        ingest(write(bare, "v2", tmp_path / "three"), tmp_path / "c")
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_incomplete_frames_are_left_out_when_asked(form: str, bare: made.Log, tmp_path: Path) -> None:
+    spoil_camera(bare)
+    bare.frames[4]["lasers"] = []
+    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene", skip_missing=True)
+    assert len(scene.sweeps) == 3
+    assert any("frames 2, 4 lack" in note for note in scene.source.notes)
+    only = ingest(write(bare, form, tmp_path / "log"), tmp_path / "other", cameras=("front",), frames=(0, 4))
+    assert len(only.frames) == 4  # the missing image is of a camera that was not asked for
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
+    form: str, bare: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for image in bare.frames[1]["lasers"][0]["returns"]:
+        image[..., 0] = -1
+    bare.frames[0]["boxes"][0]["id"] = "_odd"
+    bare.frames[0]["boxes"][0]["type"] = 9
+    odd = dict(bare.frames[0]["images"][0], number=7)
+    bare.frames[0]["images"].append(odd)
+    bare.frames[0]["lasers"].append({"number": 8, "returns": bare.frames[0]["lasers"][0]["returns"], "poses": None})
+    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene")
+    assert len(read_points(scene, scene.sweeps[1]).xyz) == 0
+    assert "has no points" in capsys.readouterr().err
+    assert scene.track("t_odd").label == "unknown"
+    assert len(scene.frames) == 10
+    assert len(scene.sweeps) == 5
+
+
+def tfrecord(log: made.Log, tmp_path: Path) -> tuple[Path, bytearray]:
+    path = write(log, "v1", tmp_path / "log")
+    return path, bytearray(path.read_bytes())
+
+
+@roundtrip.needs_native
+def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: Path) -> None:
+    path, content = tfrecord(bare, tmp_path)
+    places = list(waymo_tfrecord.record_places(path))
+    third = places[2].offset
+    cases: list[tuple[bytes, str]] = [
+        (bytes(content[: third + 500]), "cut off"),
+        (bytes(content[: third + 5]), "cut off"),
+        (
+            bytes(content[: third + 100]) + bytes([content[third + 100] ^ 1]) + bytes(content[third + 101 :]),
+            "do not fit their checksum",
+        ),
+        (bytes(content[:third]) + bytes([content[third] ^ 1]) + bytes(content[third + 1 :]), "header is damaged"),
+    ]
+    huge = struct.pack("<Q", 1 << 50)
+    cases.append(
+        (
+            bytes(content[:third]) + huge + struct.pack("<I", made.masked(huge)) + bytes(content[third + 12 :]),
+            "no frame has",
+        )
+    )
+    for spoilt, word in cases:
+        path.write_bytes(spoilt)
+        with pytest.raises(InputError, match=word) as caught:
+            ingest(path, tmp_path / "scene")
+        assert f"record 2 at byte {third}" in caught.value.where
+    path.write_bytes(cases[2][0])
+    assert len(ingest(path, tmp_path / "scene", frames=(0, 2)).sweeps) == 2  # what is not asked for need not be whole
+
+
+@roundtrip.needs_native
+def test_files_of_another_kind_are_refused(bare: made.Log, tmp_path: Path) -> None:
+    path = tmp_path / "a.tfrecord"
+    for content, word in ((b"<html>not here</html>", "not a TFRecord"), (b"\x1f\x8b" + bytes(40), "compressed"), (b"", "no frames"),
+                          (made.record(b"\x0a\x05ab"), "cannot be decoded"), (made.record(b""), "transform is incomplete")):  # fmt: skip
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=word):
+            ingest(path, tmp_path / "scene")
+    path.write_bytes(
+        b"".join(made.record(made.frame_message(one, bare.frames[n])) for n, one in enumerate((bare, bare)))
+    )
+    bare.name = "another"
+    path.write_bytes(path.read_bytes() + made.record(made.frame_message(bare, bare.frames[2])))
+    with pytest.raises(InputError, match="mixes two logs"):
+        ingest(path, tmp_path / "scene")
+    with pytest.raises(InputError, match="no frames"):
+        ingest(path, tmp_path / "scene", frames=(7, 9))
+
+
+def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    float_image = waymo_log.float_image
+    whole = made.matrix_float(np.ones((2, 3, 4), np.float32))
+    assert float_image(whole, 4, "x").shape == (2, 3, 4)
+    with pytest.raises(InputError, match="wrong shape"):
+        float_image(whole, 6, "x")
+    with pytest.raises(InputError, match="cut off"):
+        float_image(whole[:-6], 4, "x")
+    with pytest.raises(InputError, match="cannot be unpacked"):
+        float_image(b"nonsense", 4, "x")
+    monkeypatch.setattr(waymo_log, "MAX_UNPACKED_BYTES", 1 << 20)
+    bomb = zlib.compress(bytes(2 << 20), 1)
+    with pytest.raises(InputError, match="unpacks to more"):
+        float_image(bomb, 4, "x")
+    lying = made.text(1, bytes(16)) + made.text(2, b"".join(made.number(1, n) for n in (1 << 20, 1 << 20, 4)))
+    with pytest.raises(InputError, match="wrong shape"):
+        float_image(zlib.compress(lying), 4, "x")
+
+
+@roundtrip.needs_native
+def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write(bare, "v2", tmp_path / "log")
+    table = root / "lidar" / f"{bare.name}.parquet"
+    whole = table.read_bytes()
+    table.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="Parquet file cannot be read"):
+        ingest(root, tmp_path / "scene")
+    (root / "lidar_box" / f"{bare.name}.parquet").rename(table)
+    with pytest.raises(InputError, match="lacks columns"):
+        ingest(root, tmp_path / "scene")
+    table.write_bytes(whole)
+    pose = root / "lidar_pose" / f"{bare.name}.parquet"
+    pose.rename(root / "away")
+    with pytest.raises(InputError, match="pixel poses are missing"):
+        ingest(root, tmp_path / "scene")
+    (root / "away").rename(pose)
+    (root / "camera_calibration" / f"{bare.name}.parquet").unlink()
+    with pytest.raises(InputError, match="a component of the log is missing"):
+        ingest(root, tmp_path / "scene")
+    pyarrow = pytest.importorskip("pyarrow")
+    holes = pyarrow.table({"a": [1, None, 3]})
+    pytest.importorskip("pyarrow.parquet").write_table(holes, tmp_path / "holes.parquet")
+    with pytest.raises(InputError, match="empty value") as hole:
+        Table(tmp_path / "holes.parquet").columns(("a",))
+    assert hole.value.where.endswith("row 1")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ResourceError, match="pyarrow") as caught:
+        Table(pose)
+    assert "mudg[data]" in caught.value.remedy
+
+
+@roundtrip.needs_native
+def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    names = [f"segment-{n}_with_camera_labels" for n in ("111_2", "222_3")]
+    for name in names:
+        made.write_tfrecord(bare, folder / f"{name}.tfrecord")
+    with pytest.raises(UsageError, match="several logs") as caught:
+        ingest(folder, tmp_path / "scene")
+    assert all(name in caught.value.expected for name in names)
+    with pytest.raises(UsageError, match="no logs have such a name"):
+        ingest(folder, tmp_path / "scene", sequence="333")
+    assert len(ingest(folder, tmp_path / "scene", sequence="222", frames=(0, 1)).frames) == 2
+    assert RECOGNISERS["waymo"](folder)
+    assert RECOGNISERS["waymo"](folder / f"{names[0]}.tfrecord")
+    assert not RECOGNISERS["waymo"](tmp_path)
+    for options in ({"poses": tmp_path}, {"boxes": tmp_path}, {"untwist": "no"}):
+        with pytest.raises(UsageError):
+            ingest(folder, tmp_path / "other", **options)
+    with pytest.raises(InputError, match="no Waymo log found"):
+        ingest(tmp_path / "scene", tmp_path / "other")
+
+
+# --- the real pieces --------------------------------------------------------------------------------------------------
+
+
+def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
+    scene = ingest(path, tmp_path / "scene", resolution=480, cameras=("front", "side_right"))
+    assert scene.id == "1024360143612057520_3580_000_3600_000"
+    assert [frame.view.camera.name for frame in scene.frames] == ["front", "side_right"]  # as the LiDAR passes them
+    assert (scene.cameras["front"].width, scene.cameras["front"].height) == (480, 320)
+    counts = {
+        label: sum(track.label == label for track in scene.tracks)
+        for label in ("vehicle", "pedestrian", "sign", "cyclist")
+    }
+    assert counts == {"vehicle": 37, "pedestrian": 12, "sign": 25, "cyclist": 1}
+    cars = [track for track in scene.tracks if track.label == "vehicle"]
+    assert np.mean([track.size_m[0] > track.size_m[1] for track in cars]) > 0.9  # longer than wide
+    assert scene.cameras["front"].readout_s == pytest.approx(0.044, abs=1e-3)
+    for frame in scene.frames:
+        assert all(track.pose_at(frame.view.time_s) is not None for track in scene.tracks)
+        assert frame.view.world_from_cam[2, 1] < -0.99  # the image's down is the world's down
+        assert frame.view.center_world[2] == pytest.approx(2.1, abs=0.2)
+        semantics = read_label(scene, frame, "semantics")
+        assert (semantics == 255).mean() < 0.2
+        assert not np.isin(semantics[: len(semantics) // 8], [0, 1]).any()  # no road up there
+    headings = {f.view.camera.name: np.rad2deg(np.arctan2(*f.view.world_from_cam[[1, 0], 2])) for f in scene.frames}
+    assert abs(headings["front"]) < 3
+    assert abs(headings["side_right"] + 90) < 3
+
+
+def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_data: Callable[[str], Path]) -> None:
+    path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
+    label = waymo_proto.Message(
+        "Label", {**waymo_proto.FRAME.fields[6].message.fields}  # type: ignore[union-attr]
+    )  # fmt: skip
+    per_camera = waymo_proto.Message(
+        "CameraLabels", {1: waymo_proto.Field("name", "int"), 2: waymo_proto.Field("labels", "messages", label)}
+    )
+    message = waymo_proto.Message("Frame", {9: waymo_proto.Field("projected", "messages", per_camera)})
+    (place,) = waymo_tfrecord.record_places(path)
+    with path.open("rb") as file:
+        projected = waymo_proto.parse_message(waymo_tfrecord.read_record(file, path, place), message, "real")[
+            "projected"
+        ]
+    log = TfrecordLog(path)
+    frame = log.frames[0]
+    boxes = {box.id: box for box in frame.boxes}
+    names = {number: name for name, number in made.CAMERA_NUMBERS.items()}
+    errors = []
+    for camera in projected:
+        name = names[camera["name"]]
+        calibration = log.cameras[name]
+        pose, _ = waymo_camera.middle_of_exposure(frame.shots[name])
+        cam_from_vehicle = invert(pose @ waymo_camera.vehicle_from_cam(calibration)) @ frame.global_from_vehicle
+        fx, fy, cx, cy, *lens = calibration.intrinsic
+        for item in camera["labels"]:
+            box = next(box for key, box in boxes.items() if item["id"].startswith(key))
+            corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3) * box.size_m
+            corners = transform_points(cam_from_vehicle @ yaw_matrix(box.heading, box.centre), corners)
+            if (corners[:, 2] < 0.5).any():
+                continue
+            x, y = corners[:, 0] / corners[:, 2], corners[:, 1] / corners[:, 2]
+            r2 = x * x + y * y
+            radial = 1 + r2 * (lens[0] + r2 * lens[1])
+            u = fx * (x * radial + 2 * lens[2] * x * y + lens[3] * (r2 + 2 * x * x)) + cx
+            v = fy * (y * radial + lens[2] * (r2 + 2 * y * y) + 2 * lens[3] * x * y) + cy
+            ours = np.array([u.min(), v.min(), u.max(), v.max()])
+            if (ours[:2] > 2).all() and (ours[2:] < [calibration.width - 2, calibration.height - 2]).all():
+                b = item["box"]
+                theirs = [
+                    b["x"] - b["length"] / 2,
+                    b["y"] - b["width"] / 2,
+                    b["x"] + b["length"] / 2,
+                    b["y"] + b["width"] / 2,
+                ]
+                errors.append(ours - theirs)
+    assert len(errors) == 44
+    assert np.median(np.abs(errors)) < 0.03
+    assert np.abs(errors).max() < 0.2
+
+
+def test_the_real_frame_without_images_is_refused_in_words(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no images"):
+        ingest(shared_data("waymo_frame") / "labels_only_one_frame.tfrecord", tmp_path / "scene")
+
+
+def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
+    pytest.importorskip("pyarrow")
+    table = Table(shared_data("waymo_frame") / "v2_vehicle_pose.parquet")
+    column = "[VehiclePoseComponent].world_from_vehicle.transform"
+    found = table.columns(("key.segment_context_name", "key.frame_timestamp_micros", column))
+    assert len(found[column]) == 199
+    assert all(geometry.is_rigid(np.array(values).reshape(4, 4), 1e-6) for values in found[column])
+    steps = np.diff(np.array(found["key.frame_timestamp_micros"], np.int64))
+    assert ((steps > 90_000) & (steps < 110_000)).all()
+    assert np.allclose(table.value(57, column), found[column][57])
+    assert np.allclose(table.value(3, column), found[column][3])

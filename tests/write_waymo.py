@@ -1,0 +1,377 @@
+"""Writes a scene as a Waymo log, format 1 or 2: what the importer reads, made the other way round.
+
+``log_of`` turns a scene with one spinning LiDAR into a ``Log`` of plain values, which tests may change before ``write_tfrecord`` or
+``write_parquet`` encodes it. The checksum is computed bit by bit and messages are built by hand, so nothing here shares code with
+the reader.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project, transform_points, yaw_matrix, yaw_of
+from mudg.base.types import Scene, Track
+from mudg.data.scene_files import open_files
+from mudg.data.scenefile import read_points
+
+Matrix = NDArray[np.float64]
+EPOCH_US = 1_553_735_853_462_203
+GLOBAL_FROM_WORLD = yaw_matrix(0.7, (300.0, -200.0, 10.0))
+CAMERA_NUMBERS = {"front": 1, "front_left": 2, "front_right": 3, "side_left": 4, "side_right": 5}
+LASER_NUMBERS = {"top": 1, "front": 2, "side_left": 3, "side_right": 4, "rear": 5}
+TYPE_NUMBERS = {"car": 1, "truck": 1, "bus": 1, "pedestrian": 2, "cyclist": 4}
+LABELS = {"car": "vehicle", "truck": "vehicle", "bus": "vehicle", "pedestrian": "pedestrian", "cyclist": "cyclist"}
+SHUTTER_S, READOUT_S = 0.002, 0.04
+DIVISOR = 1000
+
+
+@dataclass
+class Log:
+    """A log as plain values; frames hold ``timestamp_us, pose, images, lasers, boxes``."""
+
+    name: str = "1024360143612057520_3580_000_3600_000"
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    lasers: list[dict[str, Any]] = field(default_factory=list)
+    frames: list[dict[str, Any]] = field(default_factory=list)
+
+
+def log_of(
+    truth: Scene,
+    moving: Sequence[Track],
+    *,
+    beams: NDArray[np.float64],
+    columns: int,
+    global_from_world: Matrix = GLOBAL_FROM_WORLD,
+    boxes_hold: str = "seen",
+) -> Log:
+    """The scene as a Waymo log.
+
+    Args:
+        truth: cameras and one LiDAR that turns clockwise from behind, in 0.1 s around each sweep's time.
+        moving: where the objects are at any time; a box stands where its object is when the LiDAR looks at it.
+        beams: elevations f64[H], radians, upwards.
+        columns: of the range images.
+        global_from_world: where the data set's world lies.
+        boxes_hold: whether boxes stand where their objects were when the LiDAR looked at them (``seen``), at the beginning of
+            the turn (``start``) or in its middle (``pose``).
+    """
+    log = Log()
+    mount = invert(truth.ego.pose_at(truth.sweeps[0].time_s)) @ truth.sweeps[0].world_from_lidar
+    log.lasers.append(
+        {"number": 1, "inclinations": beams, "min": float(beams[0]), "max": float(beams[-1]), "extrinsic": mount}
+    )
+    for name, camera in truth.cameras.items():
+        first = truth.frames_of(name)[0].view
+        vehicle_from_cam = invert(truth.ego.pose_at(first.time_s)) @ first.world_from_cam
+        log.cameras.append(
+            {"number": CAMERA_NUMBERS[name], "width": camera.width, "height": camera.height,
+             "intrinsic": [camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0, 0, 0],
+             "extrinsic": vehicle_from_cam @ CAM_FROM_EGO_AXES}
+        )  # fmt: skip
+    for index, sweep in enumerate(truth.sweeps):
+        pose = global_from_world @ truth.ego.pose_at(sweep.time_s)
+        frame: dict[str, Any] = {"timestamp_us": EPOCH_US + round((sweep.time_s - 0.05) * 1e6), "pose": pose}
+        frame["images"] = [_image(truth, name, index, global_from_world) for name in truth.cameras]
+        frame["lasers"] = [_scan(truth, index, mount, beams, columns, global_from_world)]
+        frame["boxes"] = _boxes(truth, moving, sweep.time_s, boxes_hold)
+        log.frames.append(frame)
+    return log
+
+
+def _image(truth: Scene, name: str, index: int, global_from_world: Matrix) -> dict[str, Any]:
+    frame = truth.frames_of(name)[index]
+    time = EPOCH_US / 1e6 + frame.view.time_s
+    return {
+        "number": CAMERA_NUMBERS[name], "image": open_files(truth.root).read(frame.image.path),
+        "pose": global_from_world @ truth.ego.pose_at(frame.view.time_s), "velocity": np.zeros(6), "pose_time": time,
+        "shutter": SHUTTER_S, "trigger": time - (READOUT_S + SHUTTER_S) / 2, "done": time + (READOUT_S + SHUTTER_S) / 2,
+        "panoptic": None,
+    }  # fmt: skip
+
+
+def _scan(
+    truth: Scene, index: int, mount: Matrix, beams: NDArray[np.float64], columns: int, global_from_world: Matrix
+) -> dict[str, Any]:
+    """Range images by inverting the geometry: from where the LiDAR was when it measured a point, to beam, column and range."""
+    sweep = truth.sweeps[index]
+    points = read_points(truth, sweep)
+    world = transform_points(sweep.world_from_lidar, points.xyz.astype(np.float64))
+    column = np.round((points.dt_s + 0.05) / 0.1 * columns - 0.5).astype(int)
+    vehicle = [truth.ego.pose_at(sweep.time_s - 0.05 + (c + 0.5) / columns * 0.1) for c in range(columns)]
+    local = np.stack([invert(vehicle[c] @ mount)[:3] @ np.r_[p, 1] for c, p in zip(column, world, strict=True)])
+    reach = np.linalg.norm(local, axis=1)
+    row = len(beams) - 1 - np.abs(np.arcsin(local[:, 2] / reach)[:, None] - beams).argmin(1)
+    returns = np.full((2, len(beams), columns, 4), -1, np.float32)
+    second = (column % 5 == 0).astype(int)  # some points are second returns
+    returns[second, row, column, 0] = reach
+    returns[second, row, column, 1] = np.arctanh(np.minimum(points.intensity.astype(np.float64), 0.9999))
+    poses = np.zeros((len(beams), columns, 6), np.float32)
+    for c, pose in enumerate(vehicle):
+        poses[:, c] = _roll_pitch_yaw(global_from_world @ pose)
+    projections = np.zeros((2, len(beams), columns, 6), np.int64)
+    for name in truth.cameras:
+        camera = truth.frames_of(name)[index].view
+        uv, z = project(camera, world)
+        inside = (z > 0.1) & (uv >= 0).all(1) & (uv < [camera.camera.width, camera.camera.height]).all(1)
+        free = inside & (projections[second, row, column, 0] == 0)
+        values = np.c_[np.full(free.sum(), CAMERA_NUMBERS[name]), np.floor(uv[free])].astype(np.int64)
+        projections[second[free], row[free], column[free], :3] = values
+    return {"number": 1, "returns": list(returns), "poses": poses, "projections": list(projections)}
+
+
+def _roll_pitch_yaw(pose: Matrix) -> list[float]:
+    roll = np.arctan2(pose[2, 1], pose[2, 2])
+    pitch = np.arctan2(-pose[2, 0], np.hypot(pose[2, 1], pose[2, 2]))
+    return [roll, pitch, np.arctan2(pose[1, 0], pose[0, 0]), *pose[:3, 3]]
+
+
+def _boxes(truth: Scene, moving: Sequence[Track], time_s: float, hold: str) -> list[dict[str, Any]]:
+    vehicle = truth.ego.pose_at(time_s)
+    own = {track.id: track for track in moving}
+    boxes = []
+    for track in truth.tracks:
+        now = invert(vehicle) @ track.pose_at(time_s)
+        late = ((0.5 - np.arctan2(now[1, 3], now[0, 3]) / (2 * np.pi)) % 1.0 - 0.5) * 0.1
+        late = {"seen": late, "start": -0.05, "pose": 0.0}[hold]
+        seen = own[track.id].pose_at(time_s + late)
+        shown = now if seen is None else invert(vehicle) @ seen
+        boxes.append(
+            {"id": track.id, "type": TYPE_NUMBERS[track.label], "centre": shown[:3, 3], "size": track.size_m,
+             "heading": yaw_of(now)}
+        )  # fmt: skip
+    return boxes
+
+
+def panoptic_png(ids: NDArray[np.integer]) -> bytes:
+    """A 16-bit PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(ids.astype(np.uint16)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+# --- format 1 ---------------------------------------------------------------------------------------------------------
+
+
+def crc32c_bitwise(data: bytes) -> int:
+    """CRC-32C by its definition, one bit after the other."""
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value >> 1) ^ (0x82F63B78 if value & 1 else 0)
+        table.append(value)
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc = table[(crc ^ byte) & 0xFF] ^ (crc >> 8)
+    return crc ^ 0xFFFFFFFF
+
+
+def masked(data: bytes) -> int:
+    """The checksum as stored."""
+    crc = crc32c_bitwise(data)
+    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def record(payload: bytes) -> bytes:
+    """One TFRecord."""
+    length = struct.pack("<Q", len(payload))
+    return length + struct.pack("<I", masked(length)) + payload + struct.pack("<I", masked(payload))
+
+
+def varint(value: int) -> bytes:
+    """Base-128 number; negative ones as 64-bit two's complement."""
+    value &= (1 << 64) - 1
+    out = b""
+    while value >= 0x80:
+        out += bytes([value & 0x7F | 0x80])
+        value >>= 7
+    return out + bytes([value])
+
+
+def number(tag: int, value: int) -> bytes:
+    """An integer field."""
+    return varint(tag << 3) + varint(value)
+
+
+def double(tag: int, value: float) -> bytes:
+    """A double field."""
+    return varint(tag << 3 | 1) + struct.pack("<d", value)
+
+
+def single(tag: int, value: float) -> bytes:
+    """A float field."""
+    return varint(tag << 3 | 5) + struct.pack("<f", value)
+
+
+def text(tag: int, value: bytes) -> bytes:
+    """A field of bytes, or a message."""
+    return varint(tag << 3 | 2) + varint(len(value)) + value
+
+
+def doubles(tag: int, values: Iterable[float]) -> bytes:
+    """A repeated field of doubles, one key each."""
+    return b"".join(double(tag, float(value)) for value in values)
+
+
+def transform(tag: int, matrix: Matrix) -> bytes:
+    """A Transform message."""
+    return text(tag, doubles(1, np.asarray(matrix).ravel()))
+
+
+def matrix_float(array: NDArray[np.float32]) -> bytes:
+    """A packed and compressed MatrixFloat."""
+    shape = b"".join(number(1, n) for n in array.shape)
+    return zlib.compress(text(1, array.astype("<f4").tobytes()) + text(2, shape), 1)
+
+
+def matrix_int(array: NDArray[np.integer]) -> bytes:
+    """A packed and compressed MatrixInt32."""
+    shape = b"".join(number(1, n) for n in array.shape)
+    return zlib.compress(text(1, b"".join(varint(int(v)) for v in array.ravel())) + text(2, shape), 1)
+
+
+def context_message(log: Log) -> bytes:
+    """The Context message."""
+    out = text(1, log.name.encode())
+    for camera in log.cameras:
+        out += text(2, number(1, camera["number"]) + doubles(2, camera["intrinsic"]) + transform(3, camera["extrinsic"])
+                    + number(4, camera["width"]) + number(5, camera["height"]) + number(6, 2))  # fmt: skip
+    for laser in log.lasers:
+        out += text(3, number(1, laser["number"]) + doubles(2, laser["inclinations"]) + double(3, laser["min"])
+                    + double(4, laser["max"]) + transform(5, laser["extrinsic"]))  # fmt: skip
+    return out + text(4, text(2, b"Day") + text(3, b"location_sf") + text(4, b"sunny"))
+
+
+def frame_message(log: Log, frame: dict[str, Any]) -> bytes:
+    """The Frame message."""
+    out = text(1, context_message(log)) + number(2, frame["timestamp_us"]) + transform(3, frame["pose"])
+    for image in frame["images"]:
+        velocity = b"".join(single(n + 1, v) for n, v in enumerate(image["velocity"][:3]))
+        velocity += b"".join(double(n + 4, v) for n, v in enumerate(image["velocity"][3:]))
+        message = number(1, image["number"]) + text(2, image["image"]) + transform(3, image["pose"]) + text(4, velocity)
+        message += double(5, image["pose_time"]) + double(6, image["shutter"])
+        message += double(7, image["trigger"]) + double(8, image["done"])
+        if image["panoptic"] is not None:
+            message += text(10, number(1, DIVISOR) + text(2, image["panoptic"]))
+        out += text(4, message)
+    for laser in frame["lasers"]:
+        message = number(1, laser["number"])
+        for index, image in enumerate(laser["returns"]):
+            part = text(2, matrix_float(image))
+            if laser.get("projections"):
+                part += text(3, matrix_int(laser["projections"][index]))
+            if index == 0 and laser.get("poses") is not None:
+                part += text(4, matrix_float(laser["poses"]))
+            message += text(2 + index, part)
+        out += text(5, message)
+    for box in frame["boxes"]:
+        length, width, height = box["size"]
+        fields = [*box["centre"], width, length, height, box["heading"]]
+        message = text(1, b"".join(double(n + 1, v) for n, v in enumerate(fields)))
+        message += text(2, double(1, 3.0)) + number(3, box["type"]) + text(4, box["id"].encode()) + number(7, 12)
+        out += text(6, message)
+    return out + text(9, number(1, 1))  # a field that the importer does not read
+
+
+def write_tfrecord(log: Log, path: Path) -> Path:
+    """The log as one TFRecord file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"".join(record(frame_message(log, frame)) for frame in log.frames))
+    return path
+
+
+# --- format 2 ---------------------------------------------------------------------------------------------------------
+
+
+def write_parquet(log: Log, root: Path) -> Path:
+    """The log as a folder of components; small row groups, so that reading crosses them."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    def save(component: str, rows: list[dict[str, Any]], types: dict[str, Any]) -> None:
+        if not rows:
+            return
+        folder = root / component
+        folder.mkdir(parents=True, exist_ok=True)
+        arrays = {}
+        for name in rows[0]:
+            arrays[name] = pa.array([row[name] for row in rows], types.get(name.split("].")[-1], types.get(name)))
+        parquet.write_table(pa.table(arrays), folder / f"{log.name}.parquet", row_group_size=4)
+
+    f32, matrix = pa.list_(pa.float32()), pa.list_(pa.float64(), 16)
+    image_types = {f"range_image_return{n}.values": f32 for n in (1, 2)} | {
+        f"range_image_return{n}.shape": pa.list_(pa.int32(), 3) for n in (1, 2)
+    }
+
+    def key(frame: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
+        time = {} if frame is None else {"key.frame_timestamp_micros": frame["timestamp_us"]}
+        return {"key.segment_context_name": log.name, **time, **{f"key.{name}": value for name, value in more.items()}}
+
+    def flat(prefix: str, array: Any) -> dict[str, Any]:
+        values = None if array is None else array.astype(np.float32).ravel()
+        return {f"{prefix}.values": values, f"{prefix}.shape": None if array is None else list(array.shape)}
+
+    save("vehicle_pose", [{**key(f), "[VehiclePoseComponent].world_from_vehicle.transform": f["pose"].ravel()} for f in log.frames],
+         {"world_from_vehicle.transform": matrix})  # fmt: skip
+    names = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+    save("camera_calibration", [
+        {**key(camera_name=c["number"]),
+         **{f"[CameraCalibrationComponent].intrinsic.{n}": float(v) for n, v in zip(names, c["intrinsic"], strict=True)},
+         "[CameraCalibrationComponent].extrinsic.transform": c["extrinsic"].ravel(),
+         "[CameraCalibrationComponent].width": c["width"], "[CameraCalibrationComponent].height": c["height"],
+         "[CameraCalibrationComponent].rolling_shutter_direction": 2} for c in log.cameras
+    ], {"extrinsic.transform": matrix})  # fmt: skip
+    save("lidar_calibration", [
+        {**key(laser_name=item["number"]), "[LiDARCalibrationComponent].extrinsic.transform": item["extrinsic"].ravel(),
+         "[LiDARCalibrationComponent].beam_inclination.min": item["min"],
+         "[LiDARCalibrationComponent].beam_inclination.max": item["max"],
+         "[LiDARCalibrationComponent].beam_inclination.values": list(item["inclinations"]) or None} for item in log.lasers
+    ], {"extrinsic.transform": matrix, "beam_inclination.values": pa.list_(pa.float64())})  # fmt: skip
+    prefix = "[CameraImageComponent]."
+    save("camera_image", [
+        {**key(f, camera_name=i["number"]), f"{prefix}image": i["image"], f"{prefix}pose.transform": i["pose"].ravel(),
+         **{f"{prefix}velocity.linear_velocity.{a}": v for a, v in zip("xyz", i["velocity"][:3], strict=True)},
+         **{f"{prefix}velocity.angular_velocity.{a}": v for a, v in zip("xyz", i["velocity"][3:], strict=True)},
+         f"{prefix}pose_timestamp": i["pose_time"], f"{prefix}rolling_shutter_params.shutter": i["shutter"],
+         f"{prefix}rolling_shutter_params.camera_trigger_time": i["trigger"],
+         f"{prefix}rolling_shutter_params.camera_readout_done_time": i["done"]} for f in log.frames for i in f["images"]
+    ], {"pose.transform": matrix})  # fmt: skip
+    prefix = "[CameraSegmentationLabelComponent]."
+    save("camera_segmentation", [
+        {**key(f, camera_name=i["number"]), f"{prefix}panoptic_label_divisor": DIVISOR, f"{prefix}panoptic_label": i["panoptic"]}
+        for f in log.frames for i in f["images"] if i["panoptic"] is not None
+    ], {})  # fmt: skip
+    lasers = [(f, item) for f in log.frames for item in f["lasers"]]
+    save("lidar", [
+        {**key(f, laser_name=item["number"]),
+         **flat("[LiDARComponent].range_image_return1", item["returns"][0]),
+         **flat("[LiDARComponent].range_image_return2", item["returns"][1] if len(item["returns"]) > 1 else None)}
+        for f, item in lasers
+    ], image_types)  # fmt: skip
+    save("lidar_pose", [
+        {**key(f, laser_name=item["number"]), **flat("[LiDARPoseComponent].range_image_return1", item["poses"])}
+        for f, item in lasers if item.get("poses") is not None
+    ], image_types)  # fmt: skip
+    prefix = "[LiDARCameraProjectionComponent]."
+    save("lidar_camera_projection", [
+        {**key(f, laser_name=item["number"]), **flat(f"{prefix}range_image_return1", item["projections"][0]),
+         **flat(f"{prefix}range_image_return2", item["projections"][1])} for f, item in lasers if item.get("projections")
+    ], image_types)  # fmt: skip
+    prefix = "[LiDARBoxComponent]."
+    save("lidar_box", [
+        {**key(f, laser_object_id=b["id"]), **{f"{prefix}box.center.{a}": float(v) for a, v in zip("xyz", b["centre"], strict=True)},
+         **{f"{prefix}box.size.{a}": float(v) for a, v in zip("xyz", b["size"], strict=True)},
+         f"{prefix}box.heading": float(b["heading"]), f"{prefix}type": b["type"]} for f in log.frames for b in f["boxes"]
+    ], {"type": pa.int8()})  # fmt: skip
+    save("stats", [{**key(log.frames[0]), "[StatsComponent].time_of_day": "Day", "[StatsComponent].location": "location_sf",
+                    "[StatsComponent].weather": "sunny"}], {})  # fmt: skip
+    return root
