@@ -1,16 +1,14 @@
-"""Importers: dataset logs in their own formats -> scene directories. ``FORMATS`` is the only place that lists them.
+"""Importers: dataset logs in their own formats -> scene directories. This is the only place that lists them.
 
 A format is one module ``<format>.py`` with ``import_<format>(source, out, options) -> Scene`` and
-``looks_like_<format>(source) -> bool``, and its name in ``FORMATS``. Modules are loaded when they are asked.
+``looks_like_<format>(source) -> bool``, its name in ``FORMATS`` and a case in ``_functions``. Modules are loaded when they are asked.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from mudg.base.types import Scene
 from mudg.data.importers.options import ImportOptions
@@ -25,17 +23,55 @@ FORMATS = (
 """Names of the formats, in the order in which a folder is asked whether it looks like one."""
 
 
-def _function(name: str, purpose: str) -> Callable[..., Any]:
-    """``import_<name>`` or ``looks_like_<name>``; ``name`` is always one of ``FORMATS``, never text from a file."""
-    return getattr(importlib.import_module(f"{__name__}.{name}"), f"{purpose}_{name}")
+def _functions(name: str) -> tuple[Recogniser, Importer]:
+    """``looks_like_<name>`` and ``import_<name>``."""
+    match name:
+        case "kitti360":
+            from mudg.data.importers.kitti360 import import_kitti360, looks_like_kitti360
+
+            return looks_like_kitti360, import_kitti360
+        case "waymo":
+            from mudg.data.importers.waymo import import_waymo, looks_like_waymo
+
+            return looks_like_waymo, import_waymo
+        case "nuscenes":
+            from mudg.data.importers.nuscenes import import_nuscenes, looks_like_nuscenes
+
+            return looks_like_nuscenes, import_nuscenes
+        case "argoverse2":
+            from mudg.data.importers.argoverse2 import import_argoverse2, looks_like_argoverse2
+
+            return looks_like_argoverse2, import_argoverse2
+        case "pandaset":
+            from mudg.data.importers.pandaset import import_pandaset, looks_like_pandaset
+
+            return looks_like_pandaset, import_pandaset
+        case "nuplan":
+            from mudg.data.importers.nuplan import import_nuplan, looks_like_nuplan
+
+            return looks_like_nuplan, import_nuplan
+        case "dgp":
+            from mudg.data.importers.dgp import import_dgp, looks_like_dgp
+
+            return looks_like_dgp, import_dgp
+        case "custom":
+            from mudg.data.importers.custom import import_custom, looks_like_custom
+
+            return looks_like_custom, import_custom
+        case "kitti":
+            from mudg.data.importers.kitti import import_kitti, looks_like_kitti
+
+            return looks_like_kitti, import_kitti
+        case _:
+            raise KeyError(name)
 
 
 def _import(name: str, source: Path, out: Path, options: ImportOptions) -> Scene:
-    return _function(name, "import")(source, out, options)
+    return _functions(name)[1](source, out, options)
 
 
 def _looks_like(name: str, source: Path) -> bool:
-    return _function(name, "looks_like")(source)
+    return _functions(name)[0](source)
 
 
 IMPORTERS: Mapping[str, Importer] = {name: partial(_import, name) for name in FORMATS}
