@@ -197,8 +197,8 @@ VERBS: dict[str, Verb] = {
         _score,
     ),
     "bench": Verb(
-        "Measurements against exact truth: mdm, mdm-ablation.",
-        ("mudg bench mdm --out runs/bench", "mudg bench mdm-ablation --out runs/ablation"),
+        "Measurements against exact truth: mdm, mdm-ablation, poses.",
+        ("mudg bench mdm --out runs/bench", "mudg bench mdm-ablation --out runs/ablation", "mudg bench poses --out runs/poses"),
         _bench,
     ),
 }  # fmt: skip

@@ -175,7 +175,7 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Positional[str]
-    """mdm or mdm-ablation."""
+    """mdm, mdm-ablation or poses."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")] = stage_config.BenchConfig()
 
 

@@ -184,7 +184,7 @@ class LearnConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class BenchConfig:
-    """Measure the diffusion model on generated cities that it was never trained on, against exact truth."""
+    """Measure on generated cities against exact truth: the diffusion model on ones it was never trained on, or the scene fit."""
 
     model: str = "embedded"
     """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
@@ -203,6 +203,8 @@ class BenchConfig:
     """mdm-ablation: training steps of each variant."""
     ablation_cities: int = Field(default=40, ge=1)
     """mdm-ablation: cities to train on."""
+    pose_iterations: int = Field(default=500, ge=1)
+    """poses: steps of each fit."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -301,6 +303,30 @@ class FitConfig:
     """Update only the Gaussians that a step's view shows."""
     learn_poses: bool = False
     """Correct the boxes of moving objects while fitting (offset and yaw per key)."""
+    pose_start: float = Field(default=0.1, ge=0, le=1)
+    """learn_poses: share of the iterations before boxes move."""
+    pose_smoothing: float = Field(default=0.2, ge=0, le=1)
+    """learn_poses: how far boxes are pulled towards a smooth path, every tenth step (0 = every key on its own)."""
+    deformable: bool = False
+    """Let people and cyclists change their shape within their boxes."""
+    color_terms: int = Field(default=0, ge=0, le=8)
+    """Sines and cosines by which the colour of moving objects may vary over time (published: 4; 0 = constant)."""
+    mirror_start: bool = False
+    """Start vehicles with their points mirrored to the side that nothing measured."""
+    mirror_probability: float = Field(default=0.0, ge=0, le=1)
+    """How often vehicles are shown mirrored while fitting, so that one side teaches the other."""
+    exposure: Literal["none", "camera", "image"] = "none"
+    """Learn an affine colour map per camera, or per recorded image; not used in renders."""
+    exposure_weight: float = Field(default=0.1, ge=0)
+    """Pull of colour maps, of recorded and virtual views, towards the identity."""
+    learn_cameras: bool = False
+    """Correct the pose of every recorded image while fitting; not used in renders."""
+    virtual_appearance: bool = False
+    """mudg_s: learn an affine colour map per set of virtual views, so that their colours do not reach the recorded path."""
+    outlier_deviations: float = Field(default=0.0, ge=0)
+    """Leave out starting points that lie lonelier than usual by so many standard deviations (0 = keep all)."""
+    object_weight: float = Field(default=0.0, ge=0)
+    """Moving objects decide, inside their boxes, between there and not there, and leave no haze outside (published: 0.1)."""
     densify: bool = True
     ssim_weight: float = Field(default=0.2, ge=0, le=1)
     lidar_weight: float = Field(default=0.1, ge=0)
