@@ -218,6 +218,13 @@ class RigidNode:
         self.offsets["shift"].add_(torch.from_numpy(share * shift).float())
         self.offsets["yaw"].add_(torch.from_numpy(share * (self._smoothers[1] @ headings - headings)).float())
 
+    def moved(self, object_from_new: NDArray[np.float64]) -> Self:
+        """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box stays."""
+        columns = {name: value.detach() for name, value in self.offsets.columns.items()}
+        columns |= {"shift": torch.zeros_like(columns["shift"]), "yaw": torch.zeros_like(columns["yaw"])}
+        keys = self.corrected_keys() @ object_from_new
+        return type(self)(self.name, self.label, self.size_m, self.times_s, keys, Table(columns), self.learn_pose)
+
     # -- rows -------------------------------------------------------------------------------------------------------
 
     def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor] | None:
@@ -479,6 +486,13 @@ class SceneModel:
             {key: value.detach()[part] for key, value in self.table.partial.items()},
         )  # fmt: skip
         return SceneModel(table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts))
+
+    def with_node_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:
+        """A copy with one object displaced in its own frame (it shares the table of Gaussians)."""
+        nodes = tuple(
+            node.moved(object_from_new) if isinstance(node, RigidNode) and node.name == name else node for node in self.nodes
+        )
+        return SceneModel(self.table, nodes, self.sky, self.classes, self.sh_degree, dict(self.facts))
 
     # -- state ------------------------------------------------------------------------------------------------------
 

@@ -203,7 +203,7 @@ class BenchConfig:
     """mdm-ablation: training steps of each variant."""
     ablation_cities: int = Field(default=40, ge=1)
     """mdm-ablation: cities to train on."""
-    pose_iterations: int = Field(default=500, ge=1)
+    pose_iterations: int = Field(default=300, ge=1)
     """poses: steps of each fit."""
 
 
