@@ -29,7 +29,7 @@ from mudg.stages.ingest import add_frame_copy, add_rest
 SIZE, FRAMES = (60, 40), 6
 EVERYTHING = {
     "learn_poses": True, "deformable": True, "color_terms": 4, "mirror_start": True, "mirror_probability": 0.3, "exposure": "image",
-    "learn_cameras": True, "virtual_appearance": True, "outlier_deviations": 4.0, "object_weight": 0.1, "pose_start": 0.0,
+    "learn_cameras": True, "virtual_appearance": True, "outlier_deviations": 4.0, "object_weight": 0.1, "pose_start": 0.3,
 }  # fmt: skip
 
 

@@ -99,11 +99,11 @@ class StaticNode:
 class RigidNode:
     """A tracked moving object: rows in the frame of its box, carried by the box's pose.
 
-    The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by learnable offsets in
+    The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in
     the frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
     positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
 
-    Parameters of the node, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians.
+    The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians. ``learn_pose``: whether a fit may change them.
     """
 
     kind = "rigid"
@@ -150,7 +150,7 @@ class RigidNode:
         turn = torch.stack([torch.cos(half), zero, zero, torch.sin(half)])
         return position, left_product_matrix(self._quats[index]) @ turn
 
-    def _keys_around(self, time_s: float) -> tuple[int, int, float] | None:
+    def keys_around(self, time_s: float) -> tuple[int, int, float] | None:
         """The two neighbouring keys and the fraction of the way between them (one key twice at its very time); None outside."""
         tolerance_s = 1e-6
         times = self.times_s
@@ -164,7 +164,7 @@ class RigidNode:
 
     def pose_at(self, time_s: float) -> tuple[Tensor, Tensor] | None:
         """Position ``[3]`` m and unit quaternion ``[4]`` at a time, differentiable in the offsets; None outside the span."""
-        found = self._keys_around(time_s)
+        found = self.keys_around(time_s)
         if found is None:
             return None
         before, after, u = found
@@ -185,12 +185,19 @@ class RigidNode:
 
     def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
         """Corrected world_from_object f64[4, 4] at a time; None outside the span."""
-        found = self._keys_around(time_s)
+        found = self.keys_around(time_s)
         if found is None:
             return None
         before, after, u = found
         keys = self._corrected(slice(before, after + 1))
         return keys[0] if before == after else geometry.interpolate_pose(keys[0], keys[1], u)
+
+    @torch.no_grad()
+    def add_offsets(self, shift_m: NDArray[np.float64], yaw_rad: NDArray[np.float64]) -> None:
+        """Move every key by ``shift_m`` [K, 3] and ``yaw_rad`` [K] in the frame of the box, in place."""
+        self.offsets["shift"].add_(torch.from_numpy(shift_m).float())
+        self.offsets["yaw"].add_(torch.from_numpy(yaw_rad).float())
+        self._placements.clear()
 
     @torch.no_grad()
     def settle(self, share: float) -> None:
@@ -215,8 +222,7 @@ class RigidNode:
         headings = heading + self.offsets["yaw"].double().numpy()
         rotation_t = self.world_from_object[:, :3, :3].transpose(0, 2, 1)
         shift = (rotation_t @ (self._smoothers[0] @ positions - positions)[..., None])[..., 0]
-        self.offsets["shift"].add_(torch.from_numpy(share * shift).float())
-        self.offsets["yaw"].add_(torch.from_numpy(share * (self._smoothers[1] @ headings - headings)).float())
+        self.add_offsets(share * shift, share * (self._smoothers[1] @ headings - headings))
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
         """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box stays."""
@@ -229,22 +235,19 @@ class RigidNode:
 
     def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor] | None:
         """See ``Node``."""
-        placement = self._placement(time_s) if self.learn_pose else self._fixed_placement(time_s)
+        placement = self._placement(time_s)
         if placement is None:
             return None
         position, rotation_t, product_t = placement
         return torch.addmm(position, means, rotation_t), quats @ product_t
 
     def _placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``."""
-        pose = self.pose_at(time_s)
-        return None if pose is None else (pose[0], rotation_matrix(pose[1]).T, left_product_matrix(pose[1]).T)
-
-    def _fixed_placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
-        """The same, remembered per time: a pose that is not learnt is worked out once."""
+        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``, remembered per time."""
         if time_s not in self._placements:
             with torch.no_grad():
-                self._placements[time_s] = self._placement(time_s)
+                pose = self.pose_at(time_s)
+            place = None if pose is None else (pose[0], rotation_matrix(pose[1]).T, left_product_matrix(pose[1]).T)
+            self._placements[time_s] = place
         return self._placements[time_s]
 
     def color_weights(self, time_s: float, terms: int) -> Tensor:
@@ -252,13 +255,11 @@ class RigidNode:
         return motion.periodic_weights(time_s, float(self.times_s[0]), float(self.times_s[-1]), terms)
 
     def parameters(self) -> Table | None:
-        """The pose offsets, when they are learnt."""
-        return self.offsets if self.learn_pose else None
+        """None: offsets are not learnt by gradient steps but by ``stages.fit_poses``, which weighs what each picture can tell."""
+        return None
 
     def after_step(self, share: float) -> None:
-        """Regularise what is learnt per key, in place, after an optimiser step; ``share`` as in ``settle``."""
-        if self.learn_pose:
-            self.settle(share)
+        """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning rate."""
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``Node``."""
@@ -302,13 +303,13 @@ class DeformableNode(RigidNode):
 
     def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor] | None:
         """See ``Node``."""
-        if self._keys_around(time_s) is None:
+        if self.keys_around(time_s) is None:
             return None
         return super().place(means + self.displacement(means, time_s), quats, time_s)
 
     def displacement(self, means: Tensor, time_s: float) -> Tensor:
         """How far rows at ``means`` [n, 3] (frame of the box) are moved at a time, [n, 3] metres; differentiable in both."""
-        found = self._keys_around(time_s)
+        found = self.keys_around(time_s)
         if found is None or len(means) == 0:
             return torch.zeros_like(means)
         before, after, u = found
@@ -320,13 +321,12 @@ class DeformableNode(RigidNode):
         return moved[0, :, 0, 0].T
 
     def parameters(self) -> Table:
-        """Offsets and displacements. (The offsets of a node whose pose is not learnt have no gradient, and so stay.)"""
+        """The table that holds the displacements; the offsets in it never have a gradient, and so stay."""
         return self.offsets
 
     @torch.no_grad()
     def after_step(self, share: float) -> None:
         """See ``RigidNode``; displacements shrink towards none and towards those of the neighbouring keys."""
-        super().after_step(share)
         deform = self.offsets["deform"]
         if len(deform) > 2:
             inner = (deform[:-2] + deform[2:]) / 2 - deform[1:-1]

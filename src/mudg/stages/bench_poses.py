@@ -97,7 +97,7 @@ def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
     """A small, quick fit with poses "fixed", "learnt", or only "smoothed"."""
     return FitConfig(
         method="street_gaussians", iterations=config.pose_iterations, learn_poses=poses != "fixed",
-        pose_start=1.0 if poses == "smoothed" else FitConfig().pose_start, initial_gaussians=8000, densify=False,
+        pose_rounds=0 if poses == "smoothed" else FitConfig().pose_rounds, initial_gaussians=8000, densify=False,
         semantic_every=1000, preview_every=10**6, checkpoint_every=10**6, seed=config.seed,
     )  # fmt: skip
 

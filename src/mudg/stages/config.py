@@ -303,10 +303,10 @@ class FitConfig:
     """Update only the Gaussians that a step's view shows."""
     learn_poses: bool = False
     """Correct the boxes of moving objects while fitting (offset and yaw per key)."""
-    pose_start: float = Field(default=0.1, ge=0, le=1)
-    """learn_poses: share of the iterations before boxes move."""
-    pose_smoothing: float = Field(default=0.2, ge=0, le=1)
-    """learn_poses: how far boxes are pulled towards a smooth path, every tenth step (0 = every key on its own)."""
+    pose_start: float = Field(default=0.25, ge=0, le=1)
+    """learn_poses: share of the iterations before the first round of corrections."""
+    pose_rounds: int = Field(default=4, ge=0)
+    """learn_poses: rounds of corrections, spread evenly up to 85 % of the iterations (0 = only take the noise out of the tracks)."""
     deformable: bool = False
     """Let people and cyclists change their shape within their boxes."""
     color_terms: int = Field(default=0, ge=0, le=8)

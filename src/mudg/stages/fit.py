@@ -43,6 +43,7 @@ from mudg.models.featnets import FilterBank
 from mudg.models.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky
 from mudg.stages.config import FitConfig
 from mudg.stages.fit_objects import boxes_in_view, objects_only
+from mudg.stages.fit_poses import refine_poses
 from mudg.stages.fit_start import StartSettings, start_model
 from mudg.stages.fit_trust import unseen_maps, unseen_rows
 from mudg.stages.fit_views import Sample, ViewSet, classes_of, load_recorded, load_virtual, training_frames
@@ -51,6 +52,7 @@ VERSION = 1
 PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
+LAST_POSE_ROUND = 0.85
 NEAR_M = 0.2
 
 
@@ -203,6 +205,9 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.longest_to_middle)
                 settle_nodes(state.model, config, step)
+            if pose_round_due(config, step):
+                moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
+                folder.log(step=step, boxes_moved_m=round(moved_m, 5))
             if growing:
                 state.stats.observe(render.trace, observation.view.camera.width, observation.view.camera.height)
             grown = _densify_if_due(state, config, step)
@@ -317,11 +322,20 @@ def shows_mirrored(config: FitConfig, step: int) -> bool:
 
 
 def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
-    """Couple neighbouring keys of every moving object, less and less as the steps of the optimiser shrink."""
-    share = config.pose_smoothing * learning_rates(step, config.iterations)["shift"] / learning_rates(1, config.iterations)["shift"]
+    """Regularise what nodes learn per key of their track, less and less as the steps of the optimiser shrink."""
+    share = learning_rates(step, config.iterations)["deform"] / learning_rates(1, config.iterations)["deform"]
     for node in model.nodes:
         if isinstance(node, RigidNode):
             node.after_step(share)
+
+
+def pose_round_due(config: FitConfig, step: int) -> bool:
+    """Whether boxes are corrected after a step."""
+    if not config.learn_poses or not config.pose_rounds:
+        return False
+    first, last = config.pose_start, max(config.pose_start, LAST_POSE_ROUND)
+    shares = np.linspace(first, last, config.pose_rounds)
+    return step in {max(1, round(float(share) * config.iterations)) for share in shares}
 
 
 def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
@@ -369,8 +383,6 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "sh_rest": 1.25e-4 * boost * gentle,
         "semantics": 1e-2 * boost,
         "panorama": 1e-2 * gentle,
-        "shift": 1e-3 * boost * gentle,
-        "yaw": 2e-4 * boost * gentle,
         "deform": 1e-3 * boost * gentle,
         "sh_time": 2.5e-3 * boost * gentle,
     }
@@ -399,8 +411,6 @@ def adam_step(model: SceneModel, step: int, config: FitConfig, visible: Tensor) 
         visible: bool[N], the Gaussians this step's view shows; with ``config.selective_adam`` the others rest.
     """
     rates = learning_rates(step, config.iterations)
-    if step <= config.pose_start * config.iterations:
-        rates |= {"shift": 0.0, "yaw": 0.0}
     model.table.adam_step(step, rates, kernels.adam_columns, visible if config.selective_adam else None)
     for table in model.node_tables().values():
         table.adam_step(step, rates, kernels.adam_columns)

@@ -32,25 +32,31 @@ def objects_only(gaussians: Gaussians) -> Gaussians:
 
 
 def boxes_in_view(model: SceneModel, view: View) -> Tensor:
-    """Bool[1, H, W]: inside the outline of some object's box (slightly grown). A box that reaches behind the camera covers all."""
-    camera = view.camera
-    canvas = Image.new("1", (camera.width, camera.height))
-    draw = ImageDraw.Draw(canvas)
+    """Bool[1, H, W]: inside the outline of some object's box (slightly grown)."""
+    inside = np.zeros((view.camera.height, view.camera.width), bool)
     for node in model.nodes:
-        if not isinstance(node, RigidNode):
-            continue
-        pose = node.pose_matrix(view.time_s)
-        if pose is None:
-            continue
-        uv, z = geometry.project(view, geometry.transform_points(pose, _corners(node.size_m)))
-        if z.max() < NEAREST_CORNER_M:
-            continue
-        if z.min() < NEAREST_CORNER_M:
-            draw.rectangle([0, 0, camera.width, camera.height], fill=1)
-            break
-        outline = [tuple(point) for point in convex_outline(uv - 0.5).tolist()]
-        draw.polygon(outline, fill=1, outline=1)
-    return torch.from_numpy(np.array(canvas, bool))[None]
+        pose = node.pose_matrix(view.time_s) if isinstance(node, RigidNode) else None
+        if pose is not None and isinstance(node, RigidNode):
+            mask = outline_mask(view, pose, node.size_m)
+            inside = inside if mask is None else inside | mask
+    return torch.from_numpy(inside)[None]
+
+
+def outline_mask(view: View, world_from_object: NDArray[np.float64], size_m: tuple[float, ...]) -> NDArray[np.bool_] | None:
+    """Bool[H, W]: inside the outline of a box, slightly grown. None: nothing of it is in view. A box that reaches behind the camera
+    covers everything."""
+    camera = view.camera
+    uv, z = geometry.project(view, geometry.transform_points(world_from_object, _corners(size_m)))
+    if z.max() < NEAREST_CORNER_M:
+        return None
+    if z.min() < NEAREST_CORNER_M:
+        return np.ones((camera.height, camera.width), bool)
+    if uv[:, 0].max() < 0 or uv[:, 1].max() < 0 or uv[:, 0].min() > camera.width or uv[:, 1].min() > camera.height:
+        return None
+    canvas = Image.new("1", (camera.width, camera.height))
+    outline = [tuple(point) for point in convex_outline(uv - 0.5).tolist()]
+    ImageDraw.Draw(canvas).polygon(outline, fill=1, outline=1)
+    return np.array(canvas, bool)
 
 
 def _corners(size_m: tuple[float, ...]) -> NDArray[np.float64]:
