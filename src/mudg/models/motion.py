@@ -17,7 +17,7 @@ from torch import Tensor
 
 ACCELERATION_M_S2: Final = 2.0
 """Usual acceleration of road users (standard deviation); hard braking is three to four times as much."""
-YAW_ACCELERATION_RAD_S2: Final = 0.5
+YAW_ACCELERATION_RAD_S2: Final = 0.3
 FEWEST_KEYS: Final = 8
 """Tracks with fewer keys tell nothing about their noise."""
 

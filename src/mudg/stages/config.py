@@ -311,7 +311,7 @@ class FitConfig:
     """Let people and cyclists change their shape within their boxes."""
     color_terms: int = Field(default=0, ge=0, le=8)
     """Sines and cosines by which the colour of moving objects may vary over time (published: 4; 0 = constant)."""
-    mirror_start: bool = False
+    mirror_start: bool = True
     """Start vehicles with their points mirrored to the side that nothing measured."""
     mirror_probability: float = Field(default=0.0, ge=0, le=1)
     """How often vehicles are shown mirrored while fitting, so that one side teaches the other."""
