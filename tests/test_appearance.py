@@ -76,7 +76,9 @@ def test_recorded_maps_average_to_the_identity_and_virtual_ones_need_not():
 def test_rigid_motion_agrees_with_the_rotation_about_an_axis():
     moved = rigid_motion(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 0.7])).numpy()
     assert np.abs(moved - geometry.yaw_matrix(0.7, (1, 2, 3))).max() < 1e-6
-    any_turn = rigid_motion(torch.zeros(3, dtype=torch.float64), torch.tensor([0.3, -0.4, 0.5], dtype=torch.float64)).numpy()
+    any_turn = rigid_motion(
+        torch.zeros(3, dtype=torch.float64), torch.tensor([0.3, -0.4, 0.5], dtype=torch.float64)
+    ).numpy()
     assert geometry.is_rigid(any_turn)
     assert math.acos((np.trace(any_turn[:3, :3]) - 1) / 2) == pytest.approx(math.sqrt(0.5), abs=1e-9)
 
@@ -95,7 +97,10 @@ def test_gradients_by_finite_differences(scale):
         pose = made.world_from_cam(view, RECORDED[1])
         return torch.cat([made.colored(rgb, RECORDED[1], "recorded").flatten(), pose.flatten()])
 
-    inputs = [(scale * torch.randn(*shape, generator=g, dtype=torch.float64)).requires_grad_() for shape in ((3, 3, 4), (3, 3), (3, 3))]
+    inputs = [
+        (scale * torch.randn(*shape, generator=g, dtype=torch.float64)).requires_grad_()
+        for shape in ((3, 3, 4), (3, 3), (3, 3))
+    ]
     assert torch.autograd.gradcheck(applied, inputs)
 
 
@@ -153,12 +158,16 @@ def world(tmp_path_factory):
 
 def begin(world, change=None, **options) -> tuple[fit.FitState, FitConfig]:
     scene, cloud = world
-    config = FitConfig(method="street_gaussians", **{"iterations": 120, "initial_gaussians": 700, "densify": False, **options})
+    config = FitConfig(
+        method="street_gaussians", **{"iterations": 120, "initial_gaussians": 700, "densify": False, **options}
+    )
     frames = fit_views.training_frames(scene, ())
     classes = fit_views.classes_of(scene, frames, None)
     recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
     recorded = tuple(map(change, recorded)) if change is not None else recorded
-    return fit.start_state(config, fit.RECIPES[config.method], scene, cloud, fit_views.ViewSet(recorded, ()), classes), config
+    return fit.start_state(
+        config, fit.RECIPES[config.method], scene, cloud, fit_views.ViewSet(recorded, ()), classes
+    ), config
 
 
 def optimised(state, config, tmp_path):
@@ -183,7 +192,9 @@ def test_different_exposures_are_recovered(world, tmp_path):
     state, config = begin(world, darker_left, exposure="camera", iterations=240)
     optimised(state, config, tmp_path / "learnt")
     grey = torch.full((3, 1, 1), 0.5)
-    front, left = (state.appearance.colored(grey, f"{name}/0", "recorded").detach().flatten() for name in ("front", "left"))
+    front, left = (
+        state.appearance.colored(grey, f"{name}/0", "recorded").detach().flatten() for name in ("front", "left")
+    )
     injected = torch.tensor([0.7, 0.7, 0.75]) * 0.5 + 6 / 255
     assert ((left - front) / (injected - 0.5) > 0.4).all()
 

@@ -18,7 +18,10 @@ def tracks(count: int = 6, keys: int = 60) -> tuple[Track, ...]:
 
 
 def moves(kind: str) -> list[np.ndarray]:
-    return [geometry.invert(a.world_from_object) @ b.world_from_object for a, b in zip(tracks(), disturbed(tracks(), kind, 0))]
+    return [
+        geometry.invert(a.world_from_object) @ b.world_from_object
+        for a, b in zip(tracks(), disturbed(tracks(), kind, 0))
+    ]
 
 
 @pytest.mark.parametrize("kind", ["noise", "drift", "offset"])

@@ -26,11 +26,15 @@ def fitted(tmp_path_factory) -> fit.FitState:
     """A toy street fitted with exact boxes."""
     root = tmp_path_factory.mktemp("world")
     scene = read_scene(write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1]).root)
-    config = FitConfig(method="street_gaussians", iterations=60, initial_gaussians=1500, densify=False, semantic_every=999)
+    config = FitConfig(
+        method="street_gaussians", iterations=60, initial_gaussians=1500, densify=False, semantic_every=999
+    )
     frames = fit_views.training_frames(scene, ())
     classes = fit_views.classes_of(scene, frames, None)
     recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
-    state = fit.start_state(config, fit.RECIPES[config.method], scene, fused_cloud(FRAMES), fit_views.ViewSet(recorded, ()), classes)
+    state = fit.start_state(
+        config, fit.RECIPES[config.method], scene, fused_cloud(FRAMES), fit_views.ViewSet(recorded, ()), classes
+    )
     fit.optimise(state, config, store.RunDir.open(root / "fit", "fit", to_dict(config), {}, 1, False))
     return state
 

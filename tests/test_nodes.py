@@ -425,12 +425,24 @@ def test_second_differences_are_the_acceleration_at_uneven_times():
     assert motion.second_differences(times[:2]).shape == (0, 2)
 
 
-def test_the_smoother_keeps_straight_motion_and_means():
+def test_smoothing_keeps_straight_motion_and_means_and_sharp_turns():
     times = np.array([0.0, 0.1, 0.35, 0.4, 1.0, 1.1])
-    smooth = motion.smoother(times, 0.1, 2.0)
-    assert np.abs(smooth @ (4 - 7 * times) - (4 - 7 * times)).max() < 1e-9
-    assert np.abs(smooth.sum(0) - 1).max() < 1e-9
-    assert np.abs(motion.smoother(times, 0.0, 2.0) - np.eye(6)).max() < 1e-12
+    straight = np.column_stack([4 - 7 * times, 2 * times])
+    assert np.abs(motion.smoothed(times, straight, 0.1, 2.0) - straight).max() < 1e-9
+    bumpy = straight + np.array([0.1, -0.1, 0.05, 0.0, -0.1, 0.05])[:, None]
+    found = motion.smoothed(times, bumpy, 0.1, 2.0)
+    assert np.abs(found.mean(0) - bumpy.mean(0)).max() < 1e-9
+    assert np.abs(motion.smoothed(times, bumpy, 0.0, 2.0) - bumpy).max() == 0
+    even = 0.1 * np.arange(30)
+    corner = np.maximum(0, 1.5 * (even - 1.5))[:, None]  # a turn that begins all at once
+    assert np.abs(motion.smoothed(even, corner, 0.02, 0.3) - corner).max() < 0.03
+
+
+def test_weights_of_motion_fall_with_acceleration():
+    weights = motion.motion_weights(np.array([[0.0], [1.0], [10.0]]))
+    assert weights[1] == pytest.approx(1.0)
+    assert weights[0] > weights[1] > weights[2]
+    assert weights[2] < 0.05
 
 
 @pytest.mark.parametrize("noise_m", [0.02, 0.1])
@@ -446,23 +458,24 @@ def test_settling_removes_noise_and_leaves_a_clean_track_alone():
     exact, noisy = wavy_track(0.1, math.radians(1.0))
     node = RigidNode.from_track(noisy, learn_pose=True)
     before = key_error(node, exact)
-    node.settle(1.0)
+    node.settle()
     assert key_error(node, exact) < 0.5 * before
     headings = np.array([geometry.yaw_of(p) for p in node.corrected_keys()])
     assert np.sqrt(((headings - 0.08 * exact.times_s) ** 2).mean()) < 0.6 * math.radians(1.0)
     clean = RigidNode.from_track(exact, learn_pose=True)
-    clean.settle(1.0)
+    clean.settle()
     assert key_error(clean, exact) < 0.002
 
 
-def test_settling_in_two_halves_moves_less_than_all_the_way_and_short_tracks_stay():
+def test_settling_again_changes_nothing_and_short_tracks_stay():
     _, noisy = wavy_track(0.1)
-    nodes_ = [RigidNode.from_track(noisy, learn_pose=True) for _ in range(2)]
-    nodes_[0].settle(1.0)
-    nodes_[1].settle(0.5)
-    assert torch.allclose(nodes_[1].offsets["shift"], 0.5 * nodes_[0].offsets["shift"], atol=1e-6)
+    node = RigidNode.from_track(noisy, learn_pose=True)
+    node.settle()
+    once = node.offsets["shift"].detach().clone()
+    node.settle()
+    assert torch.allclose(node.offsets["shift"], once, atol=1e-6)
     short = RigidNode("s", "car", (4, 2, 1.5), [0.0, 0.5], np.stack([pose(0, 0, 0, 0), pose(1, 0.3, 0, 0.1)]), learn_pose=True)
-    short.settle(1.0)
+    short.settle()
     assert not short.offsets["shift"].any()
 
 

@@ -95,7 +95,12 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
     monkeypatch.setattr(fit, "adam_step", adam_step)
     parts = fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
     assert fitted_bytes(parts) == fitted_bytes(whole)
-    assert set(fitted_bytes(whole)) == {"gaussians.safetensors", "nodes.safetensors", "appearance.safetensors", "model.json"}
+    assert set(fitted_bytes(whole)) == {
+        "gaussians.safetensors",
+        "nodes.safetensors",
+        "appearance.safetensors",
+        "model.json",
+    }
 
     model = fit.load_model(whole)
     walker = next(node for node in model.nodes if node.name == "walker")
@@ -106,7 +111,9 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
 
 
 def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
-    folder = fit.run(settings(iterations=6), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"])
+    folder = fit.run(
+        settings(iterations=6), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"]
+    )
     model = fit.load_model(folder)
     fit.save_model(model, tmp_path)
     again = fit.load_model(tmp_path)
@@ -117,7 +124,9 @@ def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
 
 def test_cloned_and_split_rows_of_objects_stay_aligned(world, tmp_path):
     """After a densification every partial column still fits, and composing works at every time."""
-    folder = fit.run(settings(iterations=4), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"])
+    folder = fit.run(
+        settings(iterations=4), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"]
+    )
     model = fit.load_model(folder)
     rows = len(model.table)
     stats = DensifyStats(torch.rand(rows, generator=torch.Generator().manual_seed(0)), torch.ones(rows))
@@ -133,8 +142,12 @@ def test_cloned_and_split_rows_of_objects_stay_aligned(world, tmp_path):
 def test_everything_on_without_tracks_and_with_one_frame(tmp_path):
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(1, semantics=False).static, {}), {})
-    folder = fit.run(settings("street_gaussians", iterations=4), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit")
-    assert torch.isfinite(fit.render_view(fit.load_model(folder), view_at(0.0, camera(width=48, height=32)), RasterConfig()).rgb).all()
+    folder = fit.run(
+        settings("street_gaussians", iterations=4), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit"
+    )
+    assert torch.isfinite(
+        fit.render_view(fit.load_model(folder), view_at(0.0, camera(width=48, height=32)), RasterConfig()).rgb
+    ).all()
 
 
 @pytest.mark.parametrize("label", ["car", "pedestrian"])
@@ -146,7 +159,9 @@ def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
     points = fused_cloud(2).objects["car"]
     few = PointCloud(points.xyz[:3], points.rgb[:3], "object", None)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(2).static, {"car": few}), {})
-    folder = fit.run(settings("street_gaussians", iterations=8), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit")
+    folder = fit.run(
+        settings("street_gaussians", iterations=8), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit"
+    )
     model = fit.load_model(folder)
     moving = model.table.labels["node"] > 0
     assert (compose(model, 0.3).opacity[moving] > 0).any()
@@ -186,7 +201,10 @@ def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
 def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):
     seen = truth(view_at(0.0, camera(width=12, height=8)))
     seen.rgb[1, 2, 3] = float("nan")
-    with pytest.raises(InputError, match=r"not finite[\s\S]*000000"), ObservationWriter(tmp_path / "v", "v", "test") as writer:
+    with (
+        pytest.raises(InputError, match=r"not finite[\s\S]*000000"),
+        ObservationWriter(tmp_path / "v", "v", "test") as writer,
+    ):
         writer.add(seen)
 
 
@@ -204,7 +222,10 @@ def test_mirrored_points_appear_where_nothing_was_measured():
 
 
 def test_lonely_points_are_found_and_regular_ones_kept():
-    grid = np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0], indexing="ij"), -1).reshape(-1, 3).astype(np.float32) * 0.2
+    grid = (
+        np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0], indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+        * 0.2
+    )
     jitter = np.random.Generator(np.random.PCG64(0)).normal(0, 0.02, grid.shape).astype(np.float32)
     far = np.array([[3.0, 3.0, 6.0]], np.float32)
     found = fit_start._lonely(np.concatenate([grid + jitter, far]), np.array([[3.0, 3.0, 1.5]], np.float32), 6.0)

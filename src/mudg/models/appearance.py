@@ -44,10 +44,16 @@ class Appearance:
     def __init__(self, names: Mapping[str, Sequence[str]], tables: Mapping[str, Table] | None = None) -> None:
         self.names = {group: tuple(of) for group, of in names.items() if len(of)}
         self._row = {group: {name: row for row, name in enumerate(of)} for group, of in self.names.items()}
-        self.tables = dict(tables) if tables is not None else {group: _identity(group, len(of)) for group, of in self.names.items()}
+        self.tables = (
+            dict(tables)
+            if tables is not None
+            else {group: _identity(group, len(of)) for group, of in self.names.items()}
+        )
         for group, of in self.names.items():
             if group not in self.tables or len(self.tables[group]) != len(of):
-                raise InputError("corrections of appearance do not fit their names", where=group, expected=f"{len(of)} rows")
+                raise InputError(
+                    "corrections of appearance do not fit their names", where=group, expected=f"{len(of)} rows"
+                )
 
     @classmethod
     def of_views(
@@ -87,7 +93,9 @@ class Appearance:
         if row is None:
             return None
         table = self.tables[CAMERA_POSE]
-        return torch.from_numpy(view.world_from_cam.copy()).to(table["shift"].dtype) @ rigid_motion(table["shift"][row], table["turn"][row])
+        return torch.from_numpy(view.world_from_cam.copy()).to(table["shift"].dtype) @ rigid_motion(
+            table["shift"][row], table["turn"][row]
+        )
 
     def _affine(self, name: str, kind: str) -> Tensor | None:
         """Difference ``[3, 4]`` of the view's colour map from the identity."""
@@ -124,7 +132,9 @@ class Appearance:
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON values and tensors that rebuild it with its moments."""
-        tensors = {f"{group}/{key}": value for group, table in self.tables.items() for key, value in table.state().items()}
+        tensors = {
+            f"{group}/{key}": value for group, table in self.tables.items() for key, value in table.state().items()
+        }
         return {group: list(of) for group, of in self.names.items()}, tensors
 
     @classmethod

@@ -121,7 +121,6 @@ class RigidNode:
         count = len(self.times_s)
         self.offsets = offsets or Table({"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)})
         self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
-        self._smoothers: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._quats = torch.from_numpy(np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])).float()
         self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
         self._positions = torch.from_numpy(self.world_from_object[:, :3, 3].copy()).float()
@@ -199,30 +198,24 @@ class RigidNode:
         self.offsets["yaw"].add_(torch.from_numpy(yaw_rad).float())
         self._placements.clear()
 
-    @torch.no_grad()
-    def settle(self, share: float) -> None:
-        """Move the corrected keys by ``share`` of the way to the likeliest path behind noisy keys, in place.
+    def settle(self) -> None:
+        """Set the offsets to what takes independent noise out of the track: the best guess before any picture was seen.
 
-        This couples neighbouring keys: independent errors go, the motion stays (``motion.smoother``). The expected noise is what
-        the track itself betrays, at least `LEAST_NOISE_M` and `LEAST_NOISE_RAD`. With ``share`` 1 and offsets of zero it is the
-        best guess before any picture was seen.
+        The size of the noise is what the track itself betrays, at least `LEAST_NOISE_M` and `LEAST_NOISE_RAD`.
         """
-        if len(self.times_s) < 3 or share <= 0:
-            return
-        heading = np.unwrap([geometry.yaw_of(pose) for pose in self.world_from_object])
-        if self._smoothers is None:
-            noise = motion.key_noise(self.times_s, np.column_stack([self.world_from_object[:, :3, 3], heading]))
-            noise_m = max(float(np.sqrt((noise[:3] ** 2).mean())), LEAST_NOISE_M)
-            noise_rad = max(float(noise[3]), LEAST_NOISE_RAD)
-            self._smoothers = (
-                motion.smoother(self.times_s, noise_m, motion.ACCELERATION_M_S2),
-                motion.smoother(self.times_s, noise_rad, motion.YAW_ACCELERATION_RAD_S2),
-            )
-        positions = self.corrected_keys()[:, :3, 3]
-        headings = heading + self.offsets["yaw"].double().numpy()
-        rotation_t = self.world_from_object[:, :3, :3].transpose(0, 2, 1)
-        shift = (rotation_t @ (self._smoothers[0] @ positions - positions)[..., None])[..., 0]
-        self.add_offsets(share * shift, share * (self._smoothers[1] @ headings - headings))
+        positions, heading = self.world_from_object[:, :3, 3], self.headings()
+        noise = motion.key_noise(self.times_s, np.column_stack([positions, heading]))
+        noise_m = max(float(np.sqrt((noise[:3] ** 2).mean())), LEAST_NOISE_M)
+        noise_rad = max(float(noise[3]), LEAST_NOISE_RAD)
+        path = motion.smoothed(self.times_s, positions, noise_m, motion.ACCELERATION_M_S2) - positions
+        turn = motion.smoothed(self.times_s, heading[:, None], noise_rad, motion.YAW_ACCELERATION_RAD_S2)[:, 0] - heading
+        shift = (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0]
+        now = [self.offsets[name].detach().double().numpy() for name in ("shift", "yaw")]
+        self.add_offsets(shift - now[0], turn - now[1])
+
+    def headings(self) -> NDArray[np.float64]:
+        """Yaw of the given keys f64[K], radians, without jumps of 2 pi."""
+        return np.unwrap([geometry.yaw_of(pose) for pose in self.world_from_object])
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
         """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box stays."""
@@ -432,7 +425,7 @@ def object_node(track: Track, learn_pose: bool = False, deformable: bool = False
     kind = DeformableNode if deformable and track.label.lower() in LIMBED_LABELS else RigidNode
     node = kind.from_track(track, learn_pose)
     if learn_pose:
-        node.settle(1.0)
+        node.settle()
     return node
 
 

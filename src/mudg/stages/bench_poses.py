@@ -50,10 +50,7 @@ NOISE_M, NOISE_RAD = 0.1, np.radians(1.0)
 SEEN_PX, FEWEST_KEYS = 60, 4
 FRAMES, WIDTH, HEIGHT = 16, 240, 160
 DRIFT_S = 0.4
-CASES = (
-    ("noise", "learnt"), ("noise", "smoothed"), ("noise", "fixed"), ("drift", "learnt"), ("drift", "fixed"), ("none", "learnt"),
-    ("offset", "learnt"),
-)  # fmt: skip
+CASES = (("noise", "learnt"), ("noise", "smoothed"), ("noise", "fixed"), ("drift", "learnt"), ("offset", "learnt"))
 """Kind of boxes, and what is done about their poses."""
 
 
@@ -89,7 +86,9 @@ def _rows_of_case(config: BenchConfig, scene: Scene, city: int, kind: str, out: 
         for poses, place in places.items():
             if not place.is_file():
                 state = fitted(given, cloud, fit_settings(config, poses), out / "fits" / place.stem)
-                store.write_json(place, {"city": city, "boxes": kind, "poses": poses, **row_of(scene, given, state.model)})
+                store.write_json(
+                    place, {"city": city, "boxes": kind, "poses": poses, **row_of(scene, given, state.model)}
+                )
     return [store.read_json(place) for place in places.values()]
 
 
@@ -105,7 +104,9 @@ def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
 def city_scene(seed: int, folder: Path, **changes: Any) -> Scene:
     """A small generated log, made when missing."""
     if not (folder / "scene.json").is_file():
-        config = CityConfig(seed=seed, n_frames=FRAMES, width=WIDTH, height=HEIGHT, cameras=("front",), lidar_azimuth_step_deg=0.8)
+        config = CityConfig(
+            seed=seed, n_frames=FRAMES, width=WIDTH, height=HEIGHT, cameras=("front",), lidar_azimuth_step_deg=0.8
+        )
         write_city(replace(config, **changes), folder)
     return read_scene(folder)
 
@@ -130,7 +131,9 @@ def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> 
     recipe = fit.RECIPES[config.method]
     frames = training_frames(scene, config.cameras)
     classes = classes_of(scene, frames, None) if config.semantics else ()
-    views = ViewSet(load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0), ())
+    views = ViewSet(
+        load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0), ()
+    )
     state = fit.start_state(config, recipe, scene, cloud, views, classes)
     run = store.RunDir.open(folder, "fit", to_dict(config), {}, fit.VERSION, overwrite=True)
     fit.optimise(state, config, run)
@@ -185,7 +188,9 @@ def moving_psnr(scene: Scene, model: SceneModel) -> float:
     for frame in scene.frames_in("test"):
         moving = torch.from_numpy(read_label(scene, frame, "dynamic").astype(bool))
         truth = torch.from_numpy(read_image(scene, frame)).permute(2, 0, 1).float() / 255
-        errors.append((fit.render_view(model, frame.view, RasterConfig(near_m=fit.NEAR_M)).rgb - truth)[:, moving].flatten())
+        errors.append(
+            (fit.render_view(model, frame.view, RasterConfig(near_m=fit.NEAR_M)).rgb - truth)[:, moving].flatten()
+        )
     every = torch.cat(errors) if errors else torch.zeros(0)
     return metrics.psnr(every, torch.zeros_like(every)) if len(every) else float("nan")
 
@@ -199,9 +204,17 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         keys = np.array([found["keys"] for found in objects], float)
         pooled = {
             name: float(np.sqrt((np.array([found[name] for found in objects]) ** 2 * keys).sum() / keys.sum()))
-            for name in (f"{when}{how}_{unit}" for when in ("before", "after") for how in ("", "_absolute") for unit in ("m", "rad"))
+            for name in (
+                f"{when}{how}_{unit}"
+                for when in ("before", "after")
+                for how in ("", "_absolute")
+                for unit in ("m", "rad")
+            )
         }
-        shares = {f"recovered_{unit}": 1 - pooled[f"after_{unit}"] / max(pooled[f"before_{unit}"], 1e-9) for unit in ("m", "rad")}
+        shares = {
+            f"recovered_{unit}": 1 - pooled[f"after_{unit}"] / max(pooled[f"before_{unit}"], 1e-9)
+            for unit in ("m", "rad")
+        }
         psnr = float(np.nanmean([row["psnr_moving"] for row in mine]))
         made.append({"boxes": kind, "poses": poses, "objects": len(objects), "keys": int(keys.sum()), **pooled, **shares,
                      "psnr_moving": psnr})  # fmt: skip

@@ -42,7 +42,9 @@ def boxes_in_view(model: SceneModel, view: View) -> Tensor:
     return torch.from_numpy(inside)[None]
 
 
-def outline_mask(view: View, world_from_object: NDArray[np.float64], size_m: tuple[float, ...]) -> NDArray[np.bool_] | None:
+def outline_mask(
+    view: View, world_from_object: NDArray[np.float64], size_m: tuple[float, ...]
+) -> NDArray[np.bool_] | None:
     """Bool[H, W]: inside the outline of a box, slightly grown. None: nothing of it is in view. A box that reaches behind the camera
     covers everything."""
     camera = view.camera

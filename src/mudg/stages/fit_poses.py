@@ -40,6 +40,8 @@ TRUST_M, TRUST_RAD = 0.1, 0.02
 """How far from the truth a track may be without looking noisy (drift of a filter, a labeller's taste)."""
 LARGEST_M, LARGEST_RAD = 0.2, 0.05
 """A round moves a key by at most this."""
+SOLVES = 4
+"""Times that the weights of the motion are brought up to date within a round."""
 FEWEST_PX = 30
 BLUR_PX = 3
 COLOR_SIGMA = 0.03
@@ -62,13 +64,17 @@ class Evidence:
 
 
 @torch.no_grad()
-def refine_poses(model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance | None = None) -> float:
+def refine_poses(
+    model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance | None = None
+) -> float:
     """One round for every node that learns its pose, in place.
 
     Returns:
         Root mean square of the moves, metres.
     """
-    learning = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.learn_pose}
+    learning = {
+        index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.learn_pose
+    }
     evidence = {index: Evidence.none(len(node.times_s)) for index, node in learning.items()}
     for stored in views:
         outlines = _outlines(learning, stored)
@@ -115,7 +121,9 @@ def _look(
         _credit(model.nodes[index], time_s, matrix, vector, evidence[index])  # type: ignore[arg-type]
 
 
-def _credit(node: RigidNode, time_s: float, matrix: NDArray[np.float64], vector: NDArray[np.float64], into: Evidence) -> None:
+def _credit(
+    node: RigidNode, time_s: float, matrix: NDArray[np.float64], vector: NDArray[np.float64], into: Evidence
+) -> None:
     """Give the evidence of a moment to the two keys around it, by their share in the pose."""
     found = node.keys_around(time_s)
     if found is None:
@@ -177,29 +185,40 @@ def _normal_equations(jacobian: Tensor, missing: Tensor) -> tuple[NDArray[np.flo
 
 def _move(node: RigidNode, evidence: Evidence) -> NDArray[np.float64]:
     """Solve for all keys of a track together and move them; returns the moves f64[K, 3] in metres."""
-    times, keys = node.times_s, len(node.times_s)
-    base = node.world_from_object
-    heading = np.unwrap([geometry.yaw_of(pose) for pose in base])
+    base, heading = node.world_from_object, node.headings()
     now = np.column_stack([node.offsets[name].detach().double().numpy() for name in ("shift", "yaw")])
-    noise = motion.key_noise(times, np.column_stack([base[:, :3, 3], heading]))
+    noise = motion.key_noise(node.times_s, np.column_stack([base[:, :3, 3], heading]))
     spread = (float(np.hypot(np.sqrt((noise[:3] ** 2).mean()), TRUST_M)), float(np.hypot(noise[3], TRUST_RAD)))
     trust = np.array([spread[0]] * 3 + [spread[1]]) ** -2
-    # Unknowns x[k, c]: the offsets after this round. Pictures and track act within a key, motion across keys.
+    # Accelerations, in units of the usual ones, are linear in the offsets: along = a0 + A shift, about = b0 + B yaw.
+    difference = motion.second_differences(node.times_s)
+    a = np.einsum("mk,kwc->mwkc", difference, base[:, :3, :3]) / motion.ACCELERATION_M_S2
+    a0 = difference @ base[:, :3, 3] / motion.ACCELERATION_M_S2
+    b, b0 = (difference @ part / motion.YAW_ACCELERATION_RAD_S2 for part in (np.eye(len(base)), heading))
+    found = now
+    for _ in range(SOLVES):
+        along = motion.motion_weights(a0 + np.einsum("mwkc,kc->mw", a, found[:, :3]))
+        about = motion.motion_weights((b0 + b @ found[:, 3])[:, None])
+        found = _solved(evidence, trust, now, (a, a0, along), (b, b0, about))
+    largest = np.array([LARGEST_M] * 3 + [LARGEST_RAD])
+    moves = np.clip(found - now, -largest, largest)
+    node.add_offsets(moves[:, :3], moves[:, 3])
+    return moves[:, :3]
+
+
+Linear = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
+def _solved(evidence: Evidence, trust: NDArray[np.float64], now: NDArray[np.float64], path: Linear, turn: Linear) -> NDArray[np.float64]:
+    """Offsets f64[K, 4] that minimise the three sums of squares. Pictures and track act within a key, motion across keys."""
+    keys = len(now)
     system = np.zeros((keys, 4, keys, 4))
     right = evidence.vector + np.einsum("kcd,kd->kc", evidence.matrix, now)
     for key in range(keys):
         system[key, :, key, :] = evidence.matrix[key] + np.diag(trust)
-    difference = motion.second_differences(times)
-    turned = np.einsum("ak,kwc->awkc", difference, base[:, :3, :3]).reshape(-1, keys, 3) / motion.ACCELERATION_M_S2
-    straight = (difference @ base[:, :3, 3]).reshape(-1) / motion.ACCELERATION_M_S2
-    system[:, :3, :, :3] += np.einsum("akc,ald->kcld", turned, turned)
-    right[:, :3] -= np.einsum("akc,a->kc", turned, straight)
-    turning = difference / motion.YAW_ACCELERATION_RAD_S2
-    system[:, 3, :, 3] += turning.T @ turning
-    right[:, 3] -= turning.T @ (turning @ heading)
-    size = 4 * keys
-    solved = np.linalg.solve(system.reshape(size, size), right.reshape(size)).reshape(keys, 4)
-    largest = np.array([LARGEST_M] * 3 + [LARGEST_RAD])
-    moves = np.clip(solved - now, -largest, largest)
-    node.add_offsets(moves[:, :3], moves[:, 3])
-    return moves[:, :3]
+    (a, a0, along), (b, b0, about) = path, turn
+    system[:, :3, :, :3] += np.einsum("m,mwkc,mwld->kcld", along, a, a, optimize=True)
+    right[:, :3] -= np.einsum("m,mwkc,mw->kc", along, a, a0)
+    system[:, 3, :, 3] += (b.T * about) @ b
+    right[:, 3] -= (b.T * about) @ b0
+    return np.linalg.solve(system.reshape(4 * keys, 4 * keys), right.reshape(4 * keys)).reshape(keys, 4)
