@@ -64,16 +64,16 @@ def test_moving_instances_are_those_of_the_generator():
 
 def test_variants_change_fields_of_the_fit():
     rows = bench_shift.rows_of(
-        BenchConfig(methods=("mudg_s",), variant=("a=virtual_probability:0.4,densify:false", "b=sh_degree:1"))
+        BenchConfig(methods=("mudg_s",), variant=("a=virtual_probability:0.4,densify:none", "b=sh_degree:1"))
     )
     a, b = rows[-2].fit, rows[-1].fit
-    assert (a.virtual_probability, a.densify, a.iterations) == (0.4, False, 1000)
+    assert (a.virtual_probability, a.densify, a.iterations) == (0.4, "none", 1000)
     assert dataclasses.replace(b, sh_degree=0) == rows[0].fit
 
 
 @pytest.mark.parametrize(
     "text",
-    ["a", "a=", "a=densify", "=densify:false", "a/b=densify:false", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
+    ["a", "a=", "a=densify", "=densify:none", "a/b=densify:none", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
 )
 def test_a_malformed_variant_is_refused(text):
     with pytest.raises(UsageError):
@@ -93,7 +93,7 @@ def test_unknown_methods_and_repeated_names_are_refused():
     with pytest.raises(UsageError, match="unknown method"):
         bench_shift.rows_of(BenchConfig(methods=("nerf",)))
     with pytest.raises(UsageError, match="same name"):
-        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify:false",)))
+        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify:none",)))
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     assert f'src="{log}/film/front_shift+3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
     again = bench_shift.run(
-        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify:false",)), out,
+        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify:none",)), out,
         rules=TINY, distances_m=(3.0,),
     )  # fmt: skip
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before

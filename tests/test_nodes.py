@@ -14,10 +14,10 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
-from mudg.core.edit import without_tracks
+from mudg.core.edit import object_moved, without_tracks
 from mudg.core.raster_request import harmonics
 from mudg.core.table import Table, torch_adam_columns
-from mudg.models import nodes
+from mudg.models import motion, nodes
 from mudg.models.nodes import RigidNode, SceneModel, SkyNode, StaticNode, compose
 
 
@@ -81,11 +81,11 @@ def test_learnt_yaw_of_either_key_turns_the_pose_between_them():
     flat = Track("flat", "car", [4, 2, 1.5], [0.0, 1.0], np.stack([pose(0, 0, 0, 0.0), pose(1, 0, 0, 0.0)]))
     node = RigidNode.from_track(flat, learn_pose=True)
     with torch.no_grad():
-        node.offsets["offsets"][1, 3] = 0.4
+        node.offsets["yaw"][1] = 0.4
     rotation = nodes.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.1, abs=1e-6)
     with torch.no_grad():
-        node.offsets["offsets"][0, 3] = 0.2
+        node.offsets["yaw"][0] = 0.2
     rotation = nodes.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.25, abs=1e-6)
 
@@ -93,25 +93,33 @@ def test_learnt_yaw_of_either_key_turns_the_pose_between_them():
 def test_offsets_act_in_the_frame_of_the_box():
     node = RigidNode.from_track(track())
     with torch.no_grad():
-        node.offsets["offsets"][1] = torch.tensor([1.0, 0.2, -0.1, 0.3])
+        node.offsets["shift"][1] = torch.tensor([1.0, 0.2, -0.1])
+        node.offsets["yaw"][1] = 0.3
     position, quat = node.pose_at(0.5)
     expected = track().world_from_object[1] @ geometry.yaw_matrix(0.3, (1.0, 0.2, -0.1))
     assert np.abs(position.detach().numpy() - expected[:3, 3]).max() < 1e-5
     assert np.abs(nodes.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
 
 
-def test_pose_gradient_reaches_both_keys_and_only_when_learnt():
-    for learn in (True, False):
-        scene = model(learn_poses=learn)
-        compose(scene, 0.3).means.sum().backward()
-        gradient = scene.nodes[1].offsets["offsets"].grad
-        if learn:
-            assert (gradient[:2, :2].abs() > 0).all()
-            assert (gradient[2:] == 0).all()
-            assert "node.car" in scene.node_tables()
-        else:
-            assert gradient is None
-            assert list(scene.node_tables()) == ["sky"]
+def test_pose_gradient_reaches_both_keys_and_no_others():
+    node = RigidNode.from_track(track())
+    position, quat = node.pose_at(0.3)
+    (position.sum() + quat.sum()).backward()
+    assert (node.offsets["shift"].grad[:2, :2].abs() > 0).all()
+    assert (node.offsets["yaw"].grad[:2].abs() > 0).all()
+    assert (node.offsets["shift"].grad[2:] == 0).all()
+
+
+def test_offsets_are_not_learnt_by_gradient_steps_and_moving_them_shows_at_once():
+    scene = model(learn_poses=True)
+    before = compose(scene, 0.3).means
+    before.sum().backward()
+    assert scene.nodes[1].offsets["shift"].grad is None
+    assert list(scene.node_tables()) == ["sky"]
+    scene.nodes[1].add_offsets(np.tile([0.5, 0.0, 0.0], (4, 1)), np.zeros(4))
+    moved = (compose(scene, 0.3).means - before).detach()
+    assert torch.allclose(moved[5:9].norm(dim=1), torch.full((4,), 0.5), atol=0.02)
+    assert not moved[:5].any()
 
 
 def test_slerp_gradient_is_finite_for_equal_rotations():
@@ -125,16 +133,14 @@ def test_pose_gradient_by_finite_differences():
     node = RigidNode.from_track(track(), learn_pose=True)
     for name in ("_quats", "_rotations", "_positions"):
         setattr(node, name, getattr(node, name).double())
-    local = torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    quats = torch.randn(3, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
-    def placed(offsets):
-        node.offsets.columns["offsets"] = offsets
-        means, turned = node.place(local, quats, 0.8)
-        return torch.cat([means.flatten(), turned.flatten()])
+    def placed(shift, yaw):
+        node.offsets.columns["shift"], node.offsets.columns["yaw"] = shift, yaw
+        return torch.cat(node.pose_at(0.8))
 
-    offsets = 0.1 * torch.randn(4, 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    assert torch.autograd.gradcheck(placed, [offsets.requires_grad_()])
+    g = torch.Generator().manual_seed(2)
+    shift, yaw = (0.1 * torch.randn(*shape, generator=g, dtype=torch.float64) for shape in ((4, 3), (4,)))
+    assert torch.autograd.gradcheck(placed, [shift.requires_grad_(), yaw.requires_grad_()])
 
 
 @settings(max_examples=25)
@@ -269,7 +275,7 @@ def test_semantics_of_uncovered_pixels_are_sky():
 def test_state_round_trip_keeps_everything():
     scene = model(learn_poses=True, degree=1)
     with torch.no_grad():
-        scene.nodes[1].offsets["offsets"].fill_(0.05)
+        scene.nodes[1].offsets["shift"].fill_(0.05)
         scene.table.moment1["means"].fill_(0.5)
     values, groups = scene.state()
     again = SceneModel.from_state(values, groups)
@@ -393,3 +399,301 @@ def test_box_grid_lies_on_the_box():
     xyz, rgb = nodes.box_grid((4.0, 2.0, 1.5), (10, 20, 30))
     assert (np.abs(xyz) <= 0.5 * np.array([4.0, 2.0, 1.5])).all()
     assert (rgb == [10, 20, 30]).all()
+
+
+# ---- noise of tracks -------------------------------------------------------------------------------------------------
+
+
+def wavy_track(noise_m: float, noise_rad: float = 0.0, keys: int = 40) -> tuple[Track, Track]:
+    """A car that speeds up and bends away, exact and with noise on every key."""
+    times = 0.1 * np.arange(keys)
+    exact = np.stack([pose(5 * t + 0.4 * t * t, 0.2 * t * t, 1, 0.08 * t) for t in times])
+    g = np.random.Generator(np.random.PCG64(3))
+    moves = np.stack([geometry.yaw_matrix(noise_rad * g.normal(), noise_m * g.normal(size=3)) for _ in times])
+    return Track("car", "car", [4, 2, 1.5], times, exact), Track("car", "car", [4, 2, 1.5], times, exact @ moves)
+
+
+def key_error(node: RigidNode, exact: Track) -> float:
+    return float(np.sqrt(((node.corrected_keys()[:, :3, 3] - exact.world_from_object[:, :3, 3]) ** 2).sum(1).mean()))
+
+
+def test_second_differences_are_the_acceleration_at_uneven_times():
+    times = np.array([0.0, 0.1, 0.35, 0.4, 1.0])
+    matrix = motion.second_differences(times)
+    assert np.abs(matrix @ (3 - 2 * times) ).max() < 1e-9
+    assert np.abs(matrix @ (1.5 * times**2) - 3.0).max() < 1e-9
+    assert motion.second_differences(times[:2]).shape == (0, 2)
+
+
+def test_smoothing_keeps_straight_motion_and_means_and_sharp_turns():
+    times = np.array([0.0, 0.1, 0.35, 0.4, 1.0, 1.1])
+    straight = np.column_stack([4 - 7 * times, 2 * times])
+    assert np.abs(motion.smoothed(times, straight, 0.1, 2.0) - straight).max() < 1e-9
+    bumpy = straight + np.array([0.1, -0.1, 0.05, 0.0, -0.1, 0.05])[:, None]
+    found = motion.smoothed(times, bumpy, 0.1, 2.0)
+    assert np.abs(found.mean(0) - bumpy.mean(0)).max() < 1e-9
+    assert np.abs(motion.smoothed(times, bumpy, 0.0, 2.0) - bumpy).max() == 0
+    even = 0.1 * np.arange(30)
+    corner = np.maximum(0, 1.5 * (even - 1.5))[:, None]  # a turn that begins all at once
+    assert np.abs(motion.smoothed(even, corner, 0.02, 0.3) - corner).max() < 0.03
+
+
+def test_weights_of_motion_fall_with_acceleration():
+    weights = motion.motion_weights(np.array([[0.0], [1.0], [10.0]]))
+    assert weights[1] == pytest.approx(1.0)
+    assert weights[0] > weights[1] > weights[2]
+    assert weights[2] < 0.05
+
+
+@pytest.mark.parametrize("noise_m", [0.02, 0.1])
+def test_the_track_betrays_its_noise(noise_m):
+    _, noisy = wavy_track(noise_m, keys=200)
+    assert motion.key_noise(noisy.times_s, noisy.world_from_object[:, :3, 3]) == pytest.approx([noise_m] * 3, rel=0.35)
+    exact, _ = wavy_track(0.0)
+    assert motion.key_noise(exact.times_s, exact.world_from_object[:, :3, 3]).max() < 0.005
+    assert (motion.key_noise(np.arange(5.0), np.ones((5, 2))) == 0).all()
+
+
+def test_settling_removes_noise_and_leaves_a_clean_track_alone():
+    exact, noisy = wavy_track(0.1, math.radians(1.0))
+    node = RigidNode.from_track(noisy, learn_pose=True)
+    before = key_error(node, exact)
+    node.settle()
+    assert key_error(node, exact) < 0.5 * before
+    headings = np.array([geometry.yaw_of(p) for p in node.corrected_keys()])
+    assert np.sqrt(((headings - 0.08 * exact.times_s) ** 2).mean()) < 0.6 * math.radians(1.0)
+    clean = RigidNode.from_track(exact, learn_pose=True)
+    clean.settle()
+    assert key_error(clean, exact) < 0.002
+
+
+def test_settling_again_changes_nothing_and_short_tracks_stay():
+    _, noisy = wavy_track(0.1)
+    node = RigidNode.from_track(noisy, learn_pose=True)
+    node.settle()
+    once = node.offsets["shift"].detach().clone()
+    node.settle()
+    assert torch.allclose(node.offsets["shift"], once, atol=1e-6)
+    short = RigidNode("s", "car", (4, 2, 1.5), [0.0, 0.5], np.stack([pose(0, 0, 0, 0), pose(1, 0.3, 0, 0.1)]), learn_pose=True)
+    short.settle()
+    assert not short.offsets["shift"].any()
+
+
+def test_pose_matrix_is_the_learnt_pose():
+    node = RigidNode.from_track(track(), learn_pose=True)
+    with torch.no_grad():
+        node.offsets["shift"].copy_(0.2 * torch.randn(4, 3, generator=torch.Generator().manual_seed(0)))
+        node.offsets["yaw"].copy_(torch.tensor([0.1, -0.2, 0.05, 0.0]))
+    for time_s in (0.0, 0.3, 1.7):
+        position, quat = node.pose_at(time_s)
+        matrix = node.pose_matrix(time_s)
+        assert np.abs(matrix[:3, 3] - position.detach().numpy()).max() < 1e-5
+        assert np.abs(matrix[:3, :3] - nodes.rotation_matrix(quat).detach().numpy()).max() < 1e-5
+    assert node.pose_matrix(2.5) is None
+
+
+def test_offsets_of_the_former_single_column_are_read():
+    facts, tensors = RigidNode.from_track(track()).state()
+    old = {key: value for key, value in tensors.items() if not key.startswith("offsets.")}
+    old["offsets.column.offsets"] = torch.arange(16.0).view(4, 4)
+    read = RigidNode.from_state(facts, old)
+    assert torch.equal(read.offsets["shift"], old["offsets.column.offsets"][:, :3])
+    assert torch.equal(read.offsets["yaw"], old["offsets.column.offsets"][:, 3])
+
+
+# ---- deformable ------------------------------------------------------------------------------------------------------
+
+
+def walker(label: str = "pedestrian") -> nodes.DeformableNode:
+    keys = np.stack([pose(0.1 * n, 0, 0.9, 0.0) for n in range(5)])
+    node = nodes.object_node(Track("p", label, [0.8, 0.6, 1.8], 0.1 * np.arange(5), keys), deformable=True)
+    assert isinstance(node, nodes.DeformableNode)
+    return node
+
+
+def test_only_those_with_limbs_deform():
+    keys = np.stack([pose(0, 0, 0, 0), pose(1, 0, 0, 0)])
+    for label, deformable, kind in (("car", True, "rigid"), ("cyclist", True, "deformable"), ("cyclist", False, "rigid")):
+        assert nodes.object_node(Track("x", label, [1, 1, 1], [0.0, 1.0], keys), deformable=deformable).kind == kind
+
+
+def test_an_undeformed_node_is_a_rigid_one():
+    node, local = walker(), columns(6, 0)
+    rigid = RigidNode(node.name, node.label, node.size_m, node.times_s, node.world_from_object)
+    for mine, theirs in zip(node.place(local["means"], local["quats"], 0.17), rigid.place(local["means"], local["quats"], 0.17)):
+        assert torch.equal(mine, theirs)
+    assert node.place(local["means"], local["quats"], 3.0) is None
+
+
+def test_displacement_interpolates_the_grid_in_space_and_time():
+    """Control points displaced by a linear function of their place displace every row by that function."""
+    node = walker()
+    up, across, along = node.offsets["deform"].shape[2:]
+    z, y, x = torch.meshgrid(*(torch.linspace(-0.5, 0.5, n) * s for n, s in zip((up, across, along), (1.8, 0.6, 0.8))), indexing="ij")
+    with torch.no_grad():
+        for key in range(5):
+            node.offsets["deform"][key] = key * torch.stack([0.1 * x + 0.2 * z, 0.3 * y, 0.05 + 0.0 * z])
+    means = torch.tensor([[0.3, -0.2, 0.7], [-0.1, 0.05, -0.6], [0.0, 0.0, 0.0]])
+    expected = torch.stack([0.1 * means[:, 0] + 0.2 * means[:, 2], 0.3 * means[:, 1], torch.full((3,), 0.05)], 1)
+    assert torch.allclose(node.displacement(means, 0.2), 2 * expected, atol=1e-6)
+    assert torch.allclose(node.displacement(means, 0.25), 2.5 * expected, atol=1e-6)
+    beyond = node.displacement(torch.tensor([[5.0, 0.0, 0.0]]), 0.1)
+    assert torch.allclose(beyond, node.displacement(torch.tensor([[0.4, 0.0, 0.0]]), 0.1), atol=1e-6)
+
+
+def test_displacement_gradient_by_finite_differences():
+    node = walker()
+    shape = node.offsets["deform"].shape
+    deform = 0.1 * torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def moved(control, means):
+        node.offsets.columns["deform"] = torch.cat([control, deform[2:]])
+        return node.displacement(means, 0.04)
+
+    means = torch.tensor([[0.21, -0.12, 0.33], [-0.17, 0.07, -0.61]], dtype=torch.float64)
+    assert torch.autograd.gradcheck(moved, [deform[:2].clone().requires_grad_(), means.requires_grad_()])
+
+
+def test_deformation_settles_between_its_neighbours_and_poses_stay():
+    node = walker()
+    with torch.no_grad():
+        node.offsets["deform"][2].fill_(1.0)
+    node.after_step(1.0)
+    deform = node.offsets["deform"]
+    assert 0.4 < deform[2].mean().item() < 0.6
+    assert 0.2 < deform[1].mean().item() < 0.3
+    assert not node.offsets["shift"].any()
+    assert node.parameters() is node.offsets
+
+
+# ---- colour over time, mirrors, edits ---------------------------------------------------------------------------------
+
+
+def with_time_colour(scene: SceneModel, terms: int = 4) -> SceneModel:
+    moving = int((scene.table.labels["node"] > 0).sum())
+    coefficients = torch.randn(moving, terms, 3, generator=torch.Generator().manual_seed(5))
+    table = Table({k: v.detach() for k, v in scene.table.columns.items()}, scene.table.labels, {"sh_time": coefficients})
+    return SceneModel(table, scene.nodes, scene.sky, scene.classes, scene.sh_degree, scene.facts)
+
+
+def test_colour_of_objects_follows_its_fourier_terms():
+    scene = with_time_colour(model())
+    coefficients = scene.table.partial["sh_time"].detach()
+    u = 0.3 / 2.0  # the car's track spans 0..2 s
+    weights = torch.tensor([f(2 * math.pi * k * u) for k in (1, 2) for f in (math.sin, math.cos)])
+    sh = compose(scene, 0.3).sh
+    assert torch.equal(sh[:5], scene.table["sh_dc"][:5])
+    assert torch.allclose(sh[5:9, 0], scene.table["sh_dc"][5:9, 0] + torch.einsum("f,nfc->nc", weights, coefficients[:4]), atol=1e-5)
+    assert compose(without_tracks(scene, ["car", "van"]), 0.3).sh.shape == (5, 1, 3)
+    edited = without_tracks(scene, ["car"])
+    assert torch.equal(compose(edited, 5.3).sh[5:], compose(scene, 5.3).sh[9:])
+
+
+def test_time_colour_survives_saving_and_learns():
+    scene = with_time_colour(model())
+    again = SceneModel.from_state(*scene.state())
+    assert torch.equal(compose(again, 0.7).sh, compose(scene, 0.7).sh)
+    compose(scene, 0.7).sh.sum().backward()
+    before = scene.table.partial["sh_time"].detach().clone()
+    scene.table.adam_step(1, {"sh_time": 0.1}, torch_adam_columns)
+    assert "sh_time" in scene.table.gradients()
+    assert (scene.table.partial["sh_time"].detach() - before).abs().max().item() == pytest.approx(0.1, rel=1e-3)
+    scene.table.clear_gradients()
+    assert not scene.table.gradients()
+
+
+def test_one_key_has_no_phase():
+    assert motion.periodic_weights(1.0, 1.0, 1.0, 4).tolist() == [0, 0, 0, 0]
+
+
+def test_reflection_is_an_involution_and_mirrors_covariances():
+    local = columns(8, 4)
+    means, quats = nodes.reflected(local["means"], local["quats"])
+    assert torch.equal(nodes.reflected(means, quats)[0], local["means"])
+    assert torch.equal(nodes.reflected(means, quats)[1], local["quats"])
+    flip = np.diag([1.0, -1.0, 1.0])
+    for before, after, log_scale in zip(local["quats"], quats, local["log_scales"]):
+        shape = np.diag(np.exp(2 * log_scale.double().numpy()))
+        r0, r1 = (geometry.matrix_from_quaternion(q.double().numpy()) for q in (before, after))
+        assert np.abs(r1 @ shape @ r1.T - flip @ r0 @ shape @ r0.T @ flip).max() < 1e-5
+
+
+def test_mirroring_shows_vehicles_reflected_and_nothing_else():
+    scene = model()
+    plain, mirrored = compose(scene, 0.3), compose(scene, 0.3, mirrored=True)
+    assert torch.equal(mirrored.means[:5], plain.means[:5])
+    local = scene.table["means"][5:9].detach().numpy() * [1, -1, 1]
+    assert np.abs(mirrored.means[5:9].detach().numpy() - geometry.transform_points(track().pose_at(0.3), local)).max() < 1e-5
+    people = SceneModel(scene.table, (scene.nodes[0], walker(), scene.nodes[2]), scene.sky, scene.classes, 0)
+    assert torch.equal(compose(people, 0.3, mirrored=True).means[5:9], compose(people, 0.3).means[5:9])
+
+
+def test_moving_an_object_equals_moving_its_track():
+    """Edit, then compose == compose what was made from the edited track; also with learnt offsets, and back again."""
+    scene = model(learn_poses=True)
+    move = pose(1.0, -2.0, 0.1, 0.4)
+    edited = object_moved(scene, "car", move)
+    other = Track("car", "car", [4.0, 2.0, 1.5], track().times_s, track().world_from_object @ move)
+    rebuilt = SceneModel(scene.table, (scene.nodes[0], RigidNode.from_track(other), scene.nodes[2]), scene.sky, scene.classes, 0)
+    for time_s in (0.0, 0.3, 1.4):
+        assert torch.allclose(compose(edited, time_s).means, compose(rebuilt, time_s).means, atol=1e-5)
+        assert torch.allclose(compose(edited, time_s).quats.abs(), compose(rebuilt, time_s).quats.abs(), atol=1e-5)
+    with torch.no_grad():
+        scene.nodes[1].offsets["shift"].fill_(0.3)
+    back = object_moved(object_moved(scene, "car", move), "car", geometry.invert(move))
+    assert torch.allclose(compose(back, 0.5).means, compose(scene, 0.5).means, atol=1e-5)
+    with pytest.raises(UsageError, match="no moving object"):
+        object_moved(scene, "tram", move)
+    with pytest.raises(InputError, match="not rigid"):
+        object_moved(scene, "car", np.diag([2.0, 1.0, 1.0, 1.0]))
+
+
+def partly_tagged(owners: list[int]) -> Table:
+    table = tagged_table(len(owners))
+    node = torch.tensor(owners, dtype=torch.int32)
+    tags = torch.arange(len(owners), dtype=torch.float32)[node > 0]
+    table = Table(
+        {name: value.detach() for name, value in table.columns.items()}, {"node": node, "tag": torch.arange(len(owners))},
+        {"part": tags[:, None].repeat(1, 2)},
+    )  # fmt: skip
+    table.moment1["part"] = 10 * tags[:, None].repeat(1, 2)
+    return table
+
+
+def parts_agree(table: Table) -> bool:
+    tags = table.labels["tag"][table.labels["node"] > 0].float()[:, None].expand(-1, 2)
+    return torch.equal(table.partial["part"], tags) and torch.equal(table.moment1["part"], 10 * tags)
+
+
+@settings(max_examples=40)
+@given(st.lists(st.integers(0, 2), min_size=1, max_size=7), st.data())
+def test_partial_columns_move_with_their_rows(owners, data):
+    table = partly_tagged(owners)
+    rows = data.draw(st.lists(st.integers(0, len(owners) - 1), min_size=1, max_size=9))
+    table.take(torch.tensor(rows))
+    assert table.labels["tag"].tolist() == rows
+    assert parts_agree(table)
+    table.take(torch.argsort(table.labels["node"], stable=True))
+    assert parts_agree(table)
+
+
+def test_appended_rows_copy_partial_values_or_start_at_zero():
+    table = partly_tagged([0, 1, 2, 0])
+    rows = torch.tensor([2, 0])
+    columns_, labels = {n: v.detach()[rows] for n, v in table.columns.items()}, {n: v[rows] for n, v in table.labels.items()}
+    table.append(columns_, labels, like=rows)
+    assert table.partial["part"].tolist() == [[1, 1], [2, 2], [2, 2]]
+    assert table.moment1["part"][:, 0].tolist() == [10, 20, 0]
+    table.append(columns_, labels)
+    assert table.partial["part"][-1].tolist() == [0, 0]
+    with pytest.raises(InputError, match="does not fit its rows"):
+        Table({"a": torch.zeros(2)}, {"node": torch.tensor([0, 1])}, {"part": torch.zeros(2, 1)})
+
+
+def test_selective_steps_move_visible_partial_rows_only():
+    table = partly_tagged([0, 1, 2, 1])
+    before = table.partial["part"].detach().clone()
+    table.partial["part"].grad = torch.ones_like(table.partial["part"])
+    table.adam_step(1, {"part": 0.5}, torch_adam_columns, torch.tensor([True, False, True, False]))
+    changed = (table.partial["part"] - before).abs().sum(1) > 0
+    assert changed.tolist() == [False, True, False]

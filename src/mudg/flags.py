@@ -197,7 +197,7 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Positional[str]
-    """mdm, mdm-ablation or shift."""
+    """mdm, mdm-ablation, poses or shift."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")] = stage_config.BenchConfig()
 
 

@@ -27,6 +27,10 @@ class Editable(Protocol):
         """A copy without the named objects."""
         ...
 
+    def with_node_moved(self, name: str, object_from_new: NDArray[np.float64]) -> Editable:
+        """A copy with one object displaced in its own frame."""
+        ...
+
 
 Model = TypeVar("Model", bound=Editable)
 
@@ -37,14 +41,31 @@ def without_tracks(model: Model, track_ids: Sequence[str]) -> Model:
     Raises:
         UsageError: a track that the scene has no node for (it may be parked, and so part of the background).
     """
-    names = model.node_names()
     for track_id in track_ids:
-        if track_id not in names:
-            raise UsageError(
-                f"the fitted scene has no moving object {track_id!r}",
-                expected="one of " + ", ".join(names) if names else "a scene with moving objects",
-            )
+        _has_object(model, track_id)
     return model.without_nodes(track_ids)  # type: ignore[return-value]
+
+
+def object_moved(model: Model, track_id: str, object_from_new: NDArray[np.float64]) -> Model:
+    """The fitted scene with one moving object displaced in its own frame at all times (``track_moved`` of a fitted scene).
+
+    Raises:
+        UsageError: the scene has no node for this track. InputError: the motion is not rigid.
+    """
+    _has_object(model, track_id)
+    problem = geometry.rigid_problem(object_from_new)
+    if problem:
+        raise InputError(f"the displacement is not rigid: {problem}")
+    return model.with_node_moved(track_id, object_from_new)  # type: ignore[return-value]
+
+
+def _has_object(model: Editable, track_id: str) -> None:
+    names = model.node_names()
+    if track_id not in names:
+        raise UsageError(
+            f"the fitted scene has no moving object {track_id!r}",
+            expected="one of " + ", ".join(names) if names else "a scene with moving objects",
+        )
 
 
 def track_removed(scene: Scene, track_id: str) -> Scene:

@@ -87,6 +87,9 @@ class ObservationWriter:
     def add(self, observation: Observation) -> None:
         """Write one observation and record its view."""
         name = f"{len(self._records):06d}"
+        if not bool(torch.isfinite(observation.rgb).all()):
+            count = int((~torch.isfinite(observation.rgb)).sum())
+            raise InputError("colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values")
         rgb = (observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
         with store.atomic_path(self._out / "rgb" / f"{name}.png") as temporary:
             Image.fromarray(rgb).save(temporary, compress_level=1)

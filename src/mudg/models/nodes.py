@@ -12,13 +12,14 @@ Columns of the table (raw, unactivated):
     logits [N]        opacity = sigmoid
     sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0)
     semantics [N, C]  class logits of the classes in ``SceneModel.classes``
+    sh_time [M, F, 3] of the M rows of moving objects only: how the constant colour varies over time (partial column)
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, Self
 
 import numpy as np
 import torch
@@ -31,10 +32,23 @@ from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, Track, View
 from mudg.core.table import Table
+from mudg.models import motion
 
 SH_C0: Final = 0.28209479177387814
 SKY_LOGIT: Final = 10.0
 """Logit of the sky class where nothing covers it; large beside what a Gaussian learns."""
+LIMBED_LABELS: Final = frozenset(
+    {"pedestrian", "person", "person_sitting", "child", "adult", "cyclist", "rider", "bicyclist", "motorcyclist", "animal"}
+)
+"""Labels of tracks that change their shape while they move."""
+SYMMETRIC_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "vehicle", "trailer", "motorcycle"})
+"""Labels of tracks whose two sides look alike."""
+LEAST_NOISE_M: Final = 0.01
+LEAST_NOISE_RAD: Final = 0.002
+DEFORM_CELLS: Final = (2, 3, 6)
+"""Cells of the control grid of a deformable node along, across and up its box."""
+DEFORM_SMOOTHING: Final = 0.5
+DEFORM_DECAY: Final = 0.02
 
 
 class Node(Protocol):
@@ -85,9 +99,11 @@ class StaticNode:
 class RigidNode:
     """A tracked moving object: rows in the frame of its box, carried by the box's pose.
 
-    The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by learnable offsets in
+    The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in
     the frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
     positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
+
+    The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians. ``learn_pose``: whether a fit may change them.
     """
 
     kind = "rigid"
@@ -103,28 +119,38 @@ class RigidNode:
         self.world_from_object = np.asarray(world_from_object, np.float64)
         self.learn_pose = learn_pose
         count = len(self.times_s)
-        self.offsets = offsets or Table({"offsets": torch.zeros(count, 4)})
+        self.offsets = offsets or Table({"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)})
         self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
         self._quats = torch.from_numpy(np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])).float()
         self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
         self._positions = torch.from_numpy(self.world_from_object[:, :3, 3].copy()).float()
 
     @classmethod
-    def from_track(cls, track: Track, learn_pose: bool = False) -> RigidNode:
+    def from_track(cls, track: Track, learn_pose: bool = False) -> Self:
         """A node that follows ``track``."""
         return cls(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object, learn_pose=learn_pose)
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether its left side looks like its right one."""
+        return self.label.lower() in SYMMETRIC_LABELS
+
+    def _own_columns(self, keys: int) -> dict[str, Tensor]:
+        """Starting values of what a kind of node has per key besides the offsets."""
+        return {}
+
+    # -- pose -------------------------------------------------------------------------------------------------------
+
     def _key_pose(self, index: int) -> tuple[Tensor, Tensor]:
         """Corrected key: position ``[3]`` and unit quaternion ``[4]`` in the world."""
-        offset = self.offsets["offsets"][index]
-        position = self._positions[index] + self._rotations[index] @ offset[:3]
-        half = offset[3] / 2
+        position = self._positions[index] + self._rotations[index] @ self.offsets["shift"][index]
+        half = self.offsets["yaw"][index] / 2
         zero = torch.zeros_like(half)
         turn = torch.stack([torch.cos(half), zero, zero, torch.sin(half)])
         return position, left_product_matrix(self._quats[index]) @ turn
 
-    def pose_at(self, time_s: float) -> tuple[Tensor, Tensor] | None:
-        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, differentiable in the offsets; None outside the span."""
+    def keys_around(self, time_s: float) -> tuple[int, int, float] | None:
+        """The two neighbouring keys and the fraction of the way between them (one key twice at its very time); None outside."""
         tolerance_s = 1e-6
         times = self.times_s
         if len(times) == 0 or time_s < times[0] - tolerance_s or time_s > times[-1] + tolerance_s:
@@ -132,36 +158,101 @@ class RigidNode:
         after = int(np.searchsorted(times, time_s))
         for near in (after, after - 1):
             if 0 <= near < len(times) and abs(times[near] - time_s) <= tolerance_s:
-                return self._key_pose(near)
-        before = after - 1
-        u = float((time_s - times[before]) / (times[after] - times[before]))
+                return near, near, 0.0
+        return after - 1, after, float((time_s - times[after - 1]) / (times[after] - times[after - 1]))
+
+    def pose_at(self, time_s: float) -> tuple[Tensor, Tensor] | None:
+        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, differentiable in the offsets; None outside the span."""
+        found = self.keys_around(time_s)
+        if found is None:
+            return None
+        before, after, u = found
         position0, quat0 = self._key_pose(before)
+        if before == after:
+            return position0, quat0
         position1, quat1 = self._key_pose(after)
         return position0 + u * (position1 - position0), slerp(quat0, quat1, u)
 
+    def corrected_keys(self) -> NDArray[np.float64]:
+        """The keys with their offsets: world_from_object f64[K, 4, 4]."""
+        return self._corrected(slice(None))
+
+    @torch.no_grad()
+    def _corrected(self, which: slice) -> NDArray[np.float64]:
+        shift, yaw = self.offsets["shift"][which].double().numpy(), self.offsets["yaw"][which].double().numpy()
+        return self.world_from_object[which] @ np.stack([geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)])
+
+    def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
+        """Corrected world_from_object f64[4, 4] at a time; None outside the span."""
+        found = self.keys_around(time_s)
+        if found is None:
+            return None
+        before, after, u = found
+        keys = self._corrected(slice(before, after + 1))
+        return keys[0] if before == after else geometry.interpolate_pose(keys[0], keys[1], u)
+
+    @torch.no_grad()
+    def add_offsets(self, shift_m: NDArray[np.float64], yaw_rad: NDArray[np.float64]) -> None:
+        """Move every key by ``shift_m`` [K, 3] and ``yaw_rad`` [K] in the frame of the box, in place."""
+        self.offsets["shift"].add_(torch.from_numpy(shift_m).float())
+        self.offsets["yaw"].add_(torch.from_numpy(yaw_rad).float())
+        self._placements.clear()
+
+    def settle(self) -> None:
+        """Set the offsets to what takes independent noise out of the track: the best guess before any picture was seen.
+
+        The size of the noise is what the track itself betrays, at least `LEAST_NOISE_M` and `LEAST_NOISE_RAD`.
+        """
+        positions, heading = self.world_from_object[:, :3, 3], self.headings()
+        noise = motion.key_noise(self.times_s, np.column_stack([positions, heading]))
+        noise_m = max(float(np.sqrt((noise[:3] ** 2).mean())), LEAST_NOISE_M)
+        noise_rad = max(float(noise[3]), LEAST_NOISE_RAD)
+        path = motion.smoothed(self.times_s, positions, noise_m, motion.ACCELERATION_M_S2) - positions
+        turn = motion.smoothed(self.times_s, heading[:, None], noise_rad, motion.YAW_ACCELERATION_RAD_S2)[:, 0] - heading
+        shift = (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0]
+        now = [self.offsets[name].detach().double().numpy() for name in ("shift", "yaw")]
+        self.add_offsets(shift - now[0], turn - now[1])
+
+    def headings(self) -> NDArray[np.float64]:
+        """Yaw of the given keys f64[K], radians, without jumps of 2 pi."""
+        return np.unwrap([geometry.yaw_of(pose) for pose in self.world_from_object])
+
+    def moved(self, object_from_new: NDArray[np.float64]) -> Self:
+        """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box stays."""
+        columns = {name: value.detach() for name, value in self.offsets.columns.items()}
+        columns |= {"shift": torch.zeros_like(columns["shift"]), "yaw": torch.zeros_like(columns["yaw"])}
+        keys = self.corrected_keys() @ object_from_new
+        return type(self)(self.name, self.label, self.size_m, self.times_s, keys, Table(columns), self.learn_pose)
+
+    # -- rows -------------------------------------------------------------------------------------------------------
+
     def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor] | None:
         """See ``Node``."""
-        placement = self._placement(time_s) if self.learn_pose else self._fixed_placement(time_s)
+        placement = self._placement(time_s)
         if placement is None:
             return None
         position, rotation_t, product_t = placement
         return torch.addmm(position, means, rotation_t), quats @ product_t
 
     def _placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``."""
-        pose = self.pose_at(time_s)
-        return None if pose is None else (pose[0], rotation_matrix(pose[1]).T, left_product_matrix(pose[1]).T)
-
-    def _fixed_placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
-        """The same, remembered per time: a pose that is not learnt is worked out once."""
+        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``, remembered per time."""
         if time_s not in self._placements:
             with torch.no_grad():
-                self._placements[time_s] = self._placement(time_s)
+                pose = self.pose_at(time_s)
+            place = None if pose is None else (pose[0], rotation_matrix(pose[1]).T, left_product_matrix(pose[1]).T)
+            self._placements[time_s] = place
         return self._placements[time_s]
 
+    def color_weights(self, time_s: float, terms: int) -> Tensor:
+        """Values f32[terms] at a time that the coefficients of the time-varying colour are multiplied by."""
+        return motion.periodic_weights(time_s, float(self.times_s[0]), float(self.times_s[-1]), terms)
+
     def parameters(self) -> Table | None:
-        """The pose offsets, when they are learnt."""
-        return self.offsets if self.learn_pose else None
+        """None: offsets are not learnt by gradient steps but by ``stages.fit_poses``, which weighs what each picture can tell."""
+        return None
+
+    def after_step(self, share: float) -> None:
+        """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning rate."""
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``Node``."""
@@ -173,13 +264,67 @@ class RigidNode:
         return facts, tensors | {f"offsets.{key}": value for key, value in self.offsets.state().items()}
 
     @classmethod
-    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> RigidNode:
-        """Inverse of ``state``."""
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
+        """Inverse of ``state``. Scenes fitted before shift and yaw were two columns are read too."""
         offsets = {key.removeprefix("offsets."): value for key, value in tensors.items() if key.startswith("offsets.")}
+        if "column.offsets" in offsets:
+            offsets = {f"{part}.{name}": value[:, cut] for part in ("column", "moment1", "moment2")
+                       if (value := offsets.get(f"{part}.offsets")) is not None
+                       for name, cut in (("shift", slice(0, 3)), ("yaw", 3))}  # fmt: skip
         return cls(
             str(facts["name"]), str(facts["label"]), facts["size_m"], tensors["times_s"].numpy(),
             tensors["world_from_object"].numpy(), Table.from_state(offsets), bool(facts["learn_pose"]),
         )  # fmt: skip
+
+
+class DeformableNode(RigidNode):
+    """A person or a cyclist: a rigid node whose rows also move within the box, differently at every time.
+
+    The deformation is a grid of control points that spans the box (the corners of `DEFORM_CELLS` cells); each has a displacement
+    at every key of the track, and a row moves by what its place in the grid interpolates (three-linear in space, linear in time;
+    free-form deformation, Sederberg & Parry 1986). The rows of the shared table need no column of their own for it, so cloning
+    and splitting them changes nothing, and a static Gaussian pays nothing.
+
+    Parameters: as ``RigidNode``, and ``deform`` [K, 3, z, y, x], metres in the frame of the box.
+    """
+
+    kind = "deformable"
+
+    def _own_columns(self, keys: int) -> dict[str, Tensor]:
+        along, across, up = (cells + 1 for cells in DEFORM_CELLS)
+        return {"deform": torch.zeros(keys, 3, up, across, along)}
+
+    def place(self, means: Tensor, quats: Tensor, time_s: float) -> tuple[Tensor, Tensor] | None:
+        """See ``Node``."""
+        if self.keys_around(time_s) is None:
+            return None
+        return super().place(means + self.displacement(means, time_s), quats, time_s)
+
+    def displacement(self, means: Tensor, time_s: float) -> Tensor:
+        """How far rows at ``means`` [n, 3] (frame of the box) are moved at a time, [n, 3] metres; differentiable in both."""
+        found = self.keys_around(time_s)
+        if found is None or len(means) == 0:
+            return torch.zeros_like(means)
+        before, after, u = found
+        control = self.offsets["deform"][before]
+        if after != before:
+            control = torch.lerp(control, self.offsets["deform"][after], u)
+        place = 2 * means / means.new_tensor(self.size_m)
+        moved = F.grid_sample(control[None], place[None, None, None], mode="bilinear", padding_mode="border", align_corners=True)
+        return moved[0, :, 0, 0].T
+
+    def parameters(self) -> Table:
+        """The table that holds the displacements; the offsets in it never have a gradient, and so stay."""
+        return self.offsets
+
+    @torch.no_grad()
+    def after_step(self, share: float) -> None:
+        """See ``RigidNode``; displacements shrink towards none and towards those of the neighbouring keys."""
+        deform = self.offsets["deform"]
+        if len(deform) > 2:
+            inner = (deform[:-2] + deform[2:]) / 2 - deform[1:-1]
+            deform[1:-1] += share * DEFORM_SMOOTHING * inner
+        deform *= 1 - share * DEFORM_DECAY
 
 
 class SkyNode:
@@ -272,7 +417,16 @@ class SkyNode:
         return cls(Table.from_state(tensors))
 
 
-NODES: Final[dict[str, Any]] = {"static": StaticNode, "rigid": RigidNode, "sky": SkyNode}
+NODES: Final[dict[str, Any]] = {"static": StaticNode, "rigid": RigidNode, "deformable": DeformableNode, "sky": SkyNode}
+
+
+def object_node(track: Track, learn_pose: bool = False, deformable: bool = False) -> RigidNode:
+    """The node of a moving track: one that deforms for those who walk or ride, if asked for; else a rigid one."""
+    kind = DeformableNode if deformable and track.label.lower() in LIMBED_LABELS else RigidNode
+    node = kind.from_track(track, learn_pose)
+    if learn_pose:
+        node.settle()
+    return node
 
 
 @dataclass
@@ -322,9 +476,20 @@ class SceneModel:
         renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
         owner = renumber[self.table.labels["node"].long()]
-        rows = owner >= 0
-        table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]})
+        rows = (owner >= 0).nonzero()[:, 0]
+        part = self.table.partial_index(rows) if self.table.partial else rows
+        table = Table(
+            {key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]},
+            {key: value.detach()[part] for key, value in self.table.partial.items()},
+        )  # fmt: skip
         return SceneModel(table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts))
+
+    def with_node_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:
+        """A copy with one object displaced in its own frame (it shares the table of Gaussians)."""
+        nodes = tuple(
+            node.moved(object_from_new) if isinstance(node, RigidNode) and node.name == name else node for node in self.nodes
+        )
+        return SceneModel(self.table, nodes, self.sky, self.classes, self.sh_degree, dict(self.facts))
 
     # -- state ------------------------------------------------------------------------------------------------------
 
@@ -347,7 +512,7 @@ class SceneModel:
             InputError: an unknown node kind, a class that does not exist, or rows that belong to no node.
         """
         nodes: list[StaticNode | RigidNode] = []
-        sky = None
+        sky: SkyNode | None = None
         for index, facts in enumerate(values["nodes"]):
             if facts["kind"] not in NODES:
                 raise InputError("unknown kind of scene node", expected=", ".join(NODES), got=str(facts["kind"]))
@@ -367,7 +532,9 @@ class SceneModel:
         return cls(table, tuple(nodes), sky, classes, int(values["sh_degree"]), dict(values["facts"]))
 
 
-def compose(model: SceneModel, time_s: float, sh_degree: int | None = None, semantics: bool = True) -> Gaussians:
+def compose(
+    model: SceneModel, time_s: float, sh_degree: int | None = None, semantics: bool = True, mirrored: bool = False
+) -> Gaussians:
     """All Gaussians of the scene in the world at a time, activated, differentiable in every column.
 
     Objects that do not exist at that time stay in the rows with opacity 0, so that rows always match the table.
@@ -375,12 +542,15 @@ def compose(model: SceneModel, time_s: float, sh_degree: int | None = None, sema
     Args:
         sh_degree: use only bands up to this one (default: all).
         semantics: add the class logits as ``extra`` channels.
+        mirrored: show symmetric objects reflected about the plane that runs along and up their boxes.
     """
     table = model.table
     counts = model.counts()
     degree = model.sh_degree if sh_degree is None else min(sh_degree, model.sh_degree)
     means, quats, present = [], [], []
     for node, local_means, local_quats in zip(model.nodes, table["means"].split(counts), table["quats"].split(counts)):
+        if mirrored and isinstance(node, RigidNode) and node.symmetric:
+            local_means, local_quats = reflected(local_means, local_quats)
         placed = node.place(local_means, local_quats, time_s)
         present.append(1.0 if placed is not None else 0.0)
         world_means, world_quats = placed if placed is not None else (local_means, local_quats)
@@ -395,11 +565,34 @@ def compose(model: SceneModel, time_s: float, sh_degree: int | None = None, sema
         quats=torch.cat(quats) if len(quats) > 1 else quats[0],
         scales=torch.exp(table["log_scales"]),
         opacity=opacity,
-        sh=table["sh_dc"],
+        sh=_colors_at(model, time_s, counts),
         sh_rest=table["sh_rest"][:, : (degree + 1) ** 2 - 1] if degree > 0 else None,
         extra=table["semantics"] if semantics and model.classes else None,
         node=table.labels["node"],
     )
+
+
+def _colors_at(model: SceneModel, time_s: float, counts: Sequence[int]) -> Tensor:
+    """Constant band of the colour ``[N, 1, 3]`` at a time: that of moving objects may vary."""
+    table = model.table
+    if "sh_time" not in table.partial:
+        return table["sh_dc"]
+    coefficients = table.partial["sh_time"]
+    terms = coefficients.shape[1]
+    weights = torch.stack([node.color_weights(time_s, terms) for node in model.nodes[1:]]) if len(model.nodes) > 1 else None
+    if weights is None:
+        return table["sh_dc"]
+    rows = weights.to(coefficients.dtype).repeat_interleave(torch.tensor(counts[1:]), 0)
+    static, moving = table["sh_dc"].split([counts[0], len(coefficients)])
+    return torch.cat([static, moving + (rows[:, :, None] * coefficients).sum(1, keepdim=True)])
+
+
+def reflected(means: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
+    """Gaussians reflected about the plane y = 0 of their frame: means ``[n, 3]``, quaternions ``[n, 4]`` (w, x, y, z).
+
+    Axes of an ellipsoid have no direction, so the reflected one is the rotation S R S with S = diag(1, -1, 1).
+    """
+    return means * means.new_tensor([1.0, -1.0, 1.0]), quats * quats.new_tensor([1.0, -1.0, 1.0, -1.0])
 
 
 def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
                without given classes, at several numbers of steps, and the seam between windows of a longer video
 mdm-ablation   what of its condition the model lives on (see `bench_ablation`)
+poses          how much of the error of tracked boxes a fit takes out (see `bench_poses`); needs no diffusion model
 shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
 
 OUT/clips/ the generated clips   OUT/bench.json   OUT/bench.md   OUT/*.png pictures
@@ -28,7 +29,7 @@ from mudg.data.city_clips import CityClipRules
 from mudg.data.clips import ConditionRules, Source, build_condition
 from mudg.models import mdm
 from mudg.models.mdm import MDM
-from mudg.stages import bench_ablation, bench_shift, learn_score
+from mudg.stages import bench_ablation, bench_poses, bench_shift, learn_score
 from mudg.stages.config import BenchConfig, SynthesizeConfig
 from mudg.stages.precision import choose_bf16
 from mudg.stages.synthesize import windows
@@ -141,5 +142,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
     "mdm-ablation": bench_ablation.measure,
+    "poses": bench_poses.measure,
 }
-"""Every measurement of the diffusion model by name."""
+"""Every measurement that is one folder, by name."""

@@ -190,7 +190,7 @@ class LearnConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class BenchConfig:
-    """Measure the diffusion model, or whole scenes off the recorded path, on generated cities never trained on, against exact truth."""
+    """Measure on generated cities, against exact truth: the diffusion model on ones it never saw, or scenes, also off the path."""
 
     model: str = "embedded"
     """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
@@ -225,6 +225,8 @@ class BenchConfig:
     """shift: logs worked on at the same time, one thread each (0 = one per core)."""
     videos: bool = True
     """shift: also make the videos of the page."""
+    pose_iterations: int = Field(default=300, ge=1)
+    """poses: steps of each fit."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -336,6 +338,30 @@ class FitConfig:
     """Pulls all opacities down, so that what is not needed fades (unset = 0.01 with mcmc, else 0)."""
     scale_weight: float | None = Field(default=None, ge=0)
     """Pulls all sizes down, per metre (unset = 0.001 with mcmc, else 0)."""
+    pose_start: float = Field(default=0.25, ge=0, le=1)
+    """learn_poses: share of the iterations before the first round of corrections."""
+    pose_rounds: int = Field(default=4, ge=0)
+    """learn_poses: rounds of corrections, spread evenly up to 85 % of the iterations (0 = only take the noise out of the tracks)."""
+    deformable: bool = False
+    """Let people and cyclists change their shape within their boxes."""
+    color_terms: int = Field(default=0, ge=0, le=8)
+    """Sines and cosines by which the colour of moving objects may vary over time (published: 4; 0 = constant)."""
+    mirror_start: bool = True
+    """Start vehicles with their points mirrored to the side that nothing measured."""
+    mirror_probability: float = Field(default=0.0, ge=0, le=1)
+    """How often vehicles are shown mirrored while fitting, so that one side teaches the other."""
+    exposure: Literal["none", "camera", "image"] = "none"
+    """Learn an affine colour map per camera, or per recorded image; not used in renders."""
+    exposure_weight: float = Field(default=0.1, ge=0)
+    """Pull of colour maps, of recorded and virtual views, towards the identity."""
+    learn_cameras: bool = False
+    """Correct the pose of every recorded image while fitting; not used in renders."""
+    virtual_appearance: bool = False
+    """mudg_s: learn an affine colour map per set of virtual views, so that their colours do not reach the recorded path."""
+    outlier_deviations: float = Field(default=0.0, ge=0)
+    """Leave out starting points that lie lonelier than usual by so many standard deviations (0 = keep all)."""
+    object_weight: float = Field(default=0.0, ge=0)
+    """Moving objects decide, inside their boxes, between there and not there, and leave no haze outside (published: 0.1)."""
     ssim_weight: float = Field(default=0.2, ge=0, le=1)
     lidar_weight: float = Field(default=0.1, ge=0)
     """LiDAR depth on recorded views (best 95 % of the points, relative error)."""

@@ -5,6 +5,7 @@ Gaussians start), ``models.nodes.compose`` (the scene at a time), ``core.raster`
 loss), ``models.densify``. Nothing else touches the parameters.
 
     OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``)
+    OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
     OUT/log.jsonl, preview/*.png                                how it went
     OUT/steps/                                                  checkpoints, while it runs
 """
@@ -18,7 +19,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +28,23 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from mudg.base import checkpoint, log, palette, store
+from mudg.base import checkpoint, log, palette, seeds, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
-from mudg.base.types import Gaussians, Observation, Render, View
+from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import fused as kernels
 from mudg.core import losses, metrics
 from mudg.core.raster import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
 from mudg.data.scenefile import read_scene
+from mudg.models.appearance import Appearance
 from mudg.models.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
 from mudg.models.featnets import FilterBank
 from mudg.models.mcmc import McmcSettings, drift, relocate_and_grow
-from mudg.models.nodes import SceneModel, compose, composite_semantics, composite_sky
+from mudg.models.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky
 from mudg.stages.config import FitConfig
+from mudg.stages.fit_objects import boxes_in_view, objects_only
+from mudg.stages.fit_poses import refine_poses
 from mudg.stages.fit_start import StartSettings, start_model
 from mudg.stages.fit_trust import unseen_maps, unseen_rows
 from mudg.stages.fit_views import (
@@ -59,6 +63,7 @@ VERSION = 1
 PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
+LAST_POSE_ROUND = 0.85
 NEAR_M = 0.2
 MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
 """Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
@@ -114,6 +119,7 @@ def run(
         state = _prepare(config, recipe, Path(scene), Path(fused), virtual, folder.path)
         optimise(state, config, folder)
     save_model(state.model, folder.path)
+    save_appearance(state.appearance, folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
     folder.finish(state.summary())
     return folder.path
@@ -132,6 +138,7 @@ class FitState:
     last: Mapping[str, float] | None = None
     unseen: Tensor | None = None
     """u8[V, H, W] of the virtual views: 1 where no recorded view saw what they show; None before they join."""
+    appearance: Appearance = field(default_factory=lambda: Appearance({}))
 
     def summary(self) -> dict[str, Any]:
         """For run.json."""
@@ -157,14 +164,26 @@ def _prepare(config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Pa
         log.info(f"continuing at step {found.step} of {config.iterations}")
         stats = DensifyStats.from_state(found.tensors("stats"))
         unseen = found.tensors("unseen").get("maps") if found.state["virtual"] else None
-        return FitState(model, views, stats, schedule, found.step, float(found.state["seconds"]), found.state["last"], unseen)
+        appearance = Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
+        return FitState(model, views, stats, schedule, found.step, float(found.state["seconds"]), found.state["last"], unseen, appearance)
+    return start_state(config, recipe, scene, fused, views, classes)
+
+
+def start_state(
+    config: FitConfig, recipe: Recipe, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]
+) -> FitState:
+    """The state that a fit starts from: a model built from the fused cloud, nothing corrected yet."""
     start = StartSettings(
         config.initial_gaussians, config.voxel_m, config.far_m, config.sh_degree, recipe.objects, recipe.sky,
-        config.learn_poses, config.seed,
+        config.learn_poses, config.seed, config.deformable, config.color_terms, config.mirror_start, config.outlier_deviations,
     )  # fmt: skip
-    model = start_model(scene, fused, recorded, classes, start)
+    model = start_model(scene, cloud, views.recorded, classes, start)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
-    return FitState(model, views, DensifyStats.zeros(len(model.table)), schedule, 0)
+    appearance = Appearance.of_views(
+        [view.name for view in views.recorded], [view.name for view in views.virtual], config.exposure, config.learn_cameras,
+        config.virtual_appearance,
+    )  # fmt: skip
+    return FitState(model, views, DensifyStats.zeros(len(model.table)), densify_schedule(config), 0, appearance=appearance)
 
 
 # ---- the loop ------------------------------------------------------------------------------------------------------
@@ -192,16 +211,24 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             wanted = recorded or config.virtual_densify
             growing = wanted and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
 
-            gaussians = compose(state.model, observation.view.time_s, semantics=not recorded or step % config.semantic_every == 0)
-            render = rasterize(gaussians, observation.view, raster, absgrad=growing)
-            terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception)
-            terms |= regularisers(gaussians, config)
+            with_classes = not recorded or step % config.semantic_every == 0
+            gaussians = compose(state.model, observation.view.time_s, None, with_classes, recorded and shows_mirrored(config, step))
+            pose = state.appearance.world_from_cam(observation.view, sample.name) if recorded else None
+            render = rasterize(gaussians, observation.view, raster, absgrad=growing, world_from_cam=pose)
+            terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception, state.appearance)
+            terms |= regularisers(gaussians, config) | correction_terms(state, gaussians, sample, config, raster, step)
             finite_or_refuse(terms, sample.name, step)
             torch.stack(list(terms.values())).sum().backward()
             gradients_or_refuse(state.model, sample.name, step)
+            state.appearance.refuse_non_finite(sample.name, step)
             adam_step(state.model, step, config, render.trace.visible)
+            state.appearance.adam_step(step, appearance_rates(step, config.iterations), kernels.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.longest_to_middle)
+                settle_nodes(state.model, config, step)
+            if pose_round_due(config, step):
+                moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
+                folder.log(step=step, boxes_moved_m=round(moved_m, 5))
             if growing:
                 camera = observation.view.camera
                 state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0])
@@ -252,7 +279,7 @@ def admit_virtual_views(state: FitState, config: FitConfig, raster: RasterConfig
 
 
 def recorded_terms(
-    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank
+    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank, appearance: Appearance | None = None
 ) -> dict[str, Tensor]:
     """Weighted loss terms of a recorded view: colour, LiDAR depth, sky, semantics (those that apply).
 
@@ -261,6 +288,7 @@ def recorded_terms(
     seen = sample.observation
     labels = seen.confidence * seen.mask
     rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
+    rgb = rgb if appearance is None else appearance.colored(rgb, sample.name, seen.kind)
     rgb = losses.outside_mask_copied(rgb, seen.rgb, None if seen.mask.all() else seen.mask)
     terms = {"color": kernels.photometric(rgb, seen.rgb, config.ssim_weight)}
     if sample.lidar is not None and len(sample.lidar.pixel) and config.lidar_weight:
@@ -275,13 +303,14 @@ def recorded_terms(
 
 
 def virtual_terms(
-    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank
+    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank, appearance: Appearance | None = None
 ) -> dict[str, Tensor]:
     """Weighted loss terms of a virtual view, every pixel weighted by the observation's confidence."""
     seen = sample.observation
     sure = seen.confidence if config.virtual_confidence_power == 1 else seen.confidence**config.virtual_confidence_power
     weight = sure * seen.mask * torch.where(sample.unseen, 1.0, config.virtual_seen_weight)
     rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
+    rgb = rgb if appearance is None else appearance.colored(rgb, sample.name, seen.kind)
     terms: dict[str, Tensor] = {}
     if config.virtual_color_weight:
         share = config.virtual_ssim_weight
@@ -320,6 +349,51 @@ def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
     if scale_weight:
         terms["scale"] = scale_weight * gaussians.scales.mean()
     return terms
+
+
+def correction_terms(
+    state: FitState, gaussians: Gaussians, sample: Sample, config: FitConfig, raster: RasterConfig, step: int
+) -> dict[str, Tensor]:
+    """Weighted terms that hold what is learnt to what is known: colour maps near the identity, objects within their boxes
+    (once densification is over)."""
+    seen = sample.observation
+    terms: dict[str, Tensor] = {}
+    distance = state.appearance.penalty(sample.name, seen.kind)
+    if distance is not None and config.exposure_weight:
+        terms["exposure"] = config.exposure_weight * distance
+    if config.object_weight and seen.kind == "recorded" and _settled(state.schedule, step) and len(state.model.nodes) > 1:
+        alpha = rasterize(objects_only(gaussians), seen.view, raster).alpha
+        inside = boxes_in_view(state.model, seen.view)
+        terms["objects"] = config.object_weight * losses.object_map(alpha, inside).mean()
+    return terms
+
+
+def _settled(schedule: DensifySettings | McmcSettings | None, step: int) -> bool:
+    """Whether the number of Gaussians does not change any more after a step."""
+    return schedule is None or step > schedule.stop
+
+
+def shows_mirrored(config: FitConfig, step: int) -> bool:
+    """Whether symmetric objects are shown mirrored at a step."""
+    probability = config.mirror_probability
+    return probability > 0 and float(seeds.numpy_rng(config.seed, step, "mirrored").random()) < probability
+
+
+def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
+    """Regularise what nodes learn per key of their track, less and less as the steps of the optimiser shrink."""
+    share = learning_rates(step, config.iterations)["deform"] / learning_rates(1, config.iterations)["deform"]
+    for node in model.nodes:
+        if isinstance(node, RigidNode):
+            node.after_step(share)
+
+
+def pose_round_due(config: FitConfig, step: int) -> bool:
+    """Whether boxes are corrected after a step."""
+    if not config.learn_poses or not config.pose_rounds:
+        return False
+    first, last = config.pose_start, max(config.pose_start, LAST_POSE_ROUND)
+    shares = np.linspace(first, last, config.pose_rounds)
+    return step in {max(1, round(float(share) * config.iterations)) for share in shares}
 
 
 def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
@@ -367,8 +441,15 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "sh_rest": 1.25e-4 * boost * gentle,
         "semantics": 1e-2 * boost,
         "panorama": 1e-2 * gentle,
-        "offsets": 1e-3 * boost * gentle,
+        "deform": 1e-3 * boost * gentle,
+        "sh_time": 2.5e-3 * boost * gentle,
     }
+
+
+def appearance_rates(step: int, iterations: int) -> dict[str, float]:
+    """Learning rates of the corrections of appearance at a step (from 1)."""
+    gentle = 0.2 ** (step / max(1, iterations))
+    return {"affine": 2e-3 * gentle, "shift": 1e-3 * gentle, "turn": 1e-4 * gentle}
 
 
 def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None:
@@ -429,7 +510,10 @@ def save_checkpoint(state: FitState, folder: Path) -> None:
     groups = {**groups, "stats": state.stats.state()}
     if state.unseen is not None:
         groups["unseen"] = {"maps": state.unseen}
-    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "virtual": state.unseen is not None}
+    names, groups["appearance"] = state.appearance.state()
+    groups["appearance"] = groups["appearance"] or {"none": torch.zeros(1)}
+    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "virtual": state.unseen is not None,
+             "appearance": names}  # fmt: skip
     checkpoint.save(folder, state.step, groups, facts)
 
 
@@ -440,6 +524,14 @@ def save_model(model: SceneModel, folder: Path) -> None:
     for name, tensors in groups.items():
         kept = {key: value for key, value in tensors.items() if "moment" not in key}
         store.write_safetensors(folder / f"{name}.safetensors", kept)
+
+
+def save_appearance(appearance: Appearance, folder: Path) -> None:
+    """What was learnt about cameras, images and virtual sets, for those who want to know; renders do not use it."""
+    if appearance:
+        names, tensors = appearance.state()
+        store.write_json(folder / "appearance.json", {"schema": 1, "names": names})
+        store.write_safetensors(folder / "appearance.safetensors", {k: v for k, v in tensors.items() if "moment" not in k})
 
 
 def load_model(folder: Path) -> SceneModel:

@@ -29,6 +29,7 @@ from mudg.models.nodes import (
     box_grid,
     columns_from_points,
     neighbour_scale,
+    object_node,
     voxel_filter,
 )  # fmt: skip
 from mudg.stages.fit_views import StoredView
@@ -39,6 +40,7 @@ FILL_CELL_PX = 8
 FILL_FRAMES = 30
 SKY_ROWS = 192
 FEWEST_OBJECT_POINTS = 150
+MIRROR_APART_M = 0.25
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,10 @@ class StartSettings:
     with_sky: bool
     learn_poses: bool
     seed: int
+    deformable: bool = False
+    color_terms: int = 0
+    mirror: bool = False
+    outlier_deviations: float = 0.0
 
 
 def start_model(
@@ -70,14 +76,16 @@ def start_model(
     if settings.with_objects:
         share = settings.initial_gaussians // max(1, len(fused.objects))
         for track_id, cloud in sorted(fused.objects.items()):
-            node = RigidNode.from_track(scene.track(track_id), settings.learn_poses)
+            node = object_node(scene.track(track_id), settings.learn_poses, settings.deformable)
             blocks.append(_object_columns(node, cloud, classes, settings, min(share, 8000)))
             nodes.append(node)
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
     sky = _painted_sky(views) if settings.with_sky else None
     log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} objects")
-    return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, settings.sh_degree)
+    moving = len(owner) - len(blocks[0]["means"])
+    partial = {"sh_time": torch.zeros(moving, settings.color_terms, 3)} if settings.color_terms and moving else {}
+    return SceneModel(Table(columns, {"node": owner}, partial), tuple(nodes), sky, classes, settings.sh_degree)
 
 
 def _static_columns(
@@ -85,6 +93,8 @@ def _static_columns(
 ) -> Mapping[str, torch.Tensor]:
     centers = np.stack([view.view.center_world for view in views]).astype(np.float32)
     rows = _thinned(cloud.xyz, centers, settings)
+    if settings.outlier_deviations:
+        rows = rows[~_lonely(cloud.xyz[rows], centers, settings.outlier_deviations)]
     xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
     semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
     scale = neighbour_scale(xyz)
@@ -107,6 +117,34 @@ def _thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], settings: S
     return rows[np.sort(seeds.numpy_rng(settings.seed, 0, "thin").permutation(len(rows))[: settings.initial_gaussians])]
 
 
+def _lonely(xyz: NDArray[np.float32], centers: NDArray[np.float32], deviations: float, neighbours: int = 6) -> NDArray[np.bool_]:
+    """Bool[N]: points whose neighbours are unusually far for their distance from the drive.
+
+    The mean distance to the nearest neighbours grows with the range and has a long tail, so its logarithm is compared with the
+    mean and spread (median and quartiles, which outliers do not move) of points in the same band of range.
+    """
+    if len(xyz) <= neighbours:
+        return np.zeros(len(xyz), bool)
+    apart = np.log(cKDTree(xyz).query(xyz, k=neighbours + 1, workers=1)[0][:, 1:].mean(1) + 1e-6)
+    band = np.round(2 * np.log2(1 + cKDTree(centers).query(xyz, k=1, workers=1)[0])).astype(int)
+    lonely = np.zeros(len(xyz), bool)
+    for one in np.unique(band):
+        mine = band == one
+        low, middle, high = np.percentile(apart[mine], (25, 50, 75))
+        lonely[mine] = apart[mine] > middle + deviations * max((high - low) / 1.349, 1e-3)
+    return lonely
+
+
+def mirrored_points(xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Points reflected about y = 0 of the box, where no measured point is within ``apart_m``: xyz f32[M, 3] and their sources."""
+    if len(xyz) == 0:
+        return xyz, np.zeros(0, np.int64)
+    flipped = xyz * np.array([1, -1, 1], np.float32)
+    distance, _ = cKDTree(xyz).query(flipped, k=1, workers=1)
+    source = np.flatnonzero(distance > apart_m)
+    return flipped[source], source
+
+
 def _object_columns(
     node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], settings: StartSettings, most: int
 ) -> Mapping[str, torch.Tensor]:
@@ -114,6 +152,10 @@ def _object_columns(
     rows = rows[np.sort(seeds.numpy_rng(settings.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
     xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
     semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
+    if settings.mirror and node.symmetric:
+        other, source = mirrored_points(xyz)
+        xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
+        semantics = np.concatenate([semantics, semantics[source]])
     if len(rows) < FEWEST_OBJECT_POINTS:
         color = rgb.mean(0) if len(rgb) else np.array([127, 127, 127])
         grid_xyz, grid_rgb = box_grid(node.size_m, color)

@@ -189,4 +189,4 @@ def _in_box(node: RigidNode, points: NDArray[np.float64], time_s: float) -> tupl
 
 
 def _pose(node: RigidNode, time_s: float) -> NDArray[np.float64] | None:
-    return geometry.pose_at(node.times_s, node.world_from_object, time_s)
+    return node.pose_matrix(time_s)

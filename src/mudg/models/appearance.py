@@ -1,0 +1,168 @@
+"""What differs from picture to picture though the scene does not: exposure and colour, small errors of camera poses.
+
+Three corrections, each optional, each the identity at the start, none of them used when a fitted scene is rendered:
+
+    exposure   3x4 affine colour map per camera or per recorded image. The mean over all of them is held at the identity, so
+               that the scene keeps the average colour of the log instead of drifting against the maps.
+    cameras    6 numbers per recorded image: shift [m] and turn [rad] of the camera in its own frame.
+    virtual    3x4 affine colour map per set of virtual views. What a generator paints too dark or too blue everywhere ends up
+               here instead of in the Gaussians that recorded views share.
+
+The affine map is that of Street Gaussians (Yan et al. 2024): ``A rgb + b``, an L1 penalty on the distance from the identity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal
+
+import torch
+from torch import Tensor
+
+from mudg.base.errors import InputError, NumericsError
+from mudg.base.types import View
+from mudg.core.table import AdamKernel, Table
+
+Exposure = Literal["none", "camera", "image"]
+RECORDED_COLOR: Final = "exposure"
+VIRTUAL_COLOR: Final = "virtual"
+CAMERA_POSE: Final = "cameras"
+
+
+class Appearance:
+    """The corrections of a fit. A group that is off is absent from ``tables``.
+
+    Args:
+        names: per group, what has a correction of its own: cameras or images, sets of virtual views, images.
+        tables: per group, one row per name: ``affine`` [n, 3, 4] (difference from the identity), or ``shift`` [n, 3] metres
+            and ``turn`` [n, 3] radians; None = identity.
+
+    Raises:
+        InputError: a table does not fit its names.
+    """
+
+    def __init__(self, names: Mapping[str, Sequence[str]], tables: Mapping[str, Table] | None = None) -> None:
+        self.names = {group: tuple(of) for group, of in names.items() if len(of)}
+        self._row = {group: {name: row for row, name in enumerate(of)} for group, of in self.names.items()}
+        self.tables = (
+            dict(tables)
+            if tables is not None
+            else {group: _identity(group, len(of)) for group, of in self.names.items()}
+        )
+        for group, of in self.names.items():
+            if group not in self.tables or len(self.tables[group]) != len(of):
+                raise InputError(
+                    "corrections of appearance do not fit their names", where=group, expected=f"{len(of)} rows"
+                )
+
+    @classmethod
+    def of_views(
+        cls, recorded: Sequence[str], virtual: Sequence[str], exposure: Exposure = "none", cameras: bool = False,
+        virtual_color: bool = False,
+    ) -> Appearance:  # fmt: skip
+        """Corrections for views named ``camera/number`` (recorded) and ``set/number`` (virtual), all the identity."""
+        images = tuple(dict.fromkeys(recorded))
+        colored = {"none": (), "camera": tuple(dict.fromkeys(map(owner, recorded))), "image": images}[exposure]
+        return cls({
+            RECORDED_COLOR: colored,
+            CAMERA_POSE: images if cameras else (),
+            VIRTUAL_COLOR: tuple(dict.fromkeys(map(owner, virtual))) if virtual_color else (),
+        })  # fmt: skip
+
+    def __bool__(self) -> bool:
+        return bool(self.tables)
+
+    # -- use ----------------------------------------------------------------------------------------------------------
+
+    def colored(self, rgb: Tensor, name: str, kind: str) -> Tensor:
+        """A rendered picture ``[3, H, W]`` as the camera (or generator) of view ``name`` would show it, differentiable."""
+        found = self._affine(name, kind)
+        if found is None:
+            return rgb
+        flat = rgb.flatten(1)
+        return rgb + torch.addmm(found[:, 3:], found[:, :3], flat).view_as(rgb)
+
+    def penalty(self, name: str, kind: str) -> Tensor | None:
+        """Mean distance of the view's colour map from the identity (scalar), or None where it has none."""
+        found = self._affine(name, kind)
+        return None if found is None else found.abs().mean()
+
+    def world_from_cam(self, view: View, name: str) -> Tensor | None:
+        """Corrected pose f32[4, 4] of a recorded view, differentiable; None where poses are not corrected."""
+        row = self._row.get(CAMERA_POSE, {}).get(name)
+        if row is None:
+            return None
+        table = self.tables[CAMERA_POSE]
+        return torch.from_numpy(view.world_from_cam.copy()).to(table["shift"].dtype) @ rigid_motion(
+            table["shift"][row], table["turn"][row]
+        )
+
+    def _affine(self, name: str, kind: str) -> Tensor | None:
+        """Difference ``[3, 4]`` of the view's colour map from the identity."""
+        group = RECORDED_COLOR if kind == "recorded" else VIRTUAL_COLOR
+        rows = self._row.get(group)
+        if rows is None:
+            return None
+        row = rows.get(name, rows.get(owner(name)))
+        if row is None:
+            raise InputError("a view has no colour map", where=name, expected=", ".join(list(rows)[:8]))
+        affine = self.tables[group]["affine"]
+        return affine[row] - affine.mean(0) if group == RECORDED_COLOR else affine[row]
+
+    def refuse_non_finite(self, view: str, step: int) -> None:
+        """NumericsError naming the correction if a gradient is not finite; nothing has been changed by then."""
+        for group, table in self.tables.items():
+            for name, gradient in table.gradients().items():
+                if not bool(torch.isfinite(gradient).all()):
+                    table.clear_gradients()
+                    raise NumericsError("a gradient is not finite", where=f"appearance {group}.{name}, view {view}, step {step}",
+                                        remedy="the parameters are those of the step before; leave this view out")  # fmt: skip
+
+    # -- learning -----------------------------------------------------------------------------------------------------
+
+    def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel) -> None:
+        """One Adam step on the rows that have a gradient (the others rest), then gradients are dropped."""
+        for table in self.tables.values():
+            gradients = [gradient.flatten(1).abs().sum(1) for gradient in table.gradients().values()]
+            if gradients:
+                table.adam_step(step, rates, kernel, torch.stack(gradients).sum(0) > 0)
+            table.clear_gradients()
+
+    # -- state --------------------------------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """JSON values and tensors that rebuild it with its moments."""
+        tensors = {
+            f"{group}/{key}": value for group, table in self.tables.items() for key, value in table.state().items()
+        }
+        return {group: list(of) for group, of in self.names.items()}, tensors
+
+    @classmethod
+    def from_state(cls, values: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Appearance:
+        """Inverse of ``state``."""
+        tables = {}
+        for group in values:
+            own = {key.partition("/")[2]: value for key, value in tensors.items() if key.startswith(f"{group}/")}
+            tables[group] = Table.from_state(own)
+        return cls({group: tuple(map(str, of)) for group, of in values.items()}, tables)
+
+
+def owner(name: str) -> str:
+    """Camera of a recorded view, or set of a virtual one: what stands before the last slash of its name."""
+    return name.rpartition("/")[0]
+
+
+def rigid_motion(shift_m: Tensor, turn_rad: Tensor) -> Tensor:
+    """Rigid ``[4, 4]`` with translation ``shift_m`` [3] and the rotation about ``turn_rad`` [3] by its length; differentiable, also
+    at zero."""
+    x, y, z = turn_rad.unbind()
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+    top = torch.cat([torch.matrix_exp(skew), shift_m[:, None]], 1)
+    return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def _identity(group: str, rows: int) -> Table:
+    if group == CAMERA_POSE:
+        return Table({"shift": torch.zeros(rows, 3), "turn": torch.zeros(rows, 3)})
+    return Table({"affine": torch.zeros(rows, 3, 4)})

@@ -1,0 +1,225 @@
+"""Corrections of exposure and camera poses: identity at the start, gradients, what is held fixed, recovery in a small fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_world import camera, fused_cloud, truth, view_at, write_scene
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, NumericsError
+from mudg.core.fused import adam_columns
+from mudg.core.raster import RasterConfig
+from mudg.core.table import torch_adam_columns
+from mudg.data.scenefile import read_scene
+from mudg.models.appearance import Appearance, owner, rigid_motion
+from mudg.models.nodes import compose
+from mudg.stages import fit, fit_views
+from mudg.stages.config import FitConfig
+from mudg.stages.fit_objects import boxes_in_view, convex_outline, objects_only
+
+SIZE = (60, 40)
+RECORDED = ("front/000000", "front/000001", "left/000000")
+VIRTUAL = ("front_shift+2.0/000000", "front_shift-2.0/000000", "front_shift+2.0/000001")
+
+
+def everything(exposure="image") -> Appearance:
+    return Appearance.of_views(RECORDED, VIRTUAL, exposure, cameras=True, virtual_color=True)
+
+
+def test_the_start_is_the_identity():
+    made = everything()
+    rgb = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(0))
+    view = view_at(0.3, camera())
+    for name, kind in ((RECORDED[0], "recorded"), (VIRTUAL[1], "virtual")):
+        assert torch.equal(made.colored(rgb, name, kind), rgb)
+        assert made.penalty(name, kind).item() == 0
+    assert torch.allclose(made.world_from_cam(view, RECORDED[2]), torch.from_numpy(view.world_from_cam.copy()).float())
+
+
+def test_what_is_off_is_absent():
+    made = Appearance.of_views(RECORDED, VIRTUAL)
+    rgb = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(0))
+    assert not made
+    assert made.colored(rgb, RECORDED[0], "recorded") is rgb
+    assert made.penalty(VIRTUAL[0], "virtual") is None
+    assert made.world_from_cam(view_at(0.0, camera()), RECORDED[0]) is None
+    assert everything("camera").names == {
+        "exposure": ("front", "left"), "cameras": RECORDED, "virtual": ("front_shift+2.0", "front_shift-2.0"),
+    }  # fmt: skip
+
+
+def test_a_view_without_a_map_is_refused():
+    with pytest.raises(InputError, match="no colour map"):
+        everything().colored(torch.zeros(3, 2, 2), "rear/000000", "recorded")
+    with pytest.raises(InputError, match="do not fit"):
+        Appearance({"exposure": ("a", "b")}, {"exposure": everything().tables["exposure"]})
+
+
+def test_recorded_maps_average_to_the_identity_and_virtual_ones_need_not():
+    made = everything("camera")
+    with torch.no_grad():
+        for group in ("exposure", "virtual"):
+            made.tables[group]["affine"].copy_(torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(1)))
+    rgb = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(0))
+    mean = (made.colored(rgb, "front/7", "recorded") + made.colored(rgb, "left/7", "recorded")) / 2
+    assert torch.allclose(mean, rgb, atol=1e-6)
+    affine = made.tables["virtual"]["affine"].detach()[0]
+    expected = rgb + torch.einsum("ij,jhw->ihw", affine[:, :3], rgb) + affine[:, 3, None, None]
+    assert torch.allclose(made.colored(rgb, VIRTUAL[2], "virtual"), expected, atol=1e-6)
+
+
+def test_rigid_motion_agrees_with_the_rotation_about_an_axis():
+    moved = rigid_motion(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 0.7])).numpy()
+    assert np.abs(moved - geometry.yaw_matrix(0.7, (1, 2, 3))).max() < 1e-6
+    any_turn = rigid_motion(
+        torch.zeros(3, dtype=torch.float64), torch.tensor([0.3, -0.4, 0.5], dtype=torch.float64)
+    ).numpy()
+    assert geometry.is_rigid(any_turn)
+    assert math.acos((np.trace(any_turn[:3, :3]) - 1) / 2) == pytest.approx(math.sqrt(0.5), abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3])
+def test_gradients_by_finite_differences(scale):
+    """Colour maps (through their mean as well) and camera motions, also where the turn is zero."""
+    g = torch.Generator().manual_seed(3)
+    made = everything()
+    rgb = torch.rand(3, 2, 2, generator=g, dtype=torch.float64)
+    view = view_at(0.3, camera())
+
+    def applied(affine, shift, turn):
+        made.tables["exposure"].columns["affine"] = affine
+        made.tables["cameras"].columns |= {"shift": shift, "turn": turn}
+        pose = made.world_from_cam(view, RECORDED[1])
+        return torch.cat([made.colored(rgb, RECORDED[1], "recorded").flatten(), pose.flatten()])
+
+    inputs = [
+        (scale * torch.randn(*shape, generator=g, dtype=torch.float64)).requires_grad_()
+        for shape in ((3, 3, 4), (3, 3), (3, 3))
+    ]
+    assert torch.autograd.gradcheck(applied, inputs)
+
+
+@pytest.mark.parametrize("kernel", [torch_adam_columns, adam_columns])
+def test_only_the_image_of_a_step_moves(kernel):
+    made = everything()
+    view = view_at(0.3, camera())
+    made.world_from_cam(view, RECORDED[1])[:3, 3].sum().backward()
+    made.adam_step(1, {"shift": 0.1, "turn": 0.1, "affine": 0.1}, kernel)
+    moved = made.tables["cameras"]["shift"].detach().abs().sum(1) > 0
+    assert moved.tolist() == [False, True, False]
+    assert not made.tables["cameras"]["turn"].detach().any()
+    assert not made.tables["exposure"]["affine"].detach().any()
+
+
+def test_a_non_finite_gradient_is_named():
+    made = everything()
+    made.tables["virtual"]["affine"].grad = torch.full((2, 3, 4), float("nan"))
+    with pytest.raises(NumericsError, match=r"virtual.affine, view v/1, step 3"):
+        made.refuse_non_finite("v/1", 3)
+    assert made.tables["virtual"]["affine"].grad is None
+
+
+def test_state_round_trip():
+    made = everything()
+    with torch.no_grad():
+        made.tables["cameras"]["turn"].fill_(0.01)
+    made.tables["exposure"].moment1["affine"].fill_(0.5)
+    again = Appearance.from_state(*made.state())
+    assert again.names == made.names
+    assert torch.equal(again.tables["cameras"]["turn"], made.tables["cameras"]["turn"])
+    assert torch.equal(again.tables["exposure"].moment1["affine"], made.tables["exposure"].moment1["affine"])
+    assert not Appearance.from_state(*Appearance({}).state())
+    assert owner("front/000001") == "front"
+
+
+# ---- objects by themselves -------------------------------------------------------------------------------------------
+
+
+def test_outline_of_points():
+    square = np.array([[0, 0], [2, 0], [2, 2], [0, 2], [1, 1], [1, 0], [0.5, 1.5]], float)
+    corners = {tuple(corner) for corner in convex_outline(square).tolist()}
+    assert corners == {(0, 0), (2, 0), (2, 2), (0, 2)}
+
+
+# ---- fits ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    root = tmp_path_factory.mktemp("world")
+    write_scene(root / "scene", frames=6, width=SIZE[0], height=SIZE[1], cameras=("front", "left"))
+    return read_scene(root / "scene"), fused_cloud(6)
+
+
+def begin(world, change=None, **options) -> tuple[fit.FitState, FitConfig]:
+    scene, cloud = world
+    config = FitConfig(
+        method="street_gaussians", **{"iterations": 120, "initial_gaussians": 700, "densify": False, **options}
+    )
+    frames = fit_views.training_frames(scene, ())
+    classes = fit_views.classes_of(scene, frames, None)
+    recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
+    recorded = tuple(map(change, recorded)) if change is not None else recorded
+    return fit.start_state(
+        config, fit.RECIPES[config.method], scene, cloud, fit_views.ViewSet(recorded, ()), classes
+    ), config
+
+
+def optimised(state, config, tmp_path):
+    from mudg.base import store
+    from mudg.base.config import to_dict
+
+    fit.optimise(state, config, store.RunDir.open(tmp_path, "fit", to_dict(config), {}, 1, False))
+    return state
+
+
+def darker_left(stored):
+    """What a left camera of 0.7 times the exposure, and a little more blue, records."""
+    if not stored.name.startswith("left"):
+        return stored
+    rgb = (stored.rgb.astype(np.float32) * [0.7, 0.7, 0.75] + 6).clip(0, 255).astype(np.uint8)
+    return replace(stored, rgb=rgb)
+
+
+@pytest.mark.slow
+def test_different_exposures_are_recovered(world, tmp_path):
+    """The ratio of both cameras' maps comes near the injected one, and the fit explains the pictures better."""
+    state, config = begin(world, darker_left, exposure="camera", iterations=240)
+    optimised(state, config, tmp_path / "learnt")
+    grey = torch.full((3, 1, 1), 0.5)
+    front, left = (
+        state.appearance.colored(grey, f"{name}/0", "recorded").detach().flatten() for name in ("front", "left")
+    )
+    injected = torch.tensor([0.7, 0.7, 0.75]) * 0.5 + 6 / 255
+    assert ((left - front) / (injected - 0.5) > 0.4).all()
+
+
+def test_boxes_of_objects_in_a_view(world):
+    state, _ = begin(world)
+    view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
+    inside = boxes_in_view(state.model, view)
+    moving = truth(view).semantics == 13
+    uv, _ = geometry.project(view, state.model.nodes[1].pose_matrix(0.3)[None, :3, 3])
+    assert inside[0, int(uv[0, 1]), int(uv[0, 0])]
+    assert (inside[0] & moving).sum() > 20
+    assert inside.float().mean() < 0.3
+    away = replace(view, world_from_cam=view.world_from_cam @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    assert not boxes_in_view(state.model, away).any()
+    only = objects_only(compose(state.model, 0.3))
+    assert len(only.means) == int((state.model.table.labels["node"] > 0).sum())
+
+
+def test_output_shows_no_correction(world):
+    state, _ = begin(world, exposure="image", learn_cameras=True)
+    view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
+    before = fit.render_view(state.model, view, RasterConfig()).rgb
+    with torch.no_grad():
+        for table in state.appearance.tables.values():
+            for column in table.columns.values():
+                column.normal_(generator=torch.Generator().manual_seed(0))
+    assert torch.equal(fit.render_view(state.model, view, RasterConfig()).rgb, before)

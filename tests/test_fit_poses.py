@@ -1,0 +1,122 @@
+"""Gauss-Newton rounds on boxes: every part against a known answer, and a disturbed track found again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
+
+from mudg.base import geometry, store
+from mudg.base.config import to_dict
+from mudg.core.raster import RasterConfig
+from mudg.data.scenefile import read_scene
+from mudg.models.nodes import compose
+from mudg.stages import fit, fit_poses, fit_views
+from mudg.stages.bench_poses import pose_errors
+from mudg.stages.config import FitConfig
+from mudg.stages.fit_objects import outline_mask
+
+SIZE, FRAMES = (96, 64), 6
+RASTER = RasterConfig(near_m=0.2)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory) -> fit.FitState:
+    """A toy street fitted with exact boxes."""
+    root = tmp_path_factory.mktemp("world")
+    scene = read_scene(write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1]).root)
+    config = FitConfig(
+        method="street_gaussians", iterations=60, initial_gaussians=1500, densify=False, semantic_every=999
+    )
+    frames = fit_views.training_frames(scene, ())
+    classes = fit_views.classes_of(scene, frames, None)
+    recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
+    state = fit.start_state(
+        config, fit.RECIPES[config.method], scene, fused_cloud(FRAMES), fit_views.ViewSet(recorded, ()), classes
+    )
+    fit.optimise(state, config, store.RunDir.open(root / "fit", "fit", to_dict(config), {}, 1, False))
+    return state
+
+
+@pytest.fixture
+def node(fitted):
+    """Its car, with offsets of zero before and after."""
+    car = fitted.model.nodes[1]
+    car.learn_pose = True
+    yield car
+    car.learn_pose = False
+    car.add_offsets(-car.offsets["shift"].detach().double().numpy(), -car.offsets["yaw"].detach().double().numpy())
+
+
+def test_a_displaced_picture_is_that_of_moved_offsets(fitted, node):
+    view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
+    here = compose(fitted.model, 0.3, semantics=False)
+    rows = {1: (here.node == 1).nonzero()[:, 0]}
+    for axis, step in enumerate(fit_poses.STEPS):
+        moved = fit_poses._displaced(here, rows, {1: node.pose_matrix(0.3)}, axis, step)
+        change = np.zeros((FRAMES, 4))
+        change[1, axis] = step  # the key at 0.3 s
+        node.add_offsets(change[:, :3], change[:, 3])
+        expected = compose(fitted.model, 0.3, semantics=False)
+        node.add_offsets(-change[:, :3], -change[:, 3])
+        assert torch.allclose(moved.means, expected.means, atol=2e-5)
+        same, other = (torch.nn.functional.normalize(g.quats, dim=1) for g in (moved, expected))
+        assert ((same * other).sum(1).abs() > 1 - 1e-5).all()
+    mask = outline_mask(view, node.pose_matrix(0.3), node.size_m)
+    assert (mask & (truth(view).semantics.numpy() == 13)).sum() > 30
+
+
+def test_normal_equations_solve_a_linear_problem_and_bound_outliers():
+    g = torch.Generator().manual_seed(0)
+    jacobian = torch.randn(400, 4, generator=g, dtype=torch.float64)
+    answer = torch.tensor([0.02, -0.01, 0.03, 0.005], dtype=torch.float64)
+    missing = jacobian @ answer
+    assert np.abs(np.linalg.solve(*fit_poses._normal_equations(jacobian, missing)) - answer.numpy()).max() < 1e-9
+    missing[:40] += 5.0
+    assert np.abs(np.linalg.solve(*fit_poses._normal_equations(jacobian, missing)) - answer.numpy()).max() < 0.02
+
+
+def test_without_evidence_a_clean_track_stays_and_wrong_offsets_go_back(node):
+    nothing = fit_poses.Evidence.none(FRAMES)
+    assert np.abs(fit_poses._move(node, nothing)).max() < 0.02
+    node.add_offsets(np.tile([0.1, 0.05, 0.0], (FRAMES, 1)), np.full(FRAMES, 0.02))
+    fit_poses._move(node, nothing)
+    assert np.abs(node.corrected_keys()[:, :3, 3] - node.world_from_object[:, :3, 3]).max() < 0.02
+
+
+def test_evidence_between_two_keys_is_shared(node):
+    evidence = fit_poses.Evidence.none(FRAMES)
+    fit_poses._credit(node, 0.375, np.eye(4), np.ones(4), evidence)
+    assert evidence.matrix[1, 0, 0] == pytest.approx(0.75**2)
+    assert evidence.matrix[2, 0, 0] == pytest.approx(0.25**2)
+    assert evidence.vector[:, 0] == pytest.approx([0, 0.75, 0.25, 0, 0, 0])
+    fit_poses._credit(node, 99.0, np.eye(4), np.ones(4), evidence)
+    assert evidence.views == 1
+
+
+def test_a_drifted_track_is_found_again(fitted, node):
+    """Boxes pushed off a known scene come back from the pictures alone."""
+    keys = np.arange(FRAMES)
+    drift = np.stack([0.15 * np.sin(keys), 0.12 * np.cos(keys), 0.05 * np.sin(keys), 0.04 * np.cos(keys)], 1)
+    node.add_offsets(drift[:, :3], drift[:, 3])
+    exact = np.stack([car_pose(0.3 * n) for n in keys])
+    train = [n for n in keys if n != 3]  # frame 3 is held out
+    before = pose_errors(exact[train], node.corrected_keys()[train])
+    for _ in range(3):
+        fit_poses.refine_poses(fitted.model, fitted.views.recorded, RASTER)
+    after = pose_errors(exact[train], node.corrected_keys()[train])
+    assert after.position_m < 0.5 * before.position_m
+    assert after.yaw_rad < 0.6 * before.yaw_rad
+    assert geometry.all_rigid(node.corrected_keys())
+
+
+def test_poses_that_are_not_learnt_stay(fitted):
+    assert fit_poses.refine_poses(fitted.model, fitted.views.recorded, RASTER) == 0.0
+
+
+def test_rounds_are_spread_over_the_run():
+    config = FitConfig(method="street_gaussians", iterations=200, learn_poses=True, pose_rounds=4, pose_start=0.25)
+    assert [step for step in range(1, 201) if fit.pose_round_due(config, step)] == [50, 90, 130, 170]
+    off = FitConfig(method="street_gaussians", iterations=200, pose_rounds=4)
+    assert not any(fit.pose_round_due(off, step) for step in range(1, 201))

@@ -1,0 +1,234 @@
+"""Every option of the scene's nodes and appearance at once: resume to the bit, odd scenes, poisoned inputs."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
+
+from mudg.base.errors import InputError, NumericsError
+from mudg.base.types import FusedCloud, PointCloud, Scene, Track
+from mudg.core import trajectory
+from mudg.core.raster import RasterConfig
+from mudg.data.cloudfile import write_fused
+from mudg.data.observations import ObservationWriter
+from mudg.data.scenefile import SceneWriter, read_scene
+from mudg.models.densify import DensifySettings, DensifyStats, densify
+from mudg.models.nodes import DeformableNode, compose
+from mudg.stages import fit, fit_start, fit_views
+from mudg.stages.config import FitConfig
+from mudg.stages.fit_start import mirrored_points
+from mudg.stages.ingest import add_frame_copy, add_rest
+
+SIZE, FRAMES = (60, 40), 6
+EVERYTHING = {
+    "learn_poses": True, "deformable": True, "color_terms": 4, "mirror_start": True, "mirror_probability": 0.3, "exposure": "image",
+    "learn_cameras": True, "virtual_appearance": True, "outlier_deviations": 4.0, "object_weight": 0.1, "pose_start": 0.3,
+}  # fmt: skip
+
+
+def walker_track(times) -> Track:
+    keys = np.stack([car_pose(float(t)) for t in times])
+    keys[:, 1, 3] += 3.0
+    keys[:, 2, 3] = 0.9
+    return Track("walker", "pedestrian", [0.8, 0.6, 1.8], np.asarray(times, float), keys)
+
+
+def walker_cloud() -> PointCloud:
+    xyz = (np.random.Generator(np.random.PCG64(0)).uniform(-0.5, 0.5, (200, 3)) * [0.7, 0.5, 1.7]).astype(np.float32)
+    return PointCloud(xyz, np.full((200, 3), 90, np.uint8), "object", np.full(200, 11, np.uint8))
+
+
+def with_tracks(scene: Scene, tracks: tuple[Track, ...], out: Path) -> Scene:
+    with SceneWriter(out, scene.id, scene.source) as writer:
+        add_rest(writer, replace(scene, tracks=tracks))
+        for frame in scene.frames:
+            add_frame_copy(writer, scene, frame)
+        return writer.finish()
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> dict[str, Path]:
+    """A scene with a car and a walker, its fused cloud, perfect virtual views 2 m to the left."""
+    root = tmp_path_factory.mktemp("world")
+    plain = write_scene(root / "plain", frames=FRAMES, width=SIZE[0], height=SIZE[1])
+    scene = with_tracks(plain, (*plain.tracks, walker_track(plain.tracks[0].times_s)), root / "scene")
+    cloud = fused_cloud(FRAMES)
+    write_fused(root / "fuse", FusedCloud(cloud.static, {**cloud.objects, "walker": walker_cloud()}), {})
+    path = trajectory.shifted(scene, "front", 2.0)
+    with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
+        for view in path.views:
+            writer.add(truth(view.resized(30, 20)))
+    return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+
+
+def settings(method: str = "mudg_s", **changes) -> FitConfig:
+    small = {"iterations": 30, "initial_gaussians": 700, "max_gaussians": 1200, "checkpoint_every": 1000, "preview_every": 1000,
+             "virtual_probability": 0.4}  # fmt: skip
+    return FitConfig(method=method, **{**small, **EVERYTHING, **changes})
+
+
+def fitted_bytes(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.safetensors")) + [folder / "model.json"]}
+
+
+def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, tmp_path, monkeypatch):
+    config = settings()
+    arguments = (config, world["scene"], world["fuse"])
+    whole = fit.run(*arguments, tmp_path / "whole", observations=world["virtual"])
+    adam_step = fit.adam_step
+
+    def ctrl_c(model, step, *rest):
+        adam_step(model, step, *rest)
+        if step == 17:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(fit, "adam_step", ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
+    monkeypatch.setattr(fit, "adam_step", adam_step)
+    parts = fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
+    assert fitted_bytes(parts) == fitted_bytes(whole)
+    assert set(fitted_bytes(whole)) == {
+        "gaussians.safetensors",
+        "nodes.safetensors",
+        "appearance.safetensors",
+        "model.json",
+    }
+
+    model = fit.load_model(whole)
+    walker = next(node for node in model.nodes if node.name == "walker")
+    assert isinstance(walker, DeformableNode)
+    assert walker.offsets["deform"].detach().abs().max().item() > 0
+    assert model.table.partial["sh_time"].detach().abs().max().item() > 0
+    assert model.nodes[1].offsets["shift"].detach().abs().max().item() > 0
+
+
+def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
+    folder = fit.run(
+        settings(iterations=6), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"]
+    )
+    model = fit.load_model(folder)
+    fit.save_model(model, tmp_path)
+    again = fit.load_model(tmp_path)
+    view = view_at(0.45, camera(width=SIZE[0], height=SIZE[1]))
+    for mine, theirs in ((fit.render_view(m, view, RasterConfig()) for m in (model, again)),):
+        assert torch.equal(mine.rgb, theirs.rgb)
+
+
+def test_cloned_and_split_rows_of_objects_stay_aligned(world, tmp_path):
+    """After a densification every partial column still fits, and composing works at every time."""
+    folder = fit.run(
+        settings(iterations=4), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"]
+    )
+    model = fit.load_model(folder)
+    rows = len(model.table)
+    stats = DensifyStats(torch.rand(rows, generator=torch.Generator().manual_seed(0)), torch.ones(rows))
+    densify(model, stats, 10, DensifySettings(1, 10, 1, 0.5, 0.5, 0.05), 0)
+    assert len(model.table) != rows
+    assert len(model.table.partial["sh_time"]) == int((model.table.labels["node"] > 0).sum())
+    assert compose(model, 0.6).sh.shape == (len(model.table), 1, 3)
+
+
+# ---- odd scenes -------------------------------------------------------------------------------------------------------
+
+
+def test_everything_on_without_tracks_and_with_one_frame(tmp_path):
+    write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
+    write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(1, semantics=False).static, {}), {})
+    folder = fit.run(
+        settings("street_gaussians", iterations=4), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit"
+    )
+    assert torch.isfinite(
+        fit.render_view(fit.load_model(folder), view_at(0.0, camera(width=48, height=32)), RasterConfig()).rgb
+    ).all()
+
+
+@pytest.mark.parametrize("label", ["car", "pedestrian"])
+def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
+    """It exists at that moment only, deforms or not, and nothing divides by its span of zero."""
+    plain = read_scene(world["scene"])
+    once = Track("car", label, CAR_SIZE, np.array([0.3]), car_pose(0.3)[None])
+    with_tracks(plain, (once,), tmp_path / "scene")
+    points = fused_cloud(2).objects["car"]
+    few = PointCloud(points.xyz[:3], points.rgb[:3], "object", None)
+    write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(2).static, {"car": few}), {})
+    folder = fit.run(
+        settings("street_gaussians", iterations=8), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit"
+    )
+    model = fit.load_model(folder)
+    moving = model.table.labels["node"] > 0
+    assert (compose(model, 0.3).opacity[moving] > 0).any()
+    assert not (compose(model, 0.6).opacity[moving] > 0).any()
+    assert all(torch.isfinite(value).all() for value in model.table.columns.values())
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_no_sky_at_all_and_nothing_but_sky(world, share):
+    scene = read_scene(world["scene"])
+    frames = fit_views.training_frames(scene, ())
+    classes = fit_views.classes_of(scene, frames, None)
+    views = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
+    views = tuple(replace(view, sky=np.full(view.rgb.shape[:2], share > 0)) for view in views)
+    config = settings("street_gaussians", iterations=4)
+    cloud = fused_cloud(FRAMES)
+    state = fit.start_state(config, fit.RECIPES[config.method], scene, cloud, fit_views.ViewSet(views, ()), classes)
+    assert torch.isfinite(state.model.sky.table["panorama"]).all()
+    seen = fit.render_view(state.model, views[0].view, RasterConfig())
+    assert torch.isfinite(seen.rgb).all()
+
+
+def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
+    sample = fit_views.StoredView.sample
+
+    def poisoned(self, unseen=None):
+        made = sample(self, unseen)
+        if made.name == "front/000002":
+            made.observation.rgb[0, 3, 4] = float("nan")
+        return made
+
+    monkeypatch.setattr(fit_views.StoredView, "sample", poisoned)
+    with pytest.raises(NumericsError, match=r"view front/000002, step \d"):
+        fit.run(settings("street_gaussians"), world["scene"], world["fuse"], tmp_path / "fit")
+
+
+def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):
+    seen = truth(view_at(0.0, camera(width=12, height=8)))
+    seen.rgb[1, 2, 3] = float("nan")
+    with (
+        pytest.raises(InputError, match=r"not finite[\s\S]*000000"),
+        ObservationWriter(tmp_path / "v", "v", "test") as writer,
+    ):
+        writer.add(seen)
+
+
+# ---- starting points ---------------------------------------------------------------------------------------------------
+
+
+def test_mirrored_points_appear_where_nothing_was_measured():
+    side = np.array([[x, 0.9, z] for x in (-1.0, 0.0, 1.0) for z in (0.0, 0.5)], np.float32)
+    roof = np.array([[0.0, 0.05, 0.7]], np.float32)
+    other, source = mirrored_points(np.concatenate([side, roof]))
+    assert source.tolist() == list(range(6))
+    assert np.allclose(other, side * [1, -1, 1])
+    assert len(mirrored_points(np.concatenate([side, other]))[0]) == 0
+    assert len(mirrored_points(side[:0])[0]) == 0
+
+
+def test_lonely_points_are_found_and_regular_ones_kept():
+    grid = (
+        np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0], indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+        * 0.2
+    )
+    jitter = np.random.Generator(np.random.PCG64(0)).normal(0, 0.02, grid.shape).astype(np.float32)
+    far = np.array([[3.0, 3.0, 6.0]], np.float32)
+    found = fit_start._lonely(np.concatenate([grid + jitter, far]), np.array([[3.0, 3.0, 1.5]], np.float32), 6.0)
+    assert found[-1]
+    assert found[:-1].mean() < 0.03
+    assert not fit_start._lonely(grid[:4], grid[:1], 3.0).any()
