@@ -2,9 +2,11 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
@@ -82,11 +84,13 @@ def test_a_malformed_variant_is_refused(text):
 
 def test_ablation_brings_the_rows_it_is_compared_with():
     rows = {r.name: r.fit for r in bench_shift.rows_of(BenchConfig(methods=("mudg_r",), ablation=True))}
-    assert list(rows) == ["street_gaussians", "mudg_r", "mudg_s", "only_I", "only_I_D", "only_I_S"]
+    assert list(rows) == ["street_gaussians", "mudg_r", "mudg_s", "only_I", "only_I_D", "only_I_S", "exact"]
     full = rows["mudg_s"]
-    assert rows["only_I"] == dataclasses.replace(full, virtual_depth_weight=0, virtual_semantic_weight=0)
+    no_depth = {"virtual_depth_weight": 0, "virtual_lidar_weight": 0}
+    assert rows["only_I"] == dataclasses.replace(full, **no_depth, virtual_semantic_weight=0)
     assert rows["only_I_D"] == dataclasses.replace(full, virtual_semantic_weight=0)
-    assert rows["only_I_S"] == dataclasses.replace(full, virtual_depth_weight=0)
+    assert rows["only_I_S"] == dataclasses.replace(full, **no_depth)
+    assert rows["exact"] == full
 
 
 def test_unknown_methods_and_repeated_names_are_refused():
@@ -172,6 +176,18 @@ def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("shift")
     config = BenchConfig(logs=1, iterations=30, processes=1, methods=("nearest_fill", "street_gaussians"))
     return bench_shift.run(config, out, rules=TINY, distances_m=(3.0,)), config
+
+
+def test_exact_views_are_the_truth_beside_the_path_and_nothing_of_the_path(made, tmp_path):
+    truth = made[0] / str(city_logs.DEVELOPMENT[0]) / "truth"
+    names = sorted(path.name for path in truth.iterdir() if path.is_dir())
+    paths = [SimpleNamespace(name=name, origin="shifted" if "shift" in name else "recorded") for name in names]
+    out = bench_shift.write_exact(truth, paths, tmp_path / "exact")
+    sets = list_observation_sets(out)
+    assert sorted(sets) == [name for name in names if "shift" in name] != names
+    seen, true = (read_observations(folder / "front_shift+3.0")[1] for folder in (out, truth))
+    assert seen.kind == "virtual"
+    assert torch.equal(seen.rgb, true.rgb) and torch.equal(seen.semantics, true.semantics)
 
 
 def test_the_command_compares_methods_and_reuses_what_is_there(made):

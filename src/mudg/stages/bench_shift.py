@@ -31,7 +31,7 @@ from mudg.base.types import Trajectory
 from mudg.data import city_logs
 from mudg.data.city_logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationWriter
+from mudg.data.observations import ObservationWriter, read_observations
 from mudg.data.scenefile import read_scene
 from mudg.models import mdm
 from mudg.stages import bench_shift_page, bench_shift_tables, fit, fuse, ingest, render, score, score_truth, synthesize
@@ -52,12 +52,17 @@ PERCEPTUAL_VIEWS: Final = 12
 WITHOUT, WITH, DIFFUSION, FILL = "street_gaussians", "mudg_s", "mudg_r", score.BASELINE
 GENERATED: Final = (FILL, DIFFUSION)
 """Methods without a fit."""
+_NO_DEPTH: Final = {"virtual_depth_weight": 0.0, "virtual_lidar_weight": 0.0}
+_NO_CLASSES: Final = {"virtual_semantic_weight": 0.0}
 ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
-    "only_I": ("virtual colour", {"virtual_depth_weight": 0.0, "virtual_semantic_weight": 0.0}),
-    "only_I_D": ("virtual colour and depth", {"virtual_semantic_weight": 0.0}),
-    "only_I_S": ("virtual colour and classes", {"virtual_depth_weight": 0.0}),
+    "only_I": ("virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
+    "only_I_D": ("virtual colour and depth", _NO_CLASSES),
+    "only_I_S": ("virtual colour and classes", _NO_DEPTH),
+    "exact": ("the truth in place of generated views", {}),
 }
-"""Rows between street_gaussians (no virtual views) and mudg_s (all terms), as in table 3 of the paper."""
+"""Rows beside street_gaussians (no virtual views) and mudg_s (all terms): three as in table 3 of the paper, and the most that
+virtual views can bring at this number of steps."""
+EXACT: Final = "exact"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 _VERSION = 1
 
@@ -295,6 +300,8 @@ def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajec
     if settings is None:
         raise UsageError("a method without views", got=row.name)
     model, views = job.out / "fit" / row.name, job.out / "render" / row.name
+    if row.name == EXACT:
+        painted = _made(job, lambda o: write_exact(job.out / "truth", paths, job.out / EXACT, overwrite=o))
     _made(job, lambda o: fit.run(settings, scene, fused, model, observations=painted, overwrite=o))
     return _made(job, lambda o: render.run(drawn, scene, model, views, overwrite=o))
 
@@ -323,6 +330,22 @@ def write_fill(scene: Path, fused: Path, paths: Sequence[Trajectory], out: Path,
                     writer.skip(view) if index < writer.done else writer.add(fill(view))
                     bar.advance()
     folder.finish({"trajectories": [path.name for path in paths]})
+    return out
+
+
+def write_exact(truth: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
+    """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
+    shifted = [path.name for path in paths if path.origin == "shifted"]
+    folder = store.RunDir.open(out, EXACT, {"trajectories": shifted}, {"truth": store.digest(truth)}, _VERSION, overwrite)
+    if folder.complete:
+        return folder.reused()
+    for name in shifted:
+        views = read_observations(truth / name)
+        with ObservationWriter(out / name, name, EXACT) as writer:
+            for index in range(len(views)):
+                seen = views[index]
+                writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
+    folder.finish({"trajectories": shifted})
     return out
 
 

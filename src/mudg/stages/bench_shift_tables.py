@@ -57,6 +57,7 @@ COMPARISONS: Final[tuple[Comparison, ...]] = (
 )  # fmt: skip
 ABLATION_ROWS: Final = (
     ("street_gaussians", "none"), ("only_I", "+ I"), ("only_I_D", "+ I + D"), ("only_I_S", "+ I + S"), ("mudg_s", "+ I + D + S"),
+    ("exact", "exact views"),
 )  # fmt: skip
 
 
