@@ -189,7 +189,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     assert f'src="{log}/film/front_shift+3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
     again = bench_shift.run(
-        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify:false",)), out,
+        dataclasses.replace(config, methods=("street_gaussians",), variant=("still=densify:false",)), out,
         rules=TINY, distances_m=(3.0,),
     )  # fmt: skip
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
