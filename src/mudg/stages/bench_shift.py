@@ -269,7 +269,8 @@ def make_log(job: LogJob) -> dict[str, Any]:
             "truth": truth,
             **{row.name: views[row.name] for row in job.rows if row.name in bench_shift_page.SHOWN},
         }
-        _made(job, lambda o: bench_shift_page.film(shown, paths, out / "film", overwrite=o))
+        # With another method the old films are out of date, whatever was asked.
+        _made(replace(job, overwrite=True), lambda o: bench_shift_page.film(shown, paths, out / "film", overwrite=o))
         films = [path.name for path in paths]
     facts = city_logs.facts(job.seed, job.rules)
     return {
