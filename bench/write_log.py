@@ -16,13 +16,13 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-import roundtrip  # noqa: E402
-from write_kitti360 import write_kitti360  # noqa: E402
-from write_nuplan import write_nuplan  # noqa: E402
-from write_pandaset import write_pandaset  # noqa: E402
+import roundtrip
+from write_kitti360 import write_kitti360
+from write_nuplan import write_nuplan
+from write_pandaset import write_pandaset
 
-from mudg.base import log  # noqa: E402
-from mudg.data.city import write_city  # noqa: E402
+from mudg.base import log
+from mudg.data.city import write_city
 
 DISTORTION = (-0.356, 0.171, -0.0003, -0.0002, -0.05)
 PANDASET = {"front_camera": "front", "front_left_camera": "front_left", "front_right_camera": "front",
