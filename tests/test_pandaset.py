@@ -327,6 +327,23 @@ def test_incomplete_frames_can_be_skipped(source: Path, tmp_path: Path) -> None:
     assert scene.frames_of("front")[3].view.time_s == pytest.approx(0.4)
 
 
+def test_clouds_and_tables_without_rows_are_empty_not_errors(source: Path, tmp_path: Path) -> None:
+    none = np.zeros(0)
+    write_frame(source / "lidar" / "02.pkl.gz", dict.fromkeys("xyzitd", none))
+    columns = [
+        "uuid",
+        "label",
+        "yaw",
+        "stationary",
+        *(f"{kind}.{axis}" for kind in ("position", "dimensions") for axis in "xyz"),
+    ]
+    write_frame(source / "annotations" / "cuboids" / "02.pkl.gz", dict.fromkeys(columns, none), new=True)
+    scene = ingest(source, tmp_path / "out")
+    assert len(read_points(scene, next(s for s in scene.sweeps if s.id == "pandar64/000002")).xyz) == 0
+    assert sum(sweep.sensor == "pandar_gt" for sweep in scene.sweeps) == 4
+    assert scene.tracks
+
+
 def test_a_log_without_boxes_or_front_camera_is_still_one(source: Path, tmp_path: Path) -> None:
     shutil.rmtree(source / "annotations")
     shutil.rmtree(source / "camera" / "front_camera")
