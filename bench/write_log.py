@@ -14,6 +14,8 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import roundtrip
@@ -22,6 +24,7 @@ from write_nuplan import write_nuplan
 from write_pandaset import write_pandaset
 
 from mudg.base import log
+from mudg.base.types import Track
 from mudg.data.city import write_city
 
 DISTORTION = (-0.356, 0.171, -0.0003, -0.0002, -0.05)
@@ -44,8 +47,13 @@ def main() -> None:
         config = replace(config, width=1408, height=376, lidar_azimuth_step_deg=0.18)
     with tempfile.TemporaryDirectory() as folder:
         truth = write_city(config, Path(folder) / "city")
-        times = [sweep.time_s for sweep in truth.sweeps]
-        tracks = tuple(t for t in truth.tracks if all(t.pose_at(time) is not None for time in times))
+        times = np.array([sweep.time_s for sweep in truth.sweeps])
+        keys = {track: [track.pose_at(float(time)) for time in times] for track in truth.tracks}
+        tracks = tuple(
+            Track(track.id, track.label, track.size_m, times, np.stack(poses))
+            for track, poses in keys.items()
+            if all(pose is not None for pose in poses)
+        )
         truth = replace(truth, tracks=tracks)
         if asked.format == "kitti360":
             write_kitti360(truth, asked.folder)

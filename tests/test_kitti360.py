@@ -88,7 +88,7 @@ def test_poses_between_are_interpolated_and_outside_are_left_out(truth: Scene, s
     path.write_text("\n".join(rows[1:4]) + "\n")
     inner = ingest(source, tmp_path / "inner")
     assert len(inner.sweeps) == 3
-    assert any("without a pose were left out: 1, 5" in note for note in inner.source.notes)
+    assert any("without a pose or time stamp were left out: 1, 5" in note for note in inner.source.notes)
 
 
 def test_a_gap_in_which_the_vehicle_moved_is_not_filled(source: Path, tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_a_gap_in_which_the_vehicle_moved_is_not_filled(source: Path, tmp_path: 
     path.write_text("\n".join(made.numbers(row).replace(".0 ", " ", 1) for row in (rows[0], rows[1], rows[3], rows[4])))
     scene = ingest(source, tmp_path / "out", boxes=None)
     assert len(scene.sweeps) == 4
-    assert any("without a pose were left out: 3" in note for note in scene.source.notes)
+    assert any("without a pose or time stamp were left out: 3" in note for note in scene.source.notes)
 
 
 def test_rectified_camera_poses_serve_where_vehicle_poses_are_missing(
@@ -117,6 +117,23 @@ def test_rectified_camera_poses_serve_where_vehicle_poses_are_missing(
     one, other = ingest(source, tmp_path / "one"), ingest(pristine, tmp_path / "other")
     for a, b in zip(one.frames, other.frames, strict=True):
         assert np.abs(a.view.world_from_cam - b.view.world_from_cam).max() < 1e-9
+
+
+def test_time_stamps_of_recorded_scans_only_and_empty_lines(source: Path, pristine: Path, tmp_path: Path) -> None:
+    """A drive whose first scans are missing has a line per scan; an empty line is a frame without a time."""
+    whole = ingest(pristine, tmp_path / "whole", frames=(3, 6))
+    folder = parts(source)["scans"]
+    for number in (1, 2):
+        (folder / "data" / f"{number:010d}.bin").unlink()
+    lines = (folder / "timestamps.txt").read_text().splitlines()
+    (folder / "timestamps.txt").write_text("\n".join(lines[3:6]) + "\n")
+    part = ingest(source, tmp_path / "part", frames=(3, 6))
+    for a, b in zip(whole.sweeps, part.sweeps, strict=True):
+        assert a.time_s == b.time_s
+        assert np.abs(a.world_from_lidar - b.world_from_lidar).max() < 1e-9
+    (folder / "timestamps.txt").write_text("\n".join([*lines[:4], "", *lines[5:]]) + "\n")
+    holed = ingest(source, tmp_path / "holed", frames=(3, 6))
+    assert [sweep.time_s for sweep in holed.sweeps] == pytest.approx([0.0, 0.2])
 
 
 def test_scans_are_untwisted_clockwise(truth: Scene, source: Path, tmp_path: Path) -> None:
@@ -413,7 +430,9 @@ def test_spoilt_logs_are_refused_in_words(
 
 def test_missing_frames_can_be_skipped_and_choices_are_checked(source: Path, tmp_path: Path) -> None:
     (source / IMAGE).unlink()
-    assert len(ingest(source, tmp_path / "out", skip_missing=True).sweeps) == 4
+    (source / SCAN).write_bytes(b"")
+    scene = ingest(source, tmp_path / "out", skip_missing=True, untwist="auto")
+    assert [len(read_points(scene, sweep).xyz) > 0 for sweep in scene.sweeps] == [True, False, True, True]
     with pytest.raises(UsageError, match="no such camera") as caught:
         ingest(source, tmp_path / "no", cameras=("side_left",))
     assert "front (image_00)" in caught.value.expected

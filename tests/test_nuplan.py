@@ -21,7 +21,7 @@ from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS
 from mudg.data.importers.nuplan_log import open_log
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_image
+from mudg.data.scenefile import read_image, read_points
 
 pytestmark = roundtrip.needs_native
 
@@ -280,6 +280,13 @@ def test_cameras_may_fire_one_after_another(source: Path, tmp_path: Path) -> Non
         assert caught.value.got == f"no {channel}; 1 such moments"
         assert len(ingest(source, tmp_path / f"skip {channel}", skip_missing=True).frames) == 8
         shutil.copy(tmp_path / "whole.db", log(source))
+
+
+def test_a_cloud_without_points_is_a_cloud(source: Path, tmp_path: Path) -> None:
+    blob("MergedPointCloud", 0)(source).write_bytes(made.pcd(np.zeros((0, 3)), np.zeros(0)))
+    scene = ingest(source, tmp_path / "out")
+    assert sorted(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps)[0] == 0
+    assert len(scene.sweeps) == 5
 
 
 def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:

@@ -67,11 +67,11 @@ def write_pandaset(
     return folder
 
 
-def cuboids(truth: Scene, time_s: float) -> dict[str, object]:
-    """One table of boxes: yaw counts from the y axis, x is the width."""
+def cuboids(truth: Scene, time_s: float, places: Mapping[str, np.ndarray] | None = None) -> dict[str, object]:
+    """One table of boxes: yaw counts from the y axis, x is the width. ``places``: poses of some boxes, by their tracks."""
     rows = []
     for track in truth.tracks:
-        pose = track.pose_at(time_s)
+        pose = (places or {}).get(track.id, track.pose_at(time_s))
         assert pose is not None
         rows.append((track, SOURCE_FROM_WORLD @ pose))
     size = np.array([track.size_m for track, _ in rows])

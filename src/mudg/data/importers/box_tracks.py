@@ -20,7 +20,8 @@ MAX_GAP_S: Final = 0.55
 """A moving object that is not seen for longer than this is split: interpolating across would invent its path."""
 MAX_SIDE_M: Final = 100.0
 _LONGER_THAN_WIDE: Final = frozenset(("car", "van", "truck", "bus", "trailer", "vehicle", "caravan", "tram", "train"))
-_ROW: Final = 16  # time, size, pose
+_ROW: Final = 17  # time, delay, size, pose
+_MIN_STEP_S: Final = 0.05
 
 
 @dataclass(slots=True)
@@ -31,7 +32,7 @@ class _Member:
 
 
 class BoxTracks:
-    """Collects boxes in any order, 128 bytes each; ``tracks`` puts them together.
+    """Collects boxes in any order, 136 bytes each; ``tracks`` puts them together.
 
     Args:
         where: the file or folder the boxes come from, for messages.
@@ -55,6 +56,7 @@ class BoxTracks:
         size_m: tuple[float, float, float],
         world_from_box: Matrix,
         standing: bool = False,
+        late_s: float = 0.0,
     ) -> None:
         """Add one box.
 
@@ -65,6 +67,8 @@ class BoxTracks:
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
             standing: the data set says that the object does not move in the whole log.
+            late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The track's key
+                stands at ``time_s``, moved there with the object's velocity.
 
         Raises:
             InputError: the size is not positive or absurd.
@@ -80,7 +84,7 @@ class BoxTracks:
         if member is None:
             member = self._members[track] = _Member(self._word(label))
         member.standing = standing
-        member.rows.extend((time_s, *size_m, *world_from_box[:3].ravel().tolist()))
+        member.rows.extend((time_s, late_s, *size_m, *world_from_box[:3].ravel().tolist()))
 
     def _word(self, label: str) -> str:
         if label not in self._words:
@@ -110,15 +114,17 @@ class BoxTracks:
                     got=f"time {at:.3f} s of the log",
                     remedy="are two logs mixed?",
                 )
-            size = np.median(rows[:, 1:4], axis=0)
+            size = np.median(rows[:, 2:5], axis=0)
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
-            poses[:, :3] = rows[:, 4:].reshape(-1, 3, 4)
+            poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
             if member.standing:
                 ends = times[[0, -1]] if len(times) > 1 else times
                 tracks.append(Track(name, member.label, size, ends, np.stack([_mean_pose(poses)] * len(ends))))
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > MAX_GAP_S) + 1)
             split += len(pieces) > 1
+            for piece in pieces:
+                poses[piece, :3, 3] -= _velocity(times[piece] + rows[piece, 1], poses[piece, :3, 3]) * rows[piece, 1:2]
             tracks += [
                 Track(f"{name}.{part}" if part else name, member.label, size, times[piece], poses[piece])
                 for part, piece in enumerate(pieces)
@@ -141,6 +147,18 @@ class BoxTracks:
             some = ", ".join(f"{label!r} ({count})" for label, count in sorted(self._unknown.items())[:8])
             notes.append(f"classes that are not known here keep their names: {some}")
         return notes
+
+
+def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:
+    """Velocity at each measurement, f64[n, 3]: from the neighbours on both sides, or from the one there is."""
+    if len(places) < 2:
+        return np.zeros_like(places)
+    before, after = np.maximum(np.arange(len(places)) - 1, 0), np.minimum(np.arange(len(places)) + 1, len(places) - 1)
+    span = measured_s[after] - measured_s[before]
+    velocity = (places[after] - places[before]) / np.maximum(span, _MIN_STEP_S)[:, None]
+    short = span < _MIN_STEP_S  # two measurements at nearly one moment, at an end: go by the neighbour
+    velocity[short] = velocity[np.where(before == np.arange(len(places)), after, before)][short]
+    return velocity
 
 
 def _mean_pose(poses: Matrix) -> Matrix:

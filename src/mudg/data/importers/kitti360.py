@@ -114,7 +114,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     scans = numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
     streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
     notes: list[str] = []
-    clock = _clock(folders, max(max(found) for found in streams.values()), notes)
+    clock = _clock(folders, streams, notes)
     motion = _Motion.read(folders, calibration, clock, options, notes)
     placed = {name: [n for n in found if motion.known(clock[n])] for name, found in streams.items()}
     frames = whole_frames(placed, options, str(folders.root), "kitti360")
@@ -206,28 +206,43 @@ def _say_left_out(
         everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
     lost = sorted(everything - {n for found in placed.values() for n in found})
     if lost:
-        notes.append(f"frames without a pose were left out: {some_numbers(lost)}")
+        notes.append(f"frames without a pose or time stamp were left out: {some_numbers(lost)}")
 
 
 # --- time and motion ------------------------------------------------------------------------------------------------
 
 
-def _clock(folders: _Folders, last: int, notes: list[str]) -> NDArray[np.float64]:
-    """Seconds by frame number, f64[last + 1]: the velodyne's, else camera 0's, else 10 Hz."""
-    for path in (
-        folders.raw("velodyne_points") / "timestamps.txt",
-        folders.root / "data_2d_raw" / folders.drive / "image_00" / "timestamps.txt",
+def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: list[str]) -> NDArray[np.float64]:
+    """Seconds by frame number, NaN where there is no stamp: the velodyne's, else camera 0's, else 10 Hz."""
+    last = max(max(found) for found in streams.values())
+    for path, files in (
+        (folders.raw("velodyne_points") / "timestamps.txt", streams.get(SENSOR, {})),
+        (folders.root / "data_2d_raw" / folders.drive / "image_00" / "timestamps.txt", streams.get("image_00", {})),
     ):
         if path.is_file():
-            times = np.array(kitti_poses.read_timestamps(path))
-            if len(times) <= last:
-                raise InputError(
-                    "timestamps do not cover the frames", where=str(path), got=f"{len(times)} lines",
-                    expected=f"at least {last + 1} lines (line k = frame k)", remedy="is the file cut off?",
-                )  # fmt: skip
-            return times
+            return _stamps(path, files, last)
     notes.append("no timestamps in the source: 10 Hz assumed")
     return np.arange(last + 1) * FRAME_PERIOD_S
+
+
+def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:
+    """Seconds by number, f64[last + 1]. Line k is number k; a file with just one line per recorded file counts those instead.
+
+    Empty lines are numbers without a stamp (NaN).
+    """
+    given = [bool(line.strip()) for line in store.read_bytes(path).decode("utf-8", "replace").splitlines()]
+    times = np.full(max(len(given), last + 1), np.nan)
+    stamps = kitti_poses.read_timestamps(path)
+    if len(given) > last:
+        times[: len(given)][given] = stamps
+    elif len(stamps) == len(files) > 0:
+        times[list(files)] = stamps
+    else:
+        raise InputError(
+            "timestamps do not cover the frames", where=str(path), got=f"{len(given)} lines, {len(files)} files",
+            expected=f"at least {last + 1} lines (line k = frame k), or one per file", remedy="is the file cut off?",
+        )  # fmt: skip
+    return times
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,7 +280,7 @@ class _Motion:
                     remedy="is the file of another kind?",
                 )  # fmt: skip
             before = number
-            if number < len(clock):
+            if number < len(clock) and np.isfinite(clock[number]):
                 pose = rigid_pose(row[1:].reshape(-1, 4), where)
                 numbers.append(number)
                 poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
@@ -280,8 +295,10 @@ class _Motion:
         return cls(EgoPath(times, np.stack(poses) @ IMU_FROM_EGO))
 
     def known(self, time_s: float) -> bool:
-        """Whether there is a pose at a time, or it can be interpolated."""
+        """Whether there is a pose at a time, or it can be interpolated. NaN: no."""
         times = self.ego.times_s
+        if not np.isfinite(time_s):
+            return False
         after = int(np.searchsorted(times, time_s))
         if after < len(times) and times[after] - time_s < 1e-9:
             return True
@@ -339,8 +356,7 @@ class _Sick:
         if calibration.velo_from_sick is None or not stamps.is_file():
             notes.append("SICK lines were left out: calib_sick_to_velo.txt or their timestamps.txt is missing")
             return None
-        times = np.array(kitti_poses.read_timestamps(stamps)) - start_s
-        files = {n: path for n, path in files.items() if n < len(times)}
+        times = _stamps(stamps, files, max(files)) - start_s
         return cls(files, times, calibration.ego_from_velo @ calibration.velo_from_sick, motion)
 
     def sweep(self, time_s: float) -> tuple[Matrix, SweepPoints]:

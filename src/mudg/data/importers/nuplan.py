@@ -52,7 +52,7 @@ WORDS: Final = {
 }  # fmt: skip
 IMAGE_DELAY_US: Final = 16_667
 """From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it found this."""
-_MARGIN_US: Final = 500_000
+_MARGIN_US: Final = 100_000
 _REACH_US: Final = 60_000
 _PERIOD_US: Final = 100_000
 _SQLITE: Final = b"SQLite format 3\0"

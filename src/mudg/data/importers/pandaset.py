@@ -16,7 +16,8 @@ poses and the published static calibration.
 
 Boxes. ``yaw`` 0 looks along the world's y axis, and ``dimensions.y`` is the length. Moving objects where both LiDARs look
 carry two boxes that name each other as siblings; they are one track here, and in a frame with both the turning LiDAR's box is
-kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s apart: 1 m at 20 m/s).
+kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s apart: 1 m at 20 m/s);
+it is moved to the frame's time with its track's velocity.
 """
 
 from __future__ import annotations
@@ -70,7 +71,6 @@ FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
 """Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
 MAX_POINT_DELAY_S: Final = 0.25
 MAX_CAMERA_DELAY_S: Final = 1.0
-MIN_KEY_STEP_S: Final = 0.02
 _MIN_BOX_POINTS: Final = 5
 _POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
 _CUBOID_COLUMNS: Final = (
@@ -86,6 +86,7 @@ class _Cuboid:
     uuid: str
     label: str
     time_s: float
+    late_s: float
     size_m: tuple[float, float, float]
     world_from_box: Matrix
     standing: bool
@@ -416,7 +417,8 @@ def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], log_: _
             _Cuboid(
                 str(frame["uuid"][row]),
                 str(frame["label"][row]),
-                float(log_.ego.times_s[index]) + late_s,
+                float(log_.ego.times_s[index]),
+                late_s,
                 size,
                 log_.world_from_source @ box,
                 standing,
@@ -471,8 +473,7 @@ def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> lis
             if box.sibling and box.sensor in (0, 1):
                 turning, solid = (box.uuid, box.sibling) if box.sensor == 0 else (box.sibling, box.uuid)
                 one_of.setdefault(solid, turning)
-    doubled, close = 0, 0
-    last_s: dict[str, float] = {}
+    doubled = 0
     for index in sorted(boxes):
         kept: dict[str, _Cuboid] = {}
         for box in sorted(boxes[index], key=lambda b: b.sensor == 1):
@@ -480,14 +481,5 @@ def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> lis
             doubled += name in kept
             kept.setdefault(name, box)
         for name, box in kept.items():
-            if box.time_s - last_s.get(name, -np.inf) < MIN_KEY_STEP_S:
-                close += 1  # it crossed the seam of the turn and was measured twice at nearly one moment
-                continue
-            last_s[name] = box.time_s
-            tracks.add(name, box.label, box.time_s, box.size_m, box.world_from_box, box.standing)
-    notes = []
-    if doubled:
-        notes.append(f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out")
-    if close:
-        notes.append(f"{close} boxes were measured within {MIN_KEY_STEP_S:g} s of the one before and were left out")
-    return notes
+            tracks.add(name, box.label, box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s)
+    return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []
