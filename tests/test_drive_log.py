@@ -15,7 +15,7 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Source, SweepPoints, Track
 from mudg.data.importers import box_keys, drive_log
 from mudg.data.importers.box_keys import BoxKey, build_tracks, clip_track
-from mudg.data.importers.box_times import BoxTimes
+from mudg.data.importers.box_times import BoxTimes, reach_images
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, nearest_index, write_log
 from mudg.data.importers.options import ImportOptions
 
@@ -213,3 +213,14 @@ def test_a_vehicle_that_slides_is_refused_and_one_that_reverses_is_not(tmp_path:
         drive_log.check_motion(sliding, "log")
     assert "46 degrees" in caught.value.got
     drive_log.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")
+
+
+def test_tracks_reach_the_images_at_their_ends() -> None:
+    track, _ = drawn(10.0, [0.0] * 6)
+    longer = reach_images(track)
+    assert np.allclose(longer.times_s, [-0.05, *track.times_s, 0.55])
+    assert np.allclose(longer.world_from_object[:, 0, 3], 20 + 10 * longer.times_s)
+    assert (longer.world_from_object[1:-1] == track.world_from_object).all()
+    once = reach_images(Track("1", "car", track.size_m, np.array([2.0]), track.world_from_object[:1]))
+    assert once.times_s.tolist() == [1.95, 2.0, 2.05]
+    assert (once.world_from_object == track.world_from_object[0]).all()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import roundtrip
 import write_nuscenes as made
+from PIL import Image
 from roundtrip import needs_native
 
 from mudg.base.errors import InputError, UsageError
@@ -319,6 +320,71 @@ def test_point_times_follow_columns_or_azimuth(tmp_path: Path) -> None:
 def test_intrinsics_get_half_a_pixel() -> None:
     camera = camera_from_intrinsics("front", 1600, 900, [[1266.4, 0, 816.3], [0, 1266.5, 491.5], [0, 0, 1]], "here")
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1266.4, 1266.5, 816.8, 492.0)
+
+
+# --- one frame and its info.json --------------------------------------------------------------------------------------
+
+
+def write_info(folder: Path) -> Path:
+    """A made-up key frame: one camera, three points, a car of 4 x 2 x 1.5 m 10 m ahead (the LiDAR's y)."""
+    folder.mkdir()
+    Image.new("RGB", (64, 36), (50, 60, 70)).save(folder / "front.jpg")
+    scan = np.array([[0, 8.1, -0.5, 51, 3], [0.5, 8.2, -0.4, 51, 4], [0.2, 0.3, -0.1, 255, 5]], "<f4")
+    (folder / "scan.pcd.bin").write_bytes(scan.tobytes())
+    axes = [[1, 0, 0, 0], [0, 0, -1, -0.3], [0, 1, 0, -0.8], [0, 0, 0, 1]]
+    camera = {"img_path": "front.jpg", "cam2img": [[50, 0, 31.5], [0, 50, 17.5], [0, 0, 1]], "lidar2cam": axes}
+    lidar = {"lidar_path": "scan.pcd.bin", "lidar2ego": [[0, 1, 0, 0.9], [-1, 0, 0, 0], [0, 0, 1, 1.8], [0, 0, 0, 1]]}
+    boxes = [{"bbox_3d": [0, 10, -0.6, 4, 2, 1.5, np.pi / 2], "bbox_label_3d": 0}, {"bbox_label_3d": -1}]
+    sample = {
+        "ego2global": np.eye(4).tolist(),
+        "lidar_points": lidar,
+        "images": {"CAM_FRONT": camera},
+        "instances": boxes,
+    }
+    record = {"metainfo": {"dataset": "nuscenes", "categories": {"car": 0}}, "data_list": [sample]}
+    (folder / "info.json").write_text(json.dumps(record))
+    return folder
+
+
+def test_one_frame_described_by_info(tmp_path: Path) -> None:
+    source = write_info(tmp_path / "frame")
+    assert RECOGNISERS["nuscenes"](source)
+    scene = IMPORTERS["nuscenes"](source, tmp_path / "out", ImportOptions())
+    (track,), (sweep,), (frame,) = scene.tracks, scene.sweeps, scene.frames
+    world = transform_points(sweep.world_from_lidar, read_points(scene, sweep).xyz.astype(np.float64))
+    assert np.abs(world - [[9.0, 0, 1.3], [9.1, -0.5, 1.4]]).max() < 1e-5  # ego axes; the return from the roof is gone
+    assert np.abs(track.world_from_object[0] - np.array(
+        [[1, 0, 0, 10.9], [0, 1, 0, 0], [0, 0, 1, 1.2], [0, 0, 0, 1]])).max() < 1e-9  # fmt: skip
+    uv, z = project(frame.view, world)
+    assert np.allclose(z, [7.3, 7.4], atol=1e-5)
+    assert np.allclose(uv[0], [32.0, 18.0 + 50 * 0.2 / 7.3], atol=1e-3)
+
+
+Change = Callable[[dict[str, Any]], object]
+WRONG_INFO: dict[str, tuple[Change, str]] = {
+    "left-handed": (lambda s: s["images"]["CAM_FRONT"]["lidar2cam"][0].__setitem__(0, -1), "left-handed"),
+    "scaled": (
+        lambda s: s.update(ego2global=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]), "scaled"),
+    "transposed": (lambda s: s.update(ego2global=np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 6, 7, 1]]).tolist()),
+                   "row 0 0 0 1"),
+    "no lidar": (lambda s: s.pop("lidar_points"), "incomplete"),
+    "no image": (lambda s: s["images"]["CAM_FRONT"].update(img_path="gone.jpg"), "not found"),
+    "image elsewhere": (lambda s: s["images"]["CAM_FRONT"].update(img_path="../x.jpg"), "file name contains"),
+    "box not finite": (lambda s: s["instances"][0]["bbox_3d"].__setitem__(0, float("nan")), "not finite"),
+    "swapped": (lambda s: s["instances"][0].update(bbox_3d=[0, 10, -0.6, 2, 4, 1.5, 0.0]), "swapped"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG_INFO)
+def test_wrong_info_is_refused_in_words(name: str, tmp_path: Path) -> None:
+    change, words = WRONG_INFO[name]
+    source = write_info(tmp_path / "frame")
+    record = json.loads((source / "info.json").read_bytes())
+    change(record["data_list"][0])
+    (source / "info.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=words):
+        IMPORTERS["nuscenes"](source, tmp_path / "out", ImportOptions())
+    assert not (tmp_path / "out").exists()
 
 
 # --- real data --------------------------------------------------------------------------------------------------------

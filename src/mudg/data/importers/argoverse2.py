@@ -358,7 +358,8 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     boxes = []
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
         label = box_keys.label_of(str(columns["category"][row]), LABELS, unknown)
-        size = box_keys.box_size(*sizes[row], f"{where}: row {row}")
+        length, width, height = sizes[row].tolist()
+        size = box_keys.box_size(length, width, height, f"{where}: row {row}")
         time_s = (int(stamp) - zero_ns) / NANOSECONDS
         track = str(columns["track_uuid"][row])
         boxes.append(box_keys.BoxKey(track, label, time_s, size, map_from_ego[int(stamp)] @ pose))

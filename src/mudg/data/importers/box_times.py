@@ -4,6 +4,8 @@ A turning sensor meets an object some time before or after the sweep's time stam
 vehicle's motion still show a moving object where it was when the beams met it, and people draw its box around these points: the box
 belongs to the mean time of the points inside it, not to the stamp it is filed under. At 10 m/s and 0.08 s that is 0.8 m.
 Each such box is moved by the track's velocity to the stamp, where points, too, are brought by their ``dt_s``.
+
+Images are taken a little before or after the sweep they belong to; ``reach_images`` lets a track cover those at its ends.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ Matrix = NDArray[np.float64]
 
 MOVES_M: Final = 1.0
 """A track whose keys lie farther apart than this moves; boxes of others stay as they were drawn."""
+REACH_S: Final = 0.05
+"""Half a turn of a 10 Hz sensor; cameras look at most this far from the sweep they belong to."""
 _GROWTH_M: Final = 0.1
 _SAME_S: Final = 1e-3
 
@@ -97,3 +101,17 @@ def _extent_m(track: Track) -> float:
     """Diagonal of the region that the box's centre visits; 0 for a single key."""
     places = track.world_from_object[:, :3, 3]
     return float(np.linalg.norm(places.max(0) - places.min(0)))
+
+
+def reach_images(track: Track) -> Track:
+    """The track with a key ``REACH_S`` before its first and one after its last box, made with the velocity of the nearest two.
+
+    Without these, objects would be missing in images taken just before the first sweep that shows them.
+    """
+    times, poses = track.times_s, track.world_from_object
+    before, after = poses[0].copy(), poses[-1].copy()
+    if len(times) > 1:
+        before[:3, 3] -= (poses[1, :3, 3] - poses[0, :3, 3]) / (times[1] - times[0]) * REACH_S
+        after[:3, 3] += (poses[-1, :3, 3] - poses[-2, :3, 3]) / (times[-1] - times[-2]) * REACH_S
+    times = np.concatenate([[times[0] - REACH_S], times, [times[-1] + REACH_S]])
+    return Track(track.id, track.label, track.size_m, times, np.concatenate([before[None], poses, after[None]]))

@@ -23,7 +23,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, yaw_matrix, yaw_of
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers.box_keys import clip_track
-from mudg.data.importers.box_times import BoxTimes
+from mudg.data.importers.box_times import REACH_S, BoxTimes, reach_images
 from mudg.data.importers.common import for_each
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.options import ImportOptions, holdout_split
@@ -93,7 +93,8 @@ class DriveLog:
 def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     """Write the chosen frames of ``drive`` as a scene at ``out``.
 
-    Boxes of moving objects are brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep
+    Tracks reach 0.05 s beyond their boxes, so that images at their ends are covered. Boxes of moving objects are brought to
+    the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep
     counts as one moment, without point times, and boxes stay as drawn.
 
     Images whose size is kept are copied byte for byte, after a check that they decode to their camera's size. At most two
@@ -112,7 +113,8 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     world_from_map = world_from_first(ego.world_from_ego[0])
     fits = {name: fit_images(camera, options) for name, camera in drive.cameras.items()}
     notes = [*drive.source.notes, *(fit.words for fit in fits.values() if fit.words)]
-    seen = BoxTimes([track for track in drive.tracks if clip_track(track, start_s, end_s) is not None])
+    within = (start_s - REACH_S, end_s + REACH_S)
+    seen = BoxTimes([track for track in drive.tracks if clip_track(track, *within) is not None])
     if options.untwist == "no":
         notes.append("sweeps count as moments: point times are left out")
     if options.frames is not None:
@@ -142,7 +144,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
         title = f"importing {drive.source.dataset}"
         for_each(records, convert, title=title, workers=options.workers, name=lambda record: str(record.path))
         for track in seen.at_sweep_times():
-            kept = clip_track(track, start_s, end_s)
+            kept = clip_track(reach_images(track), start_s, end_s)
             if kept is not None:
                 poses = world_from_map @ kept.world_from_object
                 writer.add_track(replace(kept, times_s=kept.times_s - start_s, world_from_object=poses))

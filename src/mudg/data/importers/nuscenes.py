@@ -409,7 +409,7 @@ def read_scan(path: Path) -> SweepPoints:
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
         own &= (rows[:, axis] > low) & (rows[:, axis] < high)
     kept = rows[~own]
-    return SweepPoints(np.ascontiguousarray(kept[:, :3]), np.clip(kept[:, 3] / 255, 0, 1), dt_s[~own])
+    return SweepPoints(np.ascontiguousarray(kept[:, :3]), (kept[:, 3] / 255).clip(0, 1).astype(np.float32), dt_s[~own])
 
 
 def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray[np.float32]:
