@@ -307,7 +307,7 @@ class FitConfig:
     """learn_poses: share of the iterations before the first round of corrections."""
     pose_rounds: int = Field(default=4, ge=0)
     """learn_poses: rounds of corrections, spread evenly up to 85 % of the iterations (0 = only take the noise out of the tracks)."""
-    deformable: bool = False
+    deformable: bool = True
     """Let people and cyclists change their shape within their boxes."""
     color_terms: int = Field(default=0, ge=0, le=8)
     """Sines and cosines by which the colour of moving objects may vary over time (published: 4; 0 = constant)."""
