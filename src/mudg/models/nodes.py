@@ -47,7 +47,7 @@ LEAST_NOISE_M: Final = 0.01
 LEAST_NOISE_RAD: Final = 0.002
 DEFORM_CELLS: Final = (2, 3, 6)
 """Cells of the control grid of a deformable node along, across and up its box."""
-DEFORM_SMOOTHING: Final = 0.5
+DEFORM_SMOOTHING: Final = 0.75
 DEFORM_DECAY: Final = 0.02
 
 

@@ -317,7 +317,7 @@ class FitConfig:
     """How often vehicles are shown mirrored while fitting, so that one side teaches the other."""
     exposure: Literal["none", "camera", "image"] = "none"
     """Learn an affine colour map per camera, or per recorded image; not used in renders."""
-    exposure_weight: float = Field(default=0.1, ge=0)
+    exposure_weight: float = Field(default=0.01, ge=0)
     """Pull of colour maps, of recorded and virtual views, towards the identity."""
     learn_cameras: bool = False
     """Correct the pose of every recorded image while fitting; not used in renders."""
