@@ -14,7 +14,7 @@ from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, w
 
 from mudg.base.errors import InputError, NumericsError
 from mudg.base.types import FusedCloud, PointCloud, Scene, Track
-from mudg.core import trajectory
+from mudg.core import metrics, trajectory
 from mudg.core.raster import RasterConfig
 from mudg.data.cloudfile import write_fused
 from mudg.data.observations import ObservationWriter
@@ -134,6 +134,30 @@ def test_cloned_and_split_rows_of_objects_stay_aligned(world, tmp_path):
     assert len(model.table) != rows
     assert len(model.table.partial["sh_time"]) == int((model.table.labels["node"] > 0).sum())
     assert compose(model, 0.6).sh.shape == (len(model.table), 1, 3)
+
+
+@pytest.mark.slow
+def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(world, tmp_path):
+    path = trajectory.shifted(read_scene(world["scene"]), "front", 2.0)
+    with ObservationWriter(tmp_path / "dark" / path.name, path.name, "dark") as writer:
+        for view in path.views:
+            seen = truth(view.resized(30, 20))
+            seen.rgb.mul_(0.7)
+            writer.add(seen)
+    psnr = {}
+    for own in (False, True):
+        config = settings(
+            iterations=150,
+            exposure="none",
+            learn_cameras=False,
+            learn_poses=False,
+            virtual_appearance=own,
+            virtual_seen_weight=1.0,
+        )
+        folder = fit.run(config, world["scene"], world["fuse"], tmp_path / str(own), observations=tmp_path / "dark")
+        view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
+        psnr[own] = metrics.psnr(fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb, truth(view).rgb)
+    assert psnr[True] > psnr[False] + 0.3, psnr
 
 
 # ---- odd scenes -------------------------------------------------------------------------------------------------------

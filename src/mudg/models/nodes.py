@@ -47,7 +47,7 @@ LEAST_NOISE_M: Final = 0.01
 LEAST_NOISE_RAD: Final = 0.002
 DEFORM_CELLS: Final = (2, 3, 6)
 """Cells of the control grid of a deformable node along, across and up its box."""
-DEFORM_SMOOTHING: Final = 0.5
+DEFORM_SMOOTHING: Final = 0.75
 DEFORM_DECAY: Final = 0.02
 
 
@@ -199,7 +199,13 @@ class RigidNode:
         self._placements.clear()
 
     def settle(self) -> None:
-        """Set the offsets to what takes independent noise out of the track: the best guess before any picture was seen.
+        """Set the offsets to ``settled_offsets``: the best guess before any picture was seen."""
+        shift, yaw = self.settled_offsets()
+        now = [self.offsets[name].detach().double().numpy() for name in ("shift", "yaw")]
+        self.add_offsets(shift - now[0], yaw - now[1])
+
+    def settled_offsets(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Offsets that take independent noise out of the track: shift f64[K, 3] m and yaw f64[K] rad.
 
         The size of the noise is what the track itself betrays, at least `LEAST_NOISE_M` and `LEAST_NOISE_RAD`.
         """
@@ -209,9 +215,7 @@ class RigidNode:
         noise_rad = max(float(noise[3]), LEAST_NOISE_RAD)
         path = motion.smoothed(self.times_s, positions, noise_m, motion.ACCELERATION_M_S2) - positions
         turn = motion.smoothed(self.times_s, heading[:, None], noise_rad, motion.YAW_ACCELERATION_RAD_S2)[:, 0] - heading
-        shift = (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0]
-        now = [self.offsets[name].detach().double().numpy() for name in ("shift", "yaw")]
-        self.add_offsets(shift - now[0], turn - now[1])
+        return (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0], turn
 
     def headings(self) -> NDArray[np.float64]:
         """Yaw of the given keys f64[K], radians, without jumps of 2 pi."""
@@ -325,6 +329,8 @@ class DeformableNode(RigidNode):
             inner = (deform[:-2] + deform[2:]) / 2 - deform[1:-1]
             deform[1:-1] += share * DEFORM_SMOOTHING * inner
         deform *= 1 - share * DEFORM_DECAY
+        if self.learn_pose:  # what moves as a whole is the pose's to explain
+            deform -= deform.mean((2, 3, 4), keepdim=True)
 
 
 class SkyNode:

@@ -342,7 +342,7 @@ class FitConfig:
     """learn_poses: share of the iterations before the first round of corrections."""
     pose_rounds: int = Field(default=4, ge=0)
     """learn_poses: rounds of corrections, spread evenly up to 85 % of the iterations (0 = only take the noise out of the tracks)."""
-    deformable: bool = False
+    deformable: bool = True
     """Let people and cyclists change their shape within their boxes."""
     color_terms: int = Field(default=0, ge=0, le=8)
     """Sines and cosines by which the colour of moving objects may vary over time (published: 4; 0 = constant)."""
@@ -352,7 +352,7 @@ class FitConfig:
     """How often vehicles are shown mirrored while fitting, so that one side teaches the other."""
     exposure: Literal["none", "camera", "image"] = "none"
     """Learn an affine colour map per camera, or per recorded image; not used in renders."""
-    exposure_weight: float = Field(default=0.1, ge=0)
+    exposure_weight: float = Field(default=0.01, ge=0)
     """Pull of colour maps, of recorded and virtual views, towards the identity."""
     learn_cameras: bool = False
     """Correct the pose of every recorded image while fitting; not used in renders."""

@@ -3,8 +3,8 @@
 Four numbers per key of a track (shift along the box's axes, yaw) are asked three questions at once:
 
     pictures   how would the rendered colours inside the box's outline change, and what is missing to the recorded ones?
-    track      how far are we from what the tracker said?
-    motion     does the corrected path accelerate as road users do?
+    track      how far are we from the track, once the noise that it betrays is taken out of it (``RigidNode.settled_offsets``)?
+    motion     does the correction accelerate no more than road users do? (So neighbouring keys are corrected alike.)
 
 Each answer counts by its expected error, so what the pictures cannot tell (the yaw of a distant car) stays with the track and its
 neighbours in time; a gradient method that scales steps to its gradients, as Adam does, walks at random there. Derivatives are
@@ -37,11 +37,9 @@ from mudg.stages.fit_views import StoredView
 STEPS: tuple[float, ...] = (0.02, 0.02, 0.02, 0.005)
 """Displacements of the differences: metres along x, y, z of the box, radians of yaw."""
 TRUST_M, TRUST_RAD = 0.1, 0.02
-"""How far from the truth a track may be without looking noisy (drift of a filter, a labeller's taste)."""
+"""How far from the truth a track may be though it is smooth (drift of a filter, a labeller's taste)."""
 LARGEST_M, LARGEST_RAD = 0.2, 0.05
 """A round moves a key by at most this."""
-SOLVES = 4
-"""Times that the weights of the motion are brought up to date within a round."""
 FEWEST_PX = 30
 BLUR_PX = 3
 COLOR_SIGMA = 0.03
@@ -184,41 +182,24 @@ def _normal_equations(jacobian: Tensor, missing: Tensor) -> tuple[NDArray[np.flo
 
 
 def _move(node: RigidNode, evidence: Evidence) -> NDArray[np.float64]:
-    """Solve for all keys of a track together and move them; returns the moves f64[K, 3] in metres."""
-    base, heading = node.world_from_object, node.headings()
-    now = np.column_stack([node.offsets[name].detach().double().numpy() for name in ("shift", "yaw")])
-    noise = motion.key_noise(node.times_s, np.column_stack([base[:, :3, 3], heading]))
-    spread = (float(np.hypot(np.sqrt((noise[:3] ** 2).mean()), TRUST_M)), float(np.hypot(noise[3], TRUST_RAD)))
-    trust = np.array([spread[0]] * 3 + [spread[1]]) ** -2
-    # Accelerations, in units of the usual ones, are linear in the offsets: along = a0 + A shift, about = b0 + B yaw.
+    """Solve for all keys of a track together and move them; returns the moves f64[K, 3] in metres.
+
+    Unknown is the correction c of every key beyond ``settled_offsets``, which have weighed noise against motion already: the sum of
+    squares of what the pictures miss, of c in units of `TRUST_M` and `TRUST_RAD`, and of its accelerations in usual ones.
+    """
+    keys, base = len(node.times_s), node.world_from_object
+    settled = np.column_stack(node.settled_offsets())
+    now = np.column_stack([node.offsets[name].detach().double().numpy() for name in ("shift", "yaw")]) - settled
+    system = np.zeros((keys, 4, keys, 4))
+    for key in range(keys):
+        system[key, :, key, :] = evidence.matrix[key] + np.diag([TRUST_M**-2] * 3 + [TRUST_RAD**-2])
     difference = motion.second_differences(node.times_s)
-    a = np.einsum("mk,kwc->mwkc", difference, base[:, :3, :3]) / motion.ACCELERATION_M_S2
-    a0 = difference @ base[:, :3, 3] / motion.ACCELERATION_M_S2
-    b, b0 = (difference @ part / motion.YAW_ACCELERATION_RAD_S2 for part in (np.eye(len(base)), heading))
-    found = now
-    for _ in range(SOLVES):
-        along = motion.motion_weights(a0 + np.einsum("mwkc,kc->mw", a, found[:, :3]))
-        about = motion.motion_weights((b0 + b @ found[:, 3])[:, None])
-        found = _solved(evidence, trust, now, (a, a0, along), (b, b0, about))
+    path = np.einsum("mk,kwc->mwkc", difference, base[:, :3, :3]) / motion.ACCELERATION_M_S2
+    system[:, :3, :, :3] += np.einsum("mwkc,mwld->kcld", path, path, optimize=True)
+    system[:, 3, :, 3] += difference.T @ difference / motion.YAW_ACCELERATION_RAD_S2**2
+    right = evidence.vector + np.einsum("kcd,kd->kc", evidence.matrix, now)
+    found = np.linalg.solve(system.reshape(4 * keys, 4 * keys), right.reshape(4 * keys)).reshape(keys, 4)
     largest = np.array([LARGEST_M] * 3 + [LARGEST_RAD])
     moves = np.clip(found - now, -largest, largest)
     node.add_offsets(moves[:, :3], moves[:, 3])
     return moves[:, :3]
-
-
-Linear = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-
-
-def _solved(evidence: Evidence, trust: NDArray[np.float64], now: NDArray[np.float64], path: Linear, turn: Linear) -> NDArray[np.float64]:
-    """Offsets f64[K, 4] that minimise the three sums of squares. Pictures and track act within a key, motion across keys."""
-    keys = len(now)
-    system = np.zeros((keys, 4, keys, 4))
-    right = evidence.vector + np.einsum("kcd,kd->kc", evidence.matrix, now)
-    for key in range(keys):
-        system[key, :, key, :] = evidence.matrix[key] + np.diag(trust)
-    (a, a0, along), (b, b0, about) = path, turn
-    system[:, :3, :, :3] += np.einsum("m,mwkc,mwld->kcld", along, a, a, optimize=True)
-    right[:, :3] -= np.einsum("m,mwkc,mw->kc", along, a, a0)
-    system[:, 3, :, 3] += (b.T * about) @ b
-    right[:, 3] -= (b.T * about) @ b0
-    return np.linalg.solve(system.reshape(4 * keys, 4 * keys), right.reshape(4 * keys)).reshape(keys, 4)
