@@ -2,8 +2,7 @@
 
 ``CodecFeatures`` is the network of the shipped codec, and only scores: no fit is trained on it.
 
-``FilterBank`` stands where LPIPS-style networks will stand: image in, list of feature maps out, compared by
-``losses.feature_distance``. It is built from what early vision is known to do (Gabor-like energy at several scales and
+All take an image and give a list of feature maps. ``FilterBank`` needs no weights; it is built from what early vision is known to do (Gabor-like energy at several scales and
 orientations, divisive contrast normalisation, opponent colours) rather than learnt:
 
 * opponent colours: luminance and two chroma axes, compared on blurred images only (the eye places colour coarsely);
@@ -96,7 +95,6 @@ class CodecFeatures(nn.Module):
         super().__init__()
         self.codec = codec
 
-    @torch.no_grad()
     def forward(self, rgb: Tensor) -> list[Tensor]:
         """Features of one image; sides that are no multiple of 8 are continued by their last pixels."""
         height, width = rgb.shape[-2:]
@@ -143,7 +141,6 @@ class LpipsFeatures(nn.Module):
             self.biases.append(_tensor(state, f"{named}.bias", (out,), where))
             self.channel_weights.append(_tensor(state, f"lin{stage}.model.1.weight", (1, out, 1, 1), where).flatten())
 
-    @torch.no_grad()
     def forward(self, rgb: Tensor) -> list[Tensor]:
         """Features ``[C, h, w]`` of the five stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
         if min(rgb.shape[-2:]) < self.SMALLEST_PX:
@@ -181,9 +178,7 @@ class PerceptualDistance:
         """The distance, or None where colour is missing."""
         if pair.rgb is None or pair.truth_rgb is None:
             return None
-        if self._known is None or self._known[0] is not pair.truth_rgb:
-            self._known = (pair.truth_rgb, self._features(pair.truth_rgb))
-        return perceptual_distance(self._features(pair.rgb), self._known[1], pair.mask, self._weights)
-
-
-FEATNETS: Final = {"filter_bank": FilterBank}
+        with torch.no_grad():
+            if self._known is None or self._known[0] is not pair.truth_rgb:
+                self._known = (pair.truth_rgb, self._features(pair.truth_rgb))
+            return perceptual_distance(self._features(pair.rgb), self._known[1], pair.mask, self._weights)

@@ -389,6 +389,11 @@ class FitConfig:
     virtual_ssim_weight: float = Field(default=0.3, ge=0, le=1)
     """mudg_s: share of structural similarity in the colour term, as `ssim_weight` for recorded views."""
     virtual_perceptual_weight: float = Field(default=0.3, ge=0)
+    virtual_perception: Literal["filters", "codec", "lpips"] = "filters"
+    """mudg_s: in whose eyes renders are like virtual views. filters: fixed ones; codec: the shipped diffusion model's, which is slower;
+    lpips: that network, from `lpips_weights`."""
+    lpips_weights: str = ""
+    """Safetensors file with LPIPS weights (AlexNet, version 0.1, the lpips package's names)."""
     virtual_depth_weight: float = Field(default=0.3, ge=0)
     """mudg_s: dense depth that the diffusion model made, robust and relative."""
     virtual_lidar_weight: float = Field(default=0.2, ge=0)

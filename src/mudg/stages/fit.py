@@ -39,11 +39,11 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.scenefile import read_scene
 from mudg.models.appearance import Appearance
 from mudg.models.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
-from mudg.models.featnets import FilterBank
 from mudg.models.mcmc import McmcSettings, drift, relocate_and_grow
 from mudg.models.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky
 from mudg.stages.config import FitConfig
 from mudg.stages.fit_objects import boxes_in_view, objects_only
+from mudg.stages.fit_perception import Perception, perception_of
 from mudg.stages.fit_poses import refine_poses
 from mudg.stages.fit_start import StartSettings, start_model
 from mudg.stages.fit_trust import unseen_maps, unseen_rows
@@ -112,6 +112,8 @@ def run(
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
     if virtual is not None:
         inputs["observations"] = store.digest(Path(virtual))
+    if config.lpips_weights:
+        inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
     folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
     if folder.complete:
         return folder.reused()
@@ -195,7 +197,7 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
-    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), FilterBank()
+    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual_start, config.virtual_stop))
     with log.task(f"fit {config.method}", config.iterations, state.step) as bar, _interrupt_at_end_of_step() as interrupted:
         while state.step < config.iterations:
@@ -279,7 +281,7 @@ def admit_virtual_views(state: FitState, config: FitConfig, raster: RasterConfig
 
 
 def recorded_terms(
-    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank, appearance: Appearance | None = None
+    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: Perception, appearance: Appearance | None = None
 ) -> dict[str, Tensor]:
     """Weighted loss terms of a recorded view: colour, LiDAR depth, sky, semantics (those that apply).
 
@@ -303,7 +305,7 @@ def recorded_terms(
 
 
 def virtual_terms(
-    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: FilterBank, appearance: Appearance | None = None
+    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: Perception, appearance: Appearance | None = None
 ) -> dict[str, Tensor]:
     """Weighted loss terms of a virtual view, every pixel weighted by the observation's confidence."""
     seen = sample.observation
@@ -319,9 +321,7 @@ def virtual_terms(
             loss = loss + share * (1 - losses.ssim_map(rgb, seen.rgb))
         terms["virtual_color"] = config.virtual_color_weight * losses.confident_mean(loss, weight)
     if config.virtual_perceptual_weight:
-        with torch.no_grad():
-            target = perception(seen.rgb)
-        terms["virtual_perceptual"] = config.virtual_perceptual_weight * losses.feature_distance(perception(rgb), target, weight)
+        terms["virtual_perceptual"] = config.virtual_perceptual_weight * perception(rgb, seen.rgb, weight)
     if seen.depth is not None and config.virtual_depth_weight:
         valid = torch.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth < FARTHEST_VIRTUAL_DEPTH_M)
         loss = losses.dense_depth_map(render.depth, torch.where(valid, seen.depth, 1.0))

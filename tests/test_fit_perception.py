@@ -1,0 +1,56 @@
+"""In whose eyes a fit compares: agreement with the scorer's distance, gradients, confidence, refusals."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_score_metrics import lpips_state
+
+from mudg.base import store
+from mudg.base.errors import InputError, UsageError
+from mudg.core import losses, metrics
+from mudg.stages.config import FitConfig
+from mudg.stages.fit_perception import perception_of
+
+
+def random(seed: int, *shape: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_loss_is_the_scorers_distance_where_all_is_certain(weighted):
+    mine, theirs = ([random(s + 9 * k, 4, 6 // (s + 1), 8 // (s + 1)) - 0.3 for s in range(2)] for k in range(2))
+    channels = [random(20 + s, 4) for s in range(2)] if weighted else None
+    loss = losses.unit_feature_distance(mine, theirs, torch.ones(1, 12, 16, dtype=torch.float64), channels)
+    assert loss.item() == pytest.approx(metrics.perceptual_distance(mine, theirs, None, channels), rel=1e-4)
+
+
+def test_gradient_of_the_loss():
+    theirs, weight, channels = random(1, 3, 4, 5), random(2, 1, 8, 10), [random(3, 3)]
+    x = (random(4, 3, 4, 5) + 0.1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: losses.unit_feature_distance([p], [theirs], weight, channels), (x,))
+
+
+@pytest.mark.parametrize("name", ["filters", "codec", "lpips"])
+def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
+    path = tmp_path / "lpips.safetensors"
+    store.write_safetensors(path, {key: value.numpy() for key, value in lpips_state().items()})
+    perception = perception_of(FitConfig(virtual_perception=name, lpips_weights=str(path)))
+    truth = random(1, 3, 48, 64).float()
+    everywhere = torch.ones(1, 48, 64)
+    assert perception(truth, truth, everywhere).item() == pytest.approx(0, abs=1e-6)
+    render = (truth * 0.6 + 0.1).requires_grad_()
+    distance = perception(render, truth, everywhere)
+    distance.backward()
+    assert distance.item() > 1e-4
+    assert render.grad is not None and bool(torch.isfinite(render.grad).all()) and float(render.grad.abs().max()) > 0
+    assert perception(render, truth, everywhere * 0).item() == 0
+    assert perception(render, truth, everywhere * 0.5).item() == pytest.approx(distance.item() / 2, rel=1e-4)
+
+
+def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="file of its weights"):
+        perception_of(FitConfig(virtual_perception="lpips"))
+    store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
+    with pytest.raises(InputError, match="incomplete"):
+        perception_of(FitConfig(virtual_perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))
