@@ -2,8 +2,8 @@
 
 ``CodecFeatures`` is the network of the shipped codec, and only scores: no fit is trained on it.
 
-All take an image and give a list of feature maps. ``FilterBank`` needs no weights; it is built from what early vision is known to do (Gabor-like energy at several scales and
-orientations, divisive contrast normalisation, opponent colours) rather than learnt:
+All take an image and give a list of feature maps. ``FilterBank`` needs no weights; it is built from what early vision is known
+to do (Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours) rather than learnt:
 
 * opponent colours: luminance and two chroma axes, compared on blurred images only (the eye places colour coarsely);
 * per scale (1, 1/2, 1/4 of the size): first-derivative responses in four orientations, divided by the local contrast, so that
