@@ -124,9 +124,13 @@ def test_ctrl_c_stops_both_once_and_cleanly(tmp_path: Path, heard: list[dict[str
             wait_for(folder / "started")
         os.kill(os.getpid(), signal.SIGINT)
 
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start deaf to it
     threading.Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(KeyboardInterrupt):
-        run_side_by_side([Task(folder.name, until_stopped, (folder,)) for folder in both], 1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_side_by_side([Task(folder.name, until_stopped, (folder,)) for folder in both], 1)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert all((folder / "stopped").exists() for folder in both)
 
 
