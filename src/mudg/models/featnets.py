@@ -1,6 +1,6 @@
-"""Feature extractors for perceptual comparison: a fixed filter bank for fitting, and learned features for scoring.
+"""Feature extractors for perceptual comparison: a fixed filter bank, the shipped codec's network, the trunk of LPIPS.
 
-``CodecFeatures`` is the network of the shipped codec, and only scores: no fit is trained on it.
+Fits compare in the eyes of the filter bank, scores in those of the codec, unless something else is asked for.
 
 All take an image and give a list of feature maps. ``FilterBank`` needs no weights; it is built from what early vision is known
 to do (Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours) rather than learnt:
