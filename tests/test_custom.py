@@ -19,6 +19,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import Scene, SweepPoints
 from mudg.data.importers import IMPORTERS, RECOGNISERS, common, custom
+from mudg.data.importers.custom_schema import read_log
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scenefile import read_points
 
@@ -308,3 +309,13 @@ def test_boxes_that_move_sideways_are_warned_about(log: Path, truth: Scene) -> N
 def test_a_missing_sweep_is_warned_about(log: Path) -> None:
     edit(log, lambda content: content["sweeps"].pop(2))
     assert "about 1 records are missing" in words_of(log, "warning")
+
+
+def test_the_example_of_the_documentation_is_a_log(repository: Path, tmp_path: Path) -> None:
+    text = (repository / "docs" / "custom_format.md").read_text(encoding="utf-8")
+    (tmp_path / "log.json").write_text(text.split("```json\n")[1].split("```")[0])
+    log = read_log(tmp_path)
+    assert (len(log.images), len(log.sweeps), len(log.tracks)) == (2, 1, 1)
+    assert log.images[1].time_s == 0.1 and log.sweeps[0].time_s == 0.05
+    assert np.allclose(log.tracks[0].world_from_object[1, :3, 3], [16.2, 3.5, 0.8])
+    assert log.cameras["front"].camera.cx == 962.6 and log.cameras["front"].lens is not None

@@ -174,8 +174,13 @@ def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) 
             assert np.array_equal(
                 read_label(copy, frame, name), read_label(scene, frame, name), equal_nan=name == "depth"
             )
-    with pytest.raises(UsageError, match="taken as it is"):
-        ingest.run(IngestConfig(frames="0:2"), source, tmp_path / "out2")
+    for index, config in enumerate(
+        (IngestConfig(frames="0:2"), IngestConfig(cameras=("front",)), IngestConfig(resolution="60"))
+    ):
+        with pytest.raises(UsageError, match="taken as it is"):
+            ingest.run(config, source, tmp_path / f"refused{index}")
+        with pytest.raises(UsageError, match="settings of its own"):
+            ingest.run(config, "city", tmp_path / f"city{index}")
 
 
 @needs_native

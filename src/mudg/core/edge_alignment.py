@@ -71,7 +71,7 @@ def depth_jumps(xyz_lidar: NDArray[np.floating]) -> NDArray[np.intp]:
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     elevation = np.arcsin(np.clip(xyz[:, 2] / distance, -1, 1))
     direction = np.stack([azimuth, _ROW_PREFERENCE * elevation], 1)
-    apart, near = KDTree(direction).query(direction, _NEIGHBOURS + 1)
+    apart, near = (np.asarray(found) for found in KDTree(direction).query(direction, _NEIGHBOURS + 1))
     step = np.median(apart[:, 1])
     behind = distance[near[:, 1:]] - distance[:, None]
     behind[apart[:, 1:] > 3 * step] = 0

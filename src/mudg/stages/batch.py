@@ -219,14 +219,11 @@ def _outcome(entry: Entry, connection: Connection, process: Any, seconds: float)
     connection.close()
     process.join()
     if error == "crash":
-        code = process.exitcode
-        killed = code is not None and code < 0
-        words = (
-            f"its process was killed by signal {-code}"
-            if killed
-            else f"its process ended with code {code}; see the messages above"
-        )
-        if killed and -code == signal.SIGKILL:
+        code = process.exitcode or 0
+        words = f"its process ended with code {code}; see the messages above"
+        if code < 0:
+            words = f"its process was killed by signal {-code}"
+        if -code == signal.SIGKILL:
             words += " (out of memory? try fewer --jobs)"
     return Outcome(entry.name, entry.source, state, round(seconds, 2), words, error)
 
@@ -236,6 +233,7 @@ def _child(connection: Connection, work: Work, entry: Entry, folder: Path, overw
     signal.signal(
         signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM)
     )  # unwinds, so that partial folders are removed
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides, and terminates
     log.set_quiet(True)
     before = _finished(folder)
     try:

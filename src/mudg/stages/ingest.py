@@ -114,7 +114,7 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
     return Asked(config, source, out)
 
 
-_OF_A_LINE = ("format", "sequence", "frames", "cameras", "poses", "boxes")
+_OF_A_LINE = ("format", "frames", "cameras", "sequence", "poses", "boxes")
 
 
 def run_many(
@@ -217,15 +217,27 @@ def source_digest(source: Path) -> str:
 def _city(config: IngestConfig, _source: Path, out: Path) -> Scene:
     from mudg.data.city import write_city
 
+    _refuse(
+        config,
+        _OF_A_LOG,
+        "the generated city has settings of its own",
+        "use --city.n-frames, --city.cameras, --city.width, ...",
+    )
     return write_city(config.city, out, test_every=config.test_every)
+
+
+_OF_A_LOG = ("frames", "cameras", "sequence", "poses", "boxes", "resolution")
+
+
+def _refuse(config: IngestConfig, names: Sequence[str], what: str, remedy: str) -> None:
+    given = [f"--{name}" for name in names if getattr(config, name)]
+    if given:
+        raise UsageError(what, where=", ".join(given), remedy=remedy)
 
 
 def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
     """Check a scene by reading everything, and write it anew; held-out frames are kept as the scene has them."""
-    if config.frames or config.sequence or config.poses or config.boxes:
-        raise UsageError(
-            "a scene is taken as it is", where="--frames, --sequence, --poses, --boxes", remedy="leave these out"
-        )
+    _refuse(config, _OF_A_LOG, "a scene is taken as it is", "leave it out")
     scene = read_scene(source)
     with SceneWriter(out, scene.id, scene.source) as writer:
         add_rest(writer, scene)
