@@ -30,6 +30,14 @@ import write_waymo
 
 SIZES = {1: (1920, 1280), 2: (1920, 1280), 3: (1920, 1280), 4: (1920, 886), 5: (1920, 886)}
 SHORT = 2
+IMPORT = """
+import sys
+from pathlib import Path
+from mudg.data.importers.options import ImportOptions
+from mudg.data.importers.waymo import import_waymo
+source, out, frames, workers = sys.argv[1:]
+import_waymo(Path(source), Path(out), ImportOptions(frames=(0, int(frames)), workers=int(workers)))
+"""
 
 
 def jpeg(width: int, height: int, rng: np.random.Generator) -> bytes:
@@ -114,20 +122,11 @@ def write_logs(folder: Path, frames: int) -> None:
 def one_import(source: Path, frames: int, workers: int) -> tuple[float, float]:
     """Processor seconds and peak memory in MB of an import in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        arguments = [
-            "ingest",
-            str(source),
-            "--out",
-            f"{folder}/scene",
-            "--frames",
-            f"0:{frames}",
-            "--workers",
-            str(workers),
-        ]
-        process = subprocess.Popen([sys.executable, "-m", "mudg", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        arguments = [sys.executable, "-c", IMPORT, str(source), f"{folder}/scene", str(frames), str(workers)]
+        process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         _, status, usage = os.wait4(process.pid, 0)
         if status:
-            raise SystemExit(f"mudg {' '.join(arguments)} failed")
+            raise SystemExit(f"importing {source} failed")
     return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20)
 
 
