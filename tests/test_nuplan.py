@@ -247,9 +247,12 @@ def test_spoilt_logs_are_refused_in_words(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_table_that_is_a_view_or_virtual_is_no_table(source: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "instead", ["VIEW category AS SELECT * FROM real_category", "VIRTUAL TABLE category USING rtree(token, name, last)"]
+)
+def test_a_table_that_is_a_view_or_virtual_is_no_table(source: Path, tmp_path: Path, instead: str) -> None:
     change(source, "ALTER TABLE category RENAME TO real_category")
-    change(source, "CREATE VIEW category AS SELECT * FROM real_category")
+    change(source, f"CREATE {instead}")
     with pytest.raises(InputError, match="no table 'category'"):
         ingest(source, tmp_path / "out")
 

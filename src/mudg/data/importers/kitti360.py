@@ -222,7 +222,7 @@ def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: 
         if path.is_file():
             return _stamps(path, files, last)
     notes.append("no timestamps in the source: 10 Hz assumed")
-    return np.arange(last + 1) * FRAME_PERIOD_S
+    return np.arange(last + 1, dtype=np.float64) * FRAME_PERIOD_S
 
 
 def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:

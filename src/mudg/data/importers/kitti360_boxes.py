@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
@@ -94,7 +94,8 @@ def read_boxes(path: Path, left_out: dict[str, int]) -> Iterator[Kitti360Box]:
 def _objects(path: Path) -> Iterator[ElementTree.Element]:
     """The children of the top element, each freed after use."""
     parser = ElementTree.XMLPullParser(("start", "end"))
-    depth, top = 0, None
+    depth = 0
+    top: ElementTree.Element | None = None
     tail = b""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
@@ -104,7 +105,8 @@ def _objects(path: Path) -> Iterator[ElementTree.Element]:
                 _refuse_entities(tail + chunk, str(path), first=not tail)
                 tail = chunk[-16:]
                 parser.feed(chunk)
-                for event, element in parser.read_events():
+                events: Iterator[Any] = parser.read_events()
+                for event, element in events:
                     if event == "start":
                         depth += 1
                         top = element if depth == 1 else top

@@ -135,7 +135,9 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
 
 def _block_parts(block: Any) -> tuple[Any, Any]:
     """Values and places of a block in the forms of pandas 1.3 (a partial call) and later (a tuple)."""
-    if isinstance(block, Record) and block.name == "functools.partial":
+    if isinstance(block, Record):
+        if block.name != "functools.partial":
+            raise ValueError(f"a block is a {block.name}")
         partial, values, places = block.arguments
         if partial.arguments != (Name(_NEW_BLOCK),):
             raise ValueError("a block of unknown form")

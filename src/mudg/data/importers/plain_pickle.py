@@ -320,8 +320,10 @@ class _Machine:
             raise TypeError(f"a call of a {type(kind).__name__}")
         else:
             maker = self._makers[kind.text]
-            as_it_stands = maker is None or opcode != "REDUCE"
-            stack.append(Record(kind.text, arguments) if as_it_stands else maker(*arguments))
+            if maker is None or opcode != "REDUCE":
+                stack.append(Record(kind.text, arguments))
+            else:
+                stack.append(maker(*arguments))
 
 
 _MEMO: Final = frozenset(("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET"))
