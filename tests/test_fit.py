@@ -173,13 +173,14 @@ def test_regularisers_are_means_of_opacity_and_scale():
     gaussians = Gaussians(
         torch.zeros(2, 3), torch.ones(2, 4), table, opacity, torch.zeros(2, 1, 3), extra=None, node=one[:, 0].int(), sh_rest=None
     )
-    assert fit.regularisers(gaussians, settings(opacity_weight=0.0, scale_weight=0.0)) == {}
+    assert fit.regularisers(gaussians, settings()) == {}
     terms = fit.regularisers(gaussians, settings(opacity_weight=0.5, scale_weight=2.0))
     assert terms["opacity"].item() == pytest.approx(0.5 * 0.4)
     assert terms["scale"].item() == pytest.approx(2.0 * 0.35)
     terms["opacity"].backward()
     assert opacity.grad.tolist() == [0.25, 0.25]
-    assert set(fit.regularisers(gaussians, settings(scale_weight=0.0))) == {"opacity"}
+    assert set(fit.regularisers(gaussians, settings(densify="mcmc"))) == {"opacity", "scale"}
+    assert set(fit.regularisers(gaussians, settings(densify="mcmc", scale_weight=0.0))) == {"opacity"}
 
 
 def test_densification_grows_within_its_cap(world, tmp_path):

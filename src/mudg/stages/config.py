@@ -334,10 +334,10 @@ class FitConfig:
     densify: Annotated[Literal["gradient", "mcmc", "none"], BeforeValidator(_densify_by_name)] = "gradient"
     """How the number of Gaussians changes. gradient: clone, split and prune by screen gradients; mcmc: move those that do nothing,
     grow to max_gaussians; none: as they start."""
-    opacity_weight: float = Field(default=0.01, ge=0)
-    """Pulls all opacities down: what no view needs fades instead of standing in the way off the recorded line."""
-    scale_weight: float = Field(default=0.001, ge=0)
-    """Pulls all sizes down, per metre."""
+    opacity_weight: float | None = Field(default=None, ge=0)
+    """Pulls all opacities down, so that what no view needs fades (unset = 0.01 with mcmc, else 0)."""
+    scale_weight: float | None = Field(default=None, ge=0)
+    """Pulls all sizes down, per metre (unset = 0.001 with mcmc, else 0)."""
     pose_start: float = Field(default=0.25, ge=0, le=1)
     """learn_poses: share of the iterations before the first round of corrections."""
     pose_rounds: int = Field(default=4, ge=0)

@@ -65,6 +65,8 @@ FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
 LAST_POSE_ROUND = 0.85
 NEAR_M = 0.2
+MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
+"""Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
 
 
 @dataclass(frozen=True)
@@ -338,11 +340,14 @@ def virtual_terms(
 
 def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
     """Weighted mean opacity and mean scale in metres of all Gaussians, where their weights are not 0."""
+    published = config.densify == "mcmc"
+    opacity_weight = (MCMC_OPACITY_WEIGHT if published else 0.0) if config.opacity_weight is None else config.opacity_weight
+    scale_weight = (MCMC_SCALE_WEIGHT if published else 0.0) if config.scale_weight is None else config.scale_weight
     terms = {}
-    if config.opacity_weight:
-        terms["opacity"] = config.opacity_weight * gaussians.opacity.mean()
-    if config.scale_weight:
-        terms["scale"] = config.scale_weight * gaussians.scales.mean()
+    if opacity_weight:
+        terms["opacity"] = opacity_weight * gaussians.opacity.mean()
+    if scale_weight:
+        terms["scale"] = scale_weight * gaussians.scales.mean()
     return terms
 
 
