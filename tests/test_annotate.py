@@ -251,7 +251,7 @@ def test_a_scene_with_images_only_can_be_labelled(tmp_path: Path) -> None:
 
 
 def test_movers_are_carried_and_marked(tmp_path: Path) -> None:
-    STREET.write(tmp_path / "plain", labels=False)
+    replace(STREET, times=(0.0, 0.4)).write(tmp_path / "plain", labels=False, width=160, height=80)
     scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "plain", tmp_path / "out"))
     for frame in scene.frames:
         _, truth, depth = STREET.image(frame.view)
@@ -263,7 +263,7 @@ def test_movers_are_carried_and_marked(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
-    STREET.write(tmp_path / "plain", labels=False)
+    replace(STREET, times=(0.0, 0.1, 0.2)).write(tmp_path / "plain", labels=False, width=96, height=48)
     config = AnnotateConfig()
     whole = annotate.run(config, tmp_path / "plain", tmp_path / "whole")
     plain = read_scene(tmp_path / "plain")
