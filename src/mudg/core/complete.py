@@ -17,11 +17,12 @@ upright surface has one depth along an image column.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
@@ -201,7 +202,8 @@ def complete_depth(
     depth[sky], confidence[sky] = rules.sky_m, 0.8
     if not known.any():
         return DenseDepth(depth, confidence)
-    away_px, owner = ndimage.distance_transform_edt(~known, return_indices=True)
+    found: Any = ndimage.distance_transform_edt(~known, return_indices=True)
+    away_px, owner = found
     planes = _fit_planes(known, measured, rules)
     start, right, down = _expected(planes, owner, away_px, rules)
     beyond &= ~known
@@ -230,8 +232,8 @@ def _fit_planes(known: NDArray[np.bool_], measured: NDArray[np.float32], rules: 
         return planes
     at = np.c_[column, row].astype(np.float64)
     stretched = at * (_STRETCH, 1.0)
-    _, near = cKDTree(stretched).query(stretched, count)
-    near = near[:, 1:]
+    nearest: Any = KDTree(stretched).query(stretched, count)
+    near = nearest[1][:, 1:]  # the first is the point itself
     du, dv = at[near, 0] - at[:, :1], at[near, 1] - at[:, 1:]
     change = inverse[near] / inverse[:, None] - 1
     slope = np.zeros((2, len(row)))
@@ -309,7 +311,9 @@ def _solve(
         right_side = data * goal + np.bincount(second, slope, size) - np.bincount(first, slope, size) + 1e-6 * x
         upper = sparse.csr_matrix((-w, (first, second)), shape=(size, size), dtype=np.float32)
         matrix = (upper + upper.T + sparse.diags(diagonal, dtype=np.float32)).tocsr()
-        x = conjugate_gradients(matrix, right_side.astype(np.float32), x, 1 / diagonal, rules.iterations)
+        x = conjugate_gradients(
+            matrix, right_side.astype(np.float32), x, (1 / diagonal).astype(np.float32), rules.iterations
+        )
     out = np.zeros(sky.shape, np.float32)
     out[~sky] = x
     return out
