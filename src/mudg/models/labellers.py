@@ -1,13 +1,16 @@
 """Labels for images that came without any: what LiDAR, tracked boxes and plain colour can tell, and how sure it is.
 
-``geometry`` holds no parameters and needs no download. It knows few classes and says 255 (unlabelled) where it cannot tell:
+``geometry`` holds no parameters and needs no download. It starts from dense depth (``core.complete``), knows few classes and says 255
+(unlabelled) where it cannot tell:
 
-* **road**: ground points (near a plane fitted to the LiDAR) and the image between and below them. Sidewalks are flat as well
-  and are called road; far beside the path with less confidence. Green ground is **terrain**.
-* **car, truck, bus, train, person, rider, ...**: tracked boxes projected into the image where nothing nearer stands.
+* **road**: what lies near a ground plane fitted to the LiDAR. Green ground is **terrain**; beside the path and a kerb's height above the
+  plane it is **sidewalk**. Far beside the path all of it has less confidence.
+* **car, truck, bus, train, person, rider, ...**: tracked boxes, where the dense surface lies in them.
 * **sky**: bright or blue, smooth, above the horizon, joined to the top of the image, and without LiDAR returns.
 * **vegetation**: what rises from the ground, or stands above the horizon, and is green.
 * **building**: any other such thing. It means "something static that stands", not architecture.
+
+``network`` takes classes and sky from a segmentation network (``models.segmenters``), depth and movers as above.
 """
 
 from __future__ import annotations
@@ -223,6 +226,11 @@ def _measure(given: LabelInput) -> _Measured:
 def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) -> _Surface:
     """Dense depth of what is not sky, and its points."""
     beyond = beyond_reach(given.view, measured.depth_m, given.highest_rad, gap_deg=given.beam_gap_deg)
+    for _, track in _far_to_near(given):  # windows of what is tracked are silent, not far
+        pose = track.pose_at(given.view.time_s)
+        outline = None if pose is None else box_outline(given.view, pose, track.size_m)
+        if outline is not None:
+            beyond &= ~outline
     dense = complete_depth(given.rgb, measured.depth_m, sky, beyond, RULES)
     rows, columns = np.indices(sky.shape)
     uv = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], 1)
