@@ -345,7 +345,7 @@ def _paint_box(
         return  # the LiDAR sees around there and nothing is in the box: it is hidden, or empty
     label = TRAIN_ID_OF[track.label]
     if not (measured.any and label in _THIN):  # people and bicycles fill little of their boxes
-        guessed = box.outline & ~box.inside & ~(depth < box.middle_m + box.reach_m) & (certain < 0.5)
+        guessed = box.outline & ~box.inside & ~(depth < box.middle_m + box.reach_m) & (certain < 0.15)
         semantics[guessed], confidence[guessed] = label, 0.4
     semantics[box.inside], confidence[box.inside] = label, (0.5 + 0.4 * certain)[box.inside]
 
