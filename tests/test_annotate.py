@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +10,13 @@ import numpy as np
 import pytest
 from toy_scene import CAR_SIZE_M, ToyStreet
 
-from mudg.base import geometry
+from mudg.base import geometry, store
+from mudg.base.config import to_dict
+from mudg.base.errors import ResourceError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import EgoPath, Source, View
+from mudg.base.types import EgoPath, Ref, Source, Sweep, View
+from mudg.core.complete import ray_elevation
 from mudg.data.scenefile import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
 from mudg.models.labellers import (
     LABELLERS,
@@ -23,9 +27,11 @@ from mudg.models.labellers import (
     find_sky,
     fit_ground,
     label_by_geometry,
-    ray_elevation,
+    labeller,
 )  # fmt: skip
 from mudg.stages import annotate
+from mudg.stages.annotate_ego import steady_bottom
+from mudg.stages.annotate_points import nearest_sweeps
 from mudg.stages.config import AnnotateConfig
 
 STREET = ToyStreet(car_start=(11, 1.0), car_velocity=(2, 0))
@@ -61,7 +67,7 @@ def test_labels_of_a_street_agree_with_the_truth() -> None:
     assert overlap(labels.semantics, truth, "building", "vegetation", "wall") > 0.8
     assert (labels.semantics != UNLABELLED).mean() > 0.95
     assert set(np.unique(labels.semantics)) <= {
-        ID[n] for n in ("road", "terrain", "building", "vegetation", "sky", "car")
+        ID[n] for n in ("road", "sidewalk", "terrain", "building", "vegetation", "sky", "car")
     } | {UNLABELLED}
 
 
@@ -81,13 +87,13 @@ def test_depth_is_measured_where_it_says_it_is_sure() -> None:
     given, _ = given_at(STREET)
     labels = label_by_geometry(given)
     _, _, truth = STREET.image(given.view)
-    sure = labels.depth_confidence > 0.6
+    sure = (labels.depth_confidence > 0.6) & ~labels.sky
     assert sure.mean() > 0.3
     assert np.isfinite(truth[sure]).mean() > 0.99
     sure &= np.isfinite(truth)
     error = np.abs(labels.depth[sure] - truth[sure]) / truth[sure]
     assert np.median(error) < 0.01
-    assert np.isnan(labels.depth[labels.sky]).all()
+    assert (labels.depth[labels.sky] == 100).all()
     assert (labels.depth_confidence[np.isnan(labels.depth)] == 0).all()
 
 
@@ -96,7 +102,7 @@ def test_without_lidar_it_says_less_and_without_boxes_it_invents_no_car() -> Non
     blind = label_by_geometry(given)
     assert overlap(blind.semantics, truth, "sky") > 0.9
     assert not (blind.semantics == ID["road"]).any()
-    assert np.isnan(blind.depth).all()
+    assert np.isnan(blind.depth[~blind.sky]).all()
     assert blind.confidence[blind.semantics == ID["car"]].max(initial=0) <= 0.5
     given, _ = given_at(STREET, boxes=False)
     assert not (label_by_geometry(given).semantics == ID["car"]).any()
@@ -118,7 +124,7 @@ def test_all_black_and_all_white_images_do_not_break_it() -> None:
 
 
 def test_labels_of_boxes_are_train_ids() -> None:
-    assert set(LABELLERS) == {"geometry"}
+    assert set(LABELLERS) == {"geometry", "network"}
     assert TRAIN_ID_OF["van"] == ID["car"]
     assert TRAIN_ID_OF["cyclist"] == ID["rider"]
     unknown = replace(STREET.track(), label="shopping trolley")
@@ -207,14 +213,16 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
     assert [f.id for f in scene.frames] == [f.id for f in plain.frames]
     for frame, before in zip(scene.frames, plain.frames, strict=True):
         assert (read_image(scene, frame) == read_image(plain, before)).all()
-        assert set(frame.labels) == {"semantics", "sky", "semantics_confidence", "depth", "depth_confidence"}
+        assert set(frame.labels) == {"semantics", "sky", "semantics_confidence", "depth", "depth_confidence", "dynamic"}
         _, truth, _ = STREET.image(frame.view)
         assert overlap(read_label(scene, frame, "semantics"), truth, "road") > 0.9
     assert (read_points(scene, scene.sweeps[1]).xyz == read_points(plain, plain.sweeps[1]).xyz).all()
     assert dict(scene.split) == dict(plain.split)
     assert any("not truth" in note for note in scene.source.notes)
     assert not [f for f in check_scene(out) if f.level == "error"]
-    assert list((out / "pictures").glob("*.png"))
+    assert list((out / "pictures").glob("*.jpg"))
+    assert "not truth" in (out / "labels.html").read_text()
+    assert not (out / "labelled").exists()
     before_ns = (out / "scene.json").stat().st_mtime_ns
     assert annotate.run(AnnotateConfig(depth=True), tmp_path / "plain", out) == out
     assert (out / "scene.json").stat().st_mtime_ns == before_ns
@@ -222,7 +230,7 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
 
 def test_a_scene_with_labels_passes_through_unchanged(tmp_path: Path) -> None:
     given = STREET.write(tmp_path / "given")
-    scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "given", tmp_path / "out"))
+    scene = read_scene(annotate.run(AnnotateConfig(dynamic=False), tmp_path / "given", tmp_path / "out"))
     for frame, before in zip(scene.frames, given.frames, strict=True):
         assert set(frame.labels) == set(before.labels)
         assert (read_label(scene, frame, "semantics") == read_label(given, before, "semantics")).all()
@@ -240,3 +248,77 @@ def test_a_scene_with_images_only_can_be_labelled(tmp_path: Path) -> None:
         writer.finish()
     scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "s", tmp_path / "out"))
     assert overlap(read_label(scene, scene.frames[0], "semantics"), street.image(view)[1], "sky") > 0.9
+
+
+def test_movers_are_carried_and_marked(tmp_path: Path) -> None:
+    replace(STREET, times=(0.0, 0.4)).write(tmp_path / "plain", labels=False, width=160, height=80)
+    scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "plain", tmp_path / "out"))
+    for frame in scene.frames:
+        _, truth, depth = STREET.image(frame.view)
+        found = read_label(scene, frame, "dynamic").astype(bool)
+        car = truth == ID["car"]
+        assert (found & car).sum() / (found | car).sum() > 0.75
+        error = np.abs(read_label(scene, frame, "depth")[car] / depth[car] - 1)
+        assert np.median(error) < 0.02
+
+
+def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
+    replace(STREET, times=(0.0, 0.1, 0.2)).write(tmp_path / "plain", labels=False, width=96, height=48)
+    config = AnnotateConfig()
+    whole = annotate.run(config, tmp_path / "plain", tmp_path / "whole")
+    plain = read_scene(tmp_path / "plain")
+    settings = to_dict(config)
+    settings.pop("processes")
+    begun = store.RunDir.open(tmp_path / "begun", "annotate", settings, {"scene": store.digest(tmp_path / "plain")}, 2)
+    aside = tmp_path / "begun" / "labelled"
+    first = [frame.id for frame in plain.frames[:2]]
+    assert list(annotate.label_and_put_aside(config, plain, first, aside)) == first
+    stamps = {name: annotate.aside_file(aside, name).stat().st_mtime_ns for name in first}
+    begun.pause()
+    made: list[str] = []
+    real = annotate.label_and_put_aside
+
+    def watched(*args: object) -> Iterator[str]:
+        assert stamps == {name: annotate.aside_file(aside, name).stat().st_mtime_ns for name in first}
+        for name in real(*args):  # type: ignore[arg-type]
+            made.append(name)
+            yield name
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(annotate, "label_and_put_aside", watched)
+        again = annotate.run(config, tmp_path / "plain", tmp_path / "begun")
+    assert made == [frame.id for frame in plain.frames[2:]]
+    for path in sorted((whole / "labels").rglob("*.*")):
+        assert path.read_bytes() == (again / path.relative_to(whole)).read_bytes()
+
+
+def test_a_label_that_is_there_stays_and_gets_no_confidence() -> None:
+    labels = label_by_geometry(given_at(STREET)[0])
+    arrays = annotate.label_arrays(AnnotateConfig(depth=False, dynamic=False), labels)
+    assert set(arrays) == {"semantics", "semantics_confidence", "sky"}
+    assert annotate.wanted_labels(AnnotateConfig(ego=True)) == {"semantics", "sky", "depth", "dynamic", "ego"}
+
+
+def test_sweeps_nearest_in_time_are_chosen() -> None:
+    sweeps = [Sweep(f"lidar/{n:06d}", "lidar", 0.1 * n, np.eye(4), Ref("x")) for n in range(20)]
+    assert [s.time_s for s in nearest_sweeps(sweeps, 0.96, 4)] == pytest.approx([0.8, 0.9, 1.0, 1.1])
+    assert [s.time_s for s in nearest_sweeps(sweeps, 3.85, 6)] == pytest.approx([1.9])
+    assert nearest_sweeps(sweeps, 9.0, 6) == []
+
+
+def test_bonnet_is_what_stays_the_same() -> None:
+    rng = np.random.default_rng(3)
+    grey = rng.uniform(60, 200, (12, 60, 90))
+    bonnet = np.zeros((60, 90), bool)
+    bonnet[48:, 20:70] = True
+    grey[:, bonnet] = rng.uniform(60, 200, bonnet.sum()) + rng.normal(0, 1, (12, bonnet.sum()))
+    found = steady_bottom(grey)
+    assert (found & bonnet).sum() / (found | bonnet).sum() > 0.85
+    assert not steady_bottom(rng.uniform(60, 200, (12, 60, 90))).any()
+
+
+def test_unknown_labeller_and_missing_weights_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="labeller"):
+        labeller("magic")
+    with pytest.raises(ResourceError, match="weights"):
+        labeller("network", str(tmp_path / "nothing"))

@@ -1,13 +1,16 @@
 """Labels for images that came without any: what LiDAR, tracked boxes and plain colour can tell, and how sure it is.
 
-``geometry`` holds no parameters and needs no download. It knows few classes and says 255 (unlabelled) where it cannot tell:
+``geometry`` holds no parameters and needs no download. It starts from dense depth (``core.complete``), knows few classes and says 255
+(unlabelled) where it cannot tell:
 
-* **road**: ground points (near a plane fitted to the LiDAR) and the image between and below them. Sidewalks are flat as well
-  and are called road; far beside the path with less confidence. Green ground is **terrain**.
-* **car, truck, bus, train, person, rider, ...**: tracked boxes projected into the image where nothing nearer stands.
+* **road**: what lies near a ground plane fitted to the LiDAR. Green ground is **terrain**; beside the path and a kerb's height above the
+  plane it is **sidewalk**. Far beside the path all of it has less confidence.
+* **car, truck, bus, train, person, rider, ...**: tracked boxes, where the dense surface lies in them.
 * **sky**: bright or blue, smooth, above the horizon, joined to the top of the image, and without LiDAR returns.
 * **vegetation**: what rises from the ground, or stands above the horizon, and is green.
 * **building**: any other such thing. It means "something static that stands", not architecture.
+
+``network`` takes classes and sky from a segmentation network (``models.segmenters``), depth and movers as above.
 """
 
 from __future__ import annotations
@@ -22,9 +25,11 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from mudg.base import geometry
+from mudg.base.errors import UsageError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Track, View
-from mudg.core.fusion import FusionRules, hidden_points, points_in_box, standing_points
+from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation, visible_depth
+from mudg.core.fusion import points_in_box
 
 TRAIN_ID_OF: Final[Mapping[str, int]] = {
     "car": ID["car"], "van": ID["car"], "vehicle": ID["car"], "misc": ID["car"], "truck": ID["truck"], "bus": ID["bus"],
@@ -37,6 +42,13 @@ TRAIN_ID_OF: Final[Mapping[str, int]] = {
 GAP_DEG: Final = 0.6
 """Beams of a turning LiDAR are at most this far apart; between two returns closer than this the surface goes on."""
 GROUND_M: Final = 0.2
+"""Height above the ground plane up to which a pixel is ground (and a little more far away)."""
+PAVEMENT_M: Final = 0.07
+"""Ground beside the road that is higher than this is sidewalk."""
+FLOOR_M: Final = 0.1
+GROWTH_M: Final = 0.15
+"""Boxes begin this far above their floor and are grown by this on each side: annotations are not exact."""
+RULES: Final = CompletionRules()
 NEAR_ROAD_M: Final = 4.0
 _GRASS: Final = 6.0
 _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
@@ -52,6 +64,9 @@ class LabelInput:
         xyz_world: f32[N, 3] metres: LiDAR returns of static things and of things as they stand at the image's time.
         tracks: tracked boxes.
         path_world: f64[M, 3], places of the vehicle.
+        beam_gap_deg: largest angle between neighbouring beams of the LiDAR.
+        highest_rad: elevation of its highest beam above the horizontal.
+        moving: numbers of the tracks that move at some time of the log.
     """
 
     view: View
@@ -59,62 +74,107 @@ class LabelInput:
     xyz_world: NDArray[np.float32]
     tracks: Sequence[Track]
     path_world: NDArray[np.float64]
+    beam_gap_deg: float = GAP_DEG
+    highest_rad: float = 0.0
+    moving: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labels:
-    """``semantics`` u8[H, W] train ids, 255 = cannot tell; ``confidence`` f32[H, W] in 0..1; ``sky`` bool[H, W];
-    ``depth`` f32[H, W] metres with NaN = unknown, and ``depth_confidence`` f32[H, W] in 0..1."""
+    """``semantics`` u8[H, W] train ids, 255 = cannot tell; ``confidence`` f32[H, W] in 0..1; ``sky`` and ``dynamic`` bool[H, W];
+    ``depth`` f32[H, W] metres, the sky at ``CompletionRules.sky_m``, NaN = unknown; ``depth_confidence`` f32[H, W] in 0..1."""
 
     semantics: NDArray[np.uint8]
     confidence: NDArray[np.float32]
     sky: NDArray[np.bool_]
+    dynamic: NDArray[np.bool_]
     depth: NDArray[np.float32]
     depth_confidence: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Returns:
-    """LiDAR returns that the image sees: rows and columns, depth, height above ground, distance to the path, all [n]."""
+class _Measured:
+    """Visible returns of an image: ``depth_m`` f32[H, W], NaN = none, and ``away_px`` f32[H, W], distance to the nearest."""
 
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
     depth_m: NDArray[np.float32]
-    height_m: NDArray[np.float32]
-    beside_m: NDArray[np.float32]
+    away_px: NDArray[np.float32]
+    gap_px: float
+
+    @property
+    def any(self) -> bool:
+        return bool(np.isfinite(self.away_px[0, 0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """Dense depth in space: ``xyz_world`` f32[H, W, 3] (NaN = unknown), depth f32[H, W] metres, ``confidence`` f32[H, W]."""
+
     xyz_world: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
 
 
 def label_by_geometry(given: LabelInput) -> Labels:
     """Label one image from LiDAR, boxes and colour; see the module text. Works, with less, without LiDAR or boxes."""
-    height, width = given.rgb.shape[:2]
-    ground = fit_ground(given.xyz_world, given.path_world)
-    returns = _visible_returns(given, ground)
-    gap_px = max(1.5, np.deg2rad(GAP_DEG) * given.view.camera.fy)
-    away_px, nearest = _nearest_return(returns, (height, width))
+    measured = _measure(given)
     elevation = ray_elevation(given.view)
-    sky = find_sky(given.rgb, elevation, away_px, gap_px)
-    semantics = np.full((height, width), UNLABELLED, np.uint8)
-    confidence = np.zeros((height, width), np.float32)
-    if nearest is not None:
-        _paint_returns(semantics, confidence, returns, nearest, away_px, gap_px, _greenness(given.rgb))
-        _paint_road_below(semantics, confidence)
+    sky = find_sky(given.rgb, elevation, measured.away_px, measured.gap_px)
+    surface = _complete(given, measured, sky)
+    semantics = np.full(sky.shape, UNLABELLED, np.uint8)
+    confidence = np.zeros(sky.shape, np.float32)
+    greenness = _greenness(given.rgb)
+    if measured.any:
+        _paint_surface(semantics, confidence, given, surface, greenness)
     standing = (semantics == UNLABELLED) & (elevation > 0) & ~sky
-    green = _greenness(given.rgb) > 0
-    semantics[standing] = np.where(green[standing], ID["vegetation"], ID["building"])
+    semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
     confidence[standing] = 0.3
     semantics[sky], confidence[sky] = ID["sky"], 0.8
-    depth = np.full((height, width), np.nan, np.float32) if nearest is None else returns.depth_m[nearest]
-    for track in _far_to_near(given):
-        _paint_box(semantics, confidence, track, given.view, returns, depth)
+    for _, track in _far_to_near(given):
+        _paint_box(semantics, confidence, track, given.view, measured, surface)
     sky &= semantics == ID["sky"]
-    depth[sky] = np.nan
-    depth_confidence = np.where(np.isfinite(depth), np.exp(-away_px / gap_px), 0).astype(np.float32)
-    return Labels(semantics, confidence, sky, depth, depth_confidence)
+    return _with_surface(given, semantics, confidence, sky, surface)
 
 
-LABELLERS: Mapping[str, Callable[[LabelInput], Labels]] = {"geometry": label_by_geometry}
-"""Name -> labeller of one image."""
+def label_by_network(given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32]) -> Labels:
+    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, depth and movers from the rest."""
+    measured = _measure(given)
+    sky = (semantics == ID["sky"]) & ~np.isfinite(measured.depth_m)
+    return _with_surface(given, semantics, confidence, sky, _complete(given, measured, sky))
+
+
+def _with_surface(
+    given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32], sky: NDArray[np.bool_], surface: _Surface
+) -> Labels:  # fmt: skip
+    depth, depth_confidence = surface.depth.copy(), surface.confidence.copy()
+    depth[sky] = RULES.sky_m
+    painted_over = ~sky & (depth == RULES.sky_m)  # a box before the sky that nothing measured
+    depth_confidence[painted_over] = 0
+    return Labels(semantics, confidence, sky, find_dynamic(given, semantics, surface), depth, depth_confidence)
+
+
+Labeller = Callable[[LabelInput], Labels]
+
+
+def _network(weights: str) -> Labeller:
+    from mudg.models.segmenters import Segmenter
+
+    segmenter = Segmenter.load(weights)
+    return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
+
+
+LABELLERS: Mapping[str, Callable[[str], Labeller]] = {"geometry": lambda _: label_by_geometry, "network": _network}
+"""Name -> what makes a labeller of one image from a folder of weights (unused by those that hold no parameters)."""
+
+
+def labeller(name: str, weights: str = "") -> Labeller:
+    """A labeller of the table, ready for use.
+
+    Raises:
+        UsageError: no such labeller. ResourceError: its weights, or the packages that read them, are missing.
+    """
+    if name not in LABELLERS:
+        raise UsageError("there is no such labeller", expected=", ".join(LABELLERS), got=name)
+    return LABELLERS[name](weights)
 
 
 # --- ground and returns ---------------------------------------------------------------------------------------------
@@ -155,26 +215,27 @@ def _plane_z(plane: NDArray[np.float64], xyz: NDArray[np.floating]) -> NDArray[n
     return xyz[:, 0] * plane[0] + xyz[:, 1] * plane[1] + plane[2]
 
 
-def _visible_returns(given: LabelInput, ground: NDArray[np.float64] | None) -> _Returns:
-    camera = given.view.camera
-    uv, z = geometry.project(given.view, given.xyz_world)
-    with np.errstate(invalid="ignore"):
-        inside = (z > 0.5) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    xyz, uv, z = given.xyz_world[inside], uv[inside], z[inside].astype(np.float32)
-    xyz_cam = geometry.transform_points(given.view.cam_from_world, xyz).astype(np.float32)
-    seen = (
-        ~hidden_points(xyz_cam, standing_points(xyz), given.view, 0.4, FusionRules(occlusion_relative=0.08))
-        if len(xyz)
-        else np.zeros(0, bool)
-    )
-    xyz, uv, z = xyz[seen], uv[seen], z[seen]
-    height = (
-        (xyz[:, 2] - _plane_z(ground, xyz)).astype(np.float32)
-        if ground is not None
-        else np.full(len(xyz), np.inf, np.float32)
-    )
-    beside = distance_to_path(xyz, given.path_world).astype(np.float32)
-    return _Returns(uv[:, 1].astype(np.intp), uv[:, 0].astype(np.intp), z, height, beside, xyz)
+def _measure(given: LabelInput) -> _Measured:
+    gap_px = max(1.5, float(np.deg2rad(given.beam_gap_deg)) * given.view.camera.fy)
+    depth = visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg)
+    known = np.isfinite(depth)
+    away = ndimage.distance_transform_edt(~known) if known.any() else np.full(depth.shape, np.inf)
+    return _Measured(depth, np.asarray(away, np.float32), gap_px)
+
+
+def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) -> _Surface:
+    """Dense depth of what is not sky, and its points."""
+    beyond = beyond_reach(given.view, measured.depth_m, given.highest_rad, gap_deg=given.beam_gap_deg)
+    for _, track in _far_to_near(given):  # windows of what is tracked are silent, not far
+        pose = track.pose_at(given.view.time_s)
+        outline = None if pose is None else box_outline(given.view, pose, track.size_m)
+        if outline is not None:
+            beyond &= ~outline
+    dense = complete_depth(given.rgb, measured.depth_m, sky, beyond, RULES)
+    rows, columns = np.indices(sky.shape)
+    uv = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], 1)
+    xyz = geometry.unproject(given.view, uv, dense.depth.ravel().astype(np.float64))
+    return _Surface(xyz.reshape(*sky.shape, 3).astype(np.float32), dense.depth, dense.confidence)
 
 
 def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -197,98 +258,107 @@ def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.flo
     return cKDTree(line).query(xyz_world[:, :2])[0]
 
 
-def _nearest_return(returns: _Returns, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.intp] | None]:
-    """Distance in pixels to the nearest return f32[H, W], and which it is; infinitely far without returns."""
-    if len(returns.row) == 0:
-        return np.full(shape, np.inf, np.float32), None
-    which = np.full(shape, -1, np.intp)
-    order = np.argsort(-returns.depth_m, kind="stable")
-    which[returns.row[order], returns.column[order]] = order
-    away, index = ndimage.distance_transform_edt(which < 0, return_indices=True)
-    return away.astype(np.float32), which[index[0], index[1]]
-
-
-def ray_elevation(view: View) -> NDArray[np.float32]:
-    """Elevation of each pixel's ray above the horizontal plane, radians, f32[H, W]."""
-    camera = view.camera
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    up = view.world_from_cam[2, :3]
-    rise = up[0] * x[None] + up[1] * y[:, None] + up[2]
-    return np.arcsin(rise / np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)).astype(np.float32)
-
-
 # --- painting -------------------------------------------------------------------------------------------------------
 
 
-def _paint_returns(
-    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], returns: _Returns, nearest: NDArray[np.intp],
-    away_px: NDArray[np.float32], gap_px: float, greenness: NDArray[np.float32],
+def _paint_surface(
+    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], given: LabelInput, surface: _Surface,
+    greenness: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Each pixel within a beam's gap of a return takes what the return stands for."""
-    is_ground = np.abs(returns.height_m) < GROUND_M + 0.005 * returns.depth_m
-    covered = away_px <= gap_px
-    ground_here = is_ground[nearest] & covered
-    beside = returns.beside_m[nearest]
-    semantics[ground_here] = np.where(greenness[ground_here] > _GRASS, ID["terrain"], ID["road"])
-    closeness = 1 - 0.5 * away_px / gap_px
-    confidence[ground_here] = (np.where(beside < NEAR_ROAD_M, 0.9, 0.5) * closeness)[ground_here]
-    standing = covered & ~ground_here
+    """Each pixel of known depth by its height above the ground, its place beside the path, and its colour."""
+    ground = fit_ground(given.xyz_world, given.path_world)
+    known = np.isfinite(surface.depth)
+    height = np.full(known.shape, np.inf, np.float32)
+    if ground is not None:
+        height = surface.xyz_world[..., 2] - _plane_z(ground, surface.xyz_world.reshape(-1, 3)).reshape(known.shape)
+    flat = known & (np.abs(height) < GROUND_M + 0.005 * surface.depth)
+    beside = _beside_path(surface, given.path_world)
+    green = greenness > _GRASS
+    semantics[flat] = np.where(green[flat], ID["terrain"], ID["road"])
+    confidence[flat] = np.where(beside[flat] < NEAR_ROAD_M, 0.9, 0.5) * (0.3 + 0.7 * surface.confidence[flat])
+    raised = flat & ~green & (beside > NEAR_ROAD_M) & (height > PAVEMENT_M)
+    semantics[raised], confidence[raised] = ID["sidewalk"], 0.4
+    standing = known & ~flat & (height > 0)
     semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
-    confidence[standing] = 0.5 * closeness[standing]
+    confidence[standing] = 0.3 + 0.2 * surface.confidence[standing]
 
 
-def _paint_road_below(semantics: NDArray[np.uint8], confidence: NDArray[np.float32]) -> None:
-    """The part of the image below the lowest beam is road where the lowest label above it is road."""
-    height = semantics.shape[0]
-    labelled = semantics != UNLABELLED
-    last = height - 1 - labelled[::-1].argmax(0)
-    columns = np.flatnonzero(labelled.any(0))
-    columns = columns[semantics[last[columns], columns] == ID["road"]]
-    below = np.zeros(semantics.shape, bool)
-    below[:, columns] = np.arange(height)[:, None] > last[columns][None]
-    semantics[below] = ID["road"]
-    confidence[below] = 0.5
+def _beside_path(surface: _Surface, path_world: NDArray[np.float64], step: int = 4) -> NDArray[np.float32]:
+    """Horizontal distance to the path f32[H, W], worked out at every ``step``-th pixel; infinite where depth is unknown."""
+    coarse = surface.xyz_world[::step, ::step].reshape(-1, 3)
+    beside = np.full(len(coarse), np.inf, np.float32)
+    known = np.isfinite(coarse).all(1)
+    beside[known] = distance_to_path(coarse[known], path_world)
+    height, width = surface.depth.shape
+    grid = beside.reshape(-(-height // step), -(-width // step))
+    return grid.repeat(step, 0).repeat(step, 1)[:height, :width]
 
 
-def _far_to_near(given: LabelInput) -> list[Track]:
+def _far_to_near(given: LabelInput) -> list[tuple[int, Track]]:
+    """Tracks with a class that are present, and their numbers."""
     here = given.view.center_world
-    present = [(track, track.pose_at(given.view.time_s)) for track in given.tracks if track.label in TRAIN_ID_OF]
-    placed = [(float(np.linalg.norm(pose[:3, 3] - here)), track) for track, pose in present if pose is not None]
-    return [track for _, track in sorted(placed, key=lambda item: -item[0])]
+    placed: list[tuple[float, int, Track]] = []
+    for number, track in enumerate(given.tracks):
+        pose = track.pose_at(given.view.time_s) if track.label in TRAIN_ID_OF else None
+        if pose is not None:
+            placed.append((float(np.linalg.norm(pose[:3, 3] - here)), number, track))
+    return [(number, track) for _, number, track in sorted(placed, key=lambda item: -item[0])]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BoxPixels:
+    """Pixels of a box: the part of the image around it, its outline in there, and where the surface lies in the box, both
+    bool[h, w]; ``middle_m`` and ``reach_m`` are its depth and half its diagonal."""
+
+    window: tuple[slice, slice]
+    outline: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+    middle_m: float
+    reach_m: float
+
+
+def _box_pixels(track: Track, view: View, surface: _Surface) -> _BoxPixels | None:
+    pose = track.pose_at(view.time_s)
+    outline = None if pose is None else box_outline(view, pose, track.size_m + 2 * GROWTH_M)
+    if pose is None or outline is None:
+        return None
+    window = (_span(outline.any(1), 1), _span(outline.any(0), 1))
+    outline = outline[window]
+    at = np.nonzero(outline & np.isfinite(surface.depth[window]))
+    local = geometry.transform_points(geometry.invert(pose), surface.xyz_world[window][at].astype(np.float64))
+    inside = np.zeros(outline.shape, bool)
+    inside[at] = points_in_box(local, track.size_m, GROWTH_M, FLOOR_M)
+    middle = float((view.cam_from_world @ pose)[2, 3])
+    return _BoxPixels(window, outline, inside, middle, float(np.linalg.norm(track.size_m)) / 2)
 
 
 def _paint_box(
-    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], track: Track, view: View, returns: _Returns, depth: NDArray[np.float32]
+    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], track: Track, view: View, measured: _Measured, surface: _Surface
 ) -> None:  # fmt: skip
-    """Paint a tracked box: surely where returns lie in it, less surely in the rest of its outline; not behind nearer things."""
-    pose = track.pose_at(view.time_s)
-    if pose is None:
+    """Paint a tracked box: surely where the surface lies in it, less surely in the rest of its outline; not behind nearer things."""
+    box = _box_pixels(track, view, surface)
+    if box is None:
         return
-    outline = box_outline(view, pose, track.size_m)
-    if outline is None:
-        return
-    reach = max(1, round(float(np.deg2rad(GAP_DEG)) * view.camera.fy / 2))
-    rows, columns = (_span(outline.any(axis), reach) for axis in (1, 0))
-    outline, depth, semantics, confidence = (m[rows, columns] for m in (outline, depth, semantics, confidence))
-    half_diagonal = float(np.linalg.norm(track.size_m)) / 2
-    middle = float((view.cam_from_world @ pose)[2, 3])
-    in_front = np.isfinite(depth) & (depth < middle - half_diagonal)
-    near = np.flatnonzero(np.abs(returns.depth_m - middle) <= half_diagonal + 0.5)
-    local = geometry.transform_points(geometry.invert(pose), returns.xyz_world[near])
-    inside = near[points_in_box(local, track.size_m, 0.1, 0.1)]
-    sure = np.zeros((view.camera.height, view.camera.width), bool)
-    sure[returns.row[inside], returns.column[inside]] = True
-    sure = _at_edges_too(ndimage.binary_closing, sure[rows, columns], reach) & outline
-    if len(inside) == 0 and np.isfinite(depth).any():
+    semantics, confidence, depth = (m[box.window] for m in (semantics, confidence, surface.depth))
+    certain = surface.confidence[box.window]
+    if measured.any and not (box.inside & np.isfinite(measured.depth_m[box.window])).any():
         return  # the LiDAR sees around there and nothing is in the box: it is hidden, or empty
     label = TRAIN_ID_OF[track.label]
-    road_before_it = (semantics == ID["road"]) & (confidence > 0.4) & (depth < middle + half_diagonal)
-    fill = outline & ~in_front & ~road_before_it
-    if label in _THIN and len(inside):
-        fill &= ndimage.binary_dilation(sure, iterations=max(1, reach // 2))  # they fill little of their boxes
-    semantics[fill], confidence[fill] = label, 0.5
-    semantics[sure], confidence[sure] = label, 0.9
+    if not (measured.any and label in _THIN):  # people and bicycles fill little of their boxes
+        guessed = box.outline & ~box.inside & ~(depth < box.middle_m + box.reach_m) & (certain < 0.15)
+        semantics[guessed], confidence[guessed] = label, 0.4
+    semantics[box.inside], confidence[box.inside] = label, (0.5 + 0.4 * certain)[box.inside]
+
+
+def find_dynamic(given: LabelInput, semantics: NDArray[np.uint8], surface: _Surface) -> NDArray[np.bool_]:
+    """Pixels of tracked things that move, bool[H, W]: the surface lies in their box, or is unsure and has their class."""
+    dynamic = np.zeros(semantics.shape, bool)
+    for number, track in _far_to_near(given):
+        box = _box_pixels(track, given.view, surface) if number in given.moving else None
+        if box is not None:
+            unsure = box.outline & ~(surface.confidence[box.window] > 0.3)
+            dynamic[box.window] |= box.inside | (unsure & (semantics[box.window] == TRAIN_ID_OF[track.label]))
+    return dynamic
 
 
 def _span(present: NDArray[np.bool_], margin: int) -> slice:

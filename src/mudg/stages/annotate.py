@@ -1,39 +1,49 @@
-"""``mudg annotate``: a scene without labels -> the same scene with semantics and sky, each pixel with a confidence.
+"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and movers, each pixel with a confidence.
 
-The result is a complete new scene; the given one is not touched. A scene whose frames all have semantics already is
-copied as it is. What made the labels is written into the scene's notes, so that nobody takes them for truth.
+The result is a complete new scene; the given one is not touched. A label that a frame has already is kept, one that it lacks
+is made; a scene whose frames lack nothing is copied as it is. What made the labels is written into the scene's notes, so that
+nobody takes them for truth.
+
+Frames are labelled in processes of their own, and each is put aside when it is done: the same command goes on where it was
+stopped.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 import functools
+import multiprocessing
+import os
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from mudg.base import geometry, log, palette, store
+from mudg.base import log, store
 from mudg.base.config import to_dict
-from mudg.base.types import Frame, Scene, Sweep
-from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
-from mudg.data.scenefile import SceneWriter, read_image, read_points, read_scene
-from mudg.models.labellers import LABELLERS, LabelInput, Labels
+from mudg.base.types import Frame, Scene
+from mudg.data.scenefile import SceneWriter, read_image, read_scene
+from mudg.models.labellers import LabelInput, Labels, labeller
 from mudg.stages import batch
+from mudg.stages.annotate_ego import find_ego
+from mudg.stages.annotate_page import write_page
+from mudg.stages.annotate_points import NearbyReturns
 from mudg.stages.config import AnnotateConfig
 from mudg.stages.ingest import add_frame_copy, add_rest
+from mudg.stages.synthesize import quiet_openmp
 
-_VERSION = 1
-NEIGHBOURS = 2
-"""Sweeps before and after the image's own whose static points help."""
-_PICTURES = 6
+_VERSION = 2
+_ASIDE = "labelled"
+_FRAMES_PER_PROCESS = 8
+"""Fewer frames than this are not worth the start of a process."""
 
 
 def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = False) -> Path:
-    """Label a scene; ``out`` becomes a scene with labels, and ``pictures/`` shows some of them.
+    """Label a scene; ``out`` becomes a scene with labels, and ``labels.html`` shows some of them.
 
     Args:
         config: see ``AnnotateConfig``.
@@ -41,22 +51,29 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
         out: output folder; a finished result of the same configuration and scene is verified and reused.
 
     Raises:
-        InputError: the scene is malformed. UsageError: ``out`` holds something else.
+        InputError: the scene is malformed. UsageError: ``out`` holds something else. ResourceError: weights are missing.
     """
-    folder = store.RunDir.open(out, "annotate", to_dict(config), {"scene": store.digest(scene)}, _VERSION, overwrite)
+    settings = to_dict(config)
+    settings.pop("processes")  # changes no result
+    folder = store.RunDir.open(out, "annotate", settings, {"scene": store.digest(scene)}, _VERSION, overwrite)
     if folder.complete:
         return folder.reused()
     loaded = read_scene(scene)
-    missing = [frame for frame in loaded.frames if "semantics" not in frame.labels]
+    wanted = wanted_labels(config)
+    missing = [frame for frame in loaded.frames if not wanted <= set(frame.labels)]
     if not missing:
         log.info("annotate: labels present, nothing to do; the scene is passed through")
     if not (folder.path / "scene.json").is_file():
-        note = f"semantics and sky of {len(missing)} frames: labeller '{config.labeller}', not truth"
-        source = dataclasses.replace(loaded.source, notes=(*loaded.source.notes, *((note,) if missing else ())))
+        aside = folder.path / _ASIDE
+        _label_frames(config, Path(scene), loaded, missing, aside)
+        source = dataclasses.replace(loaded.source, notes=(*loaded.source.notes, *_notes(config, loaded, missing)))
         with SceneWriter(folder.path, loaded.id, source) as writer:
             add_rest(writer, loaded)
-            _label_frames(config, loaded, writer, folder.path)
+            _add_frames(config, loaded, missing, aside, writer)
             writer.finish()
+    made = read_scene(folder.path)
+    write_page(made, {frame.id for frame in missing}, folder.path)
+    shutil.rmtree(folder.path / _ASIDE, ignore_errors=True)
     folder.finish({"labelled": len(missing), "labeller": config.labeller if missing else "labels present"})
     return folder.path
 
@@ -66,7 +83,7 @@ def run_many(
 ) -> dict[str, Any]:
     """``run`` for every scene of a list; see ``stages/batch.py``."""
     entries = batch.shard(batch.read_list(listed), shard)
-    work = functools.partial(_one_of_many, config)
+    work = functools.partial(_one_of_many, dataclasses.replace(config, processes=1))
     return batch.run_batch("annotate", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
 
 
@@ -74,82 +91,105 @@ def _one_of_many(config: AnnotateConfig, entry: batch.Entry, out: Path, overwrit
     return run(config, Path(entry.source), out, overwrite=overwrite)
 
 
-def _label_frames(config: AnnotateConfig, scene: Scene, writer: SceneWriter, out: Path) -> None:
-    label = LABELLERS[config.labeller]
-    returns = _NearbyReturns(scene)
-    shown = {frame.id for frame in scene.frames[:: max(1, len(scene.frames) // _PICTURES)]}
-    for frame in log.progress(scene.frames, len(scene.frames), "labelling frames"):
-        if "semantics" in frame.labels:
-            add_frame_copy(writer, scene, frame)
-            continue
-        rgb = read_image(scene, frame)
-        path = scene.ego.world_from_ego[:, :3, 3]
-        labels = label(LabelInput(frame.view, rgb, returns.of(frame), scene.tracks, path))
-        add_frame_copy(writer, scene, frame, label_arrays(labels, config.depth))
-        if frame.id in shown:
-            with store.atomic_path(out / "pictures" / f"{frame.id.replace('/', '_')}.png") as temporary:
-                picture(rgb, labels).save(temporary)
+def wanted_labels(config: AnnotateConfig) -> set[str]:
+    """Names of the labels that every frame shall have; a confidence comes only with a label that was made."""
+    return {"semantics", "sky"} | ({"depth"} if config.depth else set()) | ({"dynamic"} if config.dynamic else set()) | (
+        {"ego"} if config.ego else set()
+    )  # fmt: skip
 
 
-def label_arrays(labels: Labels, with_depth: bool) -> dict[str, NDArray[Any]]:
-    """Labels as a scene stores them."""
+def _notes(config: AnnotateConfig, scene: Scene, missing: Sequence[Frame]) -> Iterator[str]:
+    """A sentence for each label that was made: for how many frames, and from what."""
+    made_by = f"labeller '{config.labeller}'"
+    depth = f"points of {config.sweeps} sweeps, filled along the image, sky at a fixed distance"
+    origins = {"semantics": made_by, "sky": made_by, "depth": depth, "dynamic": "tracked boxes that move and dense depth",
+               "ego": "pixels that stay the same while the vehicle moves"}  # fmt: skip
+    for name, origin in origins.items():
+        count = sum(name in wanted_labels(config) and name not in frame.labels for frame in missing)
+        if count:
+            yield f"{name} of {count} frames: {origin}, not truth"
+
+
+# --- one frame after the other ----------------------------------------------------------------------------------------
+
+
+def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Sequence[Frame], aside: Path) -> None:
+    """Put the labels of every frame that has none yet into ``aside``."""
+    todo = [frame.id for frame in missing if not aside_file(aside, frame.id).is_file()]
+    if len(todo) < len(missing):
+        log.info(f"annotate: {len(missing) - len(todo)} frames were labelled before")
+    processes = min(config.processes or os.cpu_count() or 1, len(todo) // _FRAMES_PER_PROCESS)
+    with log.task("labelling frames", len(missing), len(missing) - len(todo)) as bar:
+        if processes <= 1:
+            for _ in label_and_put_aside(config, scene, todo, aside):
+                bar.advance()
+            return
+        parts = [list(part) for part in np.array_split(np.array(todo, dtype=object), 4 * processes)]
+        context = multiprocessing.get_context("spawn")
+        with quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
+            futures = [pool.submit(_label_in_process, config, path, part, aside) for part in parts if part]
+            try:
+                for future in concurrent.futures.as_completed(futures):
+                    bar.advance(future.result())
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+
+def _label_in_process(config: AnnotateConfig, path: Path, ids: list[str], aside: Path) -> int:
+    log.set_quiet(True)
+    return sum(1 for _ in label_and_put_aside(config, read_scene(path), ids, aside))
+
+
+def label_and_put_aside(config: AnnotateConfig, scene: Scene, ids: Sequence[str], aside: Path) -> Iterator[str]:
+    """Label these frames one after the other, write each to ``aside``, and name it when it is there."""
+    if not ids:
+        return
+    label = labeller(config.labeller, config.weights)
+    returns = NearbyReturns(scene, config.sweeps)
+    place = scene.ego.world_from_ego[:, :3, 3]
+    frames = {frame.id: frame for frame in scene.frames}
+    for frame_id in ids:
+        frame = frames[frame_id]
+        near = returns.of(frame)
+        labels = label(
+            LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, place, near.beam_gap_deg,
+                       near.highest_rad, returns.moving)
+        )  # fmt: skip
+        store.write_safetensors(aside_file(aside, frame_id), label_arrays(config, labels))
+        yield frame_id
+
+
+def aside_file(aside: Path, frame_id: str) -> Path:
+    """Where the labels of a frame lie until the scene is written."""
+    return aside / f"{frame_id}.safetensors"
+
+
+def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[Any]]:
+    """Labels under the names that a scene has for them; what was not asked for is left out."""
     arrays: dict[str, NDArray[Any]] = {
         "semantics": labels.semantics, "sky": labels.sky, "semantics_confidence": labels.confidence,
     }  # fmt: skip
-    if with_depth:
+    if config.depth:
         arrays |= {"depth": labels.depth, "depth_confidence": labels.depth_confidence}
+    if config.dynamic:
+        arrays["dynamic"] = labels.dynamic
     return arrays
 
 
-class _NearbyReturns:
-    """LiDAR returns for an image: its own sweep with movers where they are then, and static points of neighbouring sweeps."""
-
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        rules = FusionRules()
-        self._movers = [track for track in scene.tracks if judge_track(track, rules).moving]
-        self._rules = rules
-        self._times = np.array([sweep.time_s for sweep in scene.sweeps])
-        self._kept: dict[str, tuple[NDArray[np.float32], NDArray[np.int32], dict[int, NDArray[np.float32]]]] = {}
-
-    def of(self, frame: Frame) -> NDArray[np.float32]:
-        """Points f32[N, 3] in the world."""
-        if len(self._times) == 0:
-            return np.zeros((0, 3), np.float32)
-        own = int(np.abs(self._times - frame.view.time_s).argmin())
-        chosen = self._scene.sweeps[max(0, own - NEIGHBOURS) : own + NEIGHBOURS + 1]
-        parts = [np.zeros((0, 3), np.float32)]
-        for sweep in chosen:
-            world, owner, owned = self._separated(sweep, chosen)
-            parts.append(world[owner == STATIC])
-            if sweep is self._scene.sweeps[own]:
-                parts += list(self._movers_at(frame.view.time_s, owned))
-        return np.concatenate(parts)
-
-    def _movers_at(self, time_s: float, owned: dict[int, NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
-        for index, xyz_object in owned.items():
-            pose = self._movers[index].pose_at(time_s)
-            if pose is not None:
-                yield geometry.transform_points(pose, xyz_object).astype(np.float32)
-
-    def _separated(
-        self, sweep: Sweep, wanted: Sequence[Sweep]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int32], dict[int, NDArray[np.float32]]]:
-        if sweep.id not in self._kept:
-            ids = {other.id for other in wanted}
-            self._kept = {key: value for key, value in self._kept.items() if key in ids}
-            points = read_points(self._scene, sweep)
-            owner, owned = separate(
-                SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), self._movers, self._rules
-            )
-            world = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
-            self._kept[sweep.id] = (world, owner, owned)
-        return self._kept[sweep.id]
-
-
-def picture(rgb: NDArray[np.uint8], labels: Labels) -> Image.Image:
-    """Image over image with labels over confidence."""
-    colours = palette.encode(labels.semantics, palette.DISPLAY_COLORS)
-    mixed = (0.45 * rgb + 0.55 * colours).astype(np.uint8)
-    grey = np.repeat((labels.confidence * 255).astype(np.uint8)[..., None], 3, 2)
-    return Image.fromarray(np.concatenate([rgb, mixed, grey]))
+def _add_frames(
+    config: AnnotateConfig, scene: Scene, missing: Sequence[Frame], aside: Path, writer: SceneWriter
+) -> None:
+    ego = {name: find_ego(scene, name) for name in scene.cameras} if config.ego else {}
+    lacking = {frame.id for frame in missing}
+    for frame in scene.frames:
+        if frame.id not in lacking:
+            add_frame_copy(writer, scene, frame)
+            continue
+        arrays = store.read_safetensors(aside_file(aside, frame.id))
+        for name in ("semantics", "depth"):  # a confidence tells that a label was made: none beside one that was given
+            if name in frame.labels:
+                arrays.pop(f"{name}_confidence", None)
+        if config.ego:
+            arrays["ego"] = ego[frame.view.camera.name]
+        add_frame_copy(writer, scene, frame, arrays)

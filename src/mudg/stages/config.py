@@ -48,12 +48,22 @@ class IngestConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class AnnotateConfig:
-    """Make semantics and sky, each with a confidence, for a scene that has no labels."""
+    """Make the labels that a scene lacks: dense depth, classes, sky, movers, each with a confidence."""
 
-    labeller: Literal["geometry"] = "geometry"
-    """geometry: what boxes, ground and sky tell; needs no download."""
-    depth: bool = False
-    """Also write dense depth (LiDAR, holes filled with the nearest measurement) with a confidence."""
+    labeller: Literal["geometry", "network"] = "geometry"
+    """What tells classes and sky. geometry: boxes, heights, colour, needs no download; network: a segmentation network from `weights`."""
+    weights: str = ""
+    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it."""
+    depth: bool = True
+    """Write dense depth: LiDAR of several sweeps, filled along the image."""
+    sweeps: int = Field(default=6, ge=1, le=100)
+    """Sweeps of each LiDAR, the nearest in time, whose points are put together."""
+    dynamic: bool = True
+    """Write where tracked things are seen that move."""
+    ego: bool = False
+    """Write where the own vehicle is seen: pixels at the bottom that stay the same while it moves."""
+    processes: int = Field(default=0, ge=0)
+    """Frames labelled at the same time (0 = one per core)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

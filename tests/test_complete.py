@@ -1,0 +1,200 @@
+"""Completion of sparse depth: exact where the answer is known, honest about where it is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage, sparse
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Camera, View
+from mudg.core.complete import (
+    CompletionRules,
+    beyond_reach,
+    complete_depth,
+    conjugate_gradients,
+    ray_elevation,
+    visible_depth,
+)
+
+HEIGHT, WIDTH, FOCAL = 60, 90, 80.0
+CAMERA = Camera("c", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+
+
+def street() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colours, depth and sky: a road, a wall that recedes on the left, a car across, sky above the horizon elsewhere."""
+    row, column = np.indices((HEIGHT, WIDTH)) + 0.5
+    x, y = (column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL
+    road = np.where(y > 0.01, 1.5 / np.maximum(y, 0.01), np.inf)
+    wall = np.where(x < -0.05, -4.0 / np.minimum(x, -0.05), np.inf)
+    car = np.where((np.abs(x) < 0.15) & (y > -0.05) & (y < 0.14), 10.0, np.inf)
+    layers = np.stack([road, wall, car])
+    depth, which = layers.min(0), layers.argmin(0)
+    sky = depth > 60
+    colors = np.array([[90, 90, 95], [180, 120, 80], [40, 50, 160]], np.uint8)[which]
+    colors[sky] = 235
+    return colors, np.where(sky, np.nan, depth).astype(np.float32), sky
+
+
+def sampled(depth: np.ndarray, rows: int = 6, first: int = 15) -> np.ndarray:
+    """Rows of measurements, as a scanner leaves them; none above row ``first``."""
+    out = np.full_like(depth, np.nan)
+    out[first::rows, ::2] = depth[first::rows, ::2]
+    return out
+
+
+def relative_error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.abs(found / truth - 1)
+
+
+def test_it_beats_the_nearest_measurement_by_more_than_half() -> None:
+    rgb, depth, sky = street()
+    measured = sampled(depth)
+    dense = complete_depth(rgb, measured, sky)
+    index = ndimage.distance_transform_edt(np.isnan(measured), return_distances=False, return_indices=True)
+    near = measured[index[0], index[1]]
+    ours, theirs = relative_error(dense.depth, depth)[~sky].mean(), relative_error(near, depth)[~sky].mean()
+    assert ours < 0.05
+    assert ours < 0.5 * theirs
+
+
+def test_an_upright_wall_goes_on_above_the_beams() -> None:
+    rgb, depth, sky = street()
+    dense = complete_depth(rgb, sampled(depth, first=30), sky)
+    above = np.zeros_like(sky)
+    above[:28, :30] = True
+    assert np.median(relative_error(dense.depth, depth)[above & ~sky]) < 0.05
+
+
+def test_a_slanted_plane_is_found_to_a_thousandth() -> None:
+    row, column = np.indices((HEIGHT, WIDTH))
+    depth = (1 / (0.05 + 0.0004 * column + 0.0006 * row)).astype(np.float32)
+    dense = complete_depth(np.full((HEIGHT, WIDTH, 3), 120, np.uint8), sampled(depth, first=0))
+    inner = np.s_[4:-8, 4:-4]
+    assert relative_error(dense.depth, depth)[inner].max() < 0.01
+    assert relative_error(dense.depth, depth)[inner].mean() < 1e-3
+
+
+def test_a_wrong_measurement_does_not_last() -> None:
+    rgb, depth, sky = street()
+    measured = sampled(depth)
+    measured[51, 44] = 30.0  # on the road, where 6 m is right
+    dense = complete_depth(rgb, measured, sky)
+    assert abs(dense.depth[51, 45] / depth[51, 45] - 1) < 0.1
+
+
+def test_sky_is_at_its_distance_and_pulls_nothing() -> None:
+    rgb, depth, sky = street()
+    measured = sampled(depth)
+    dense = complete_depth(rgb, measured, sky, rules=CompletionRules(sky_m=77.0))
+    other = complete_depth(rgb, measured, sky)
+    assert (dense.depth[sky] == 77).all()
+    assert np.array_equal(dense.depth[~sky], other.depth[~sky])
+
+
+def test_error_falls_with_confidence() -> None:
+    rgb, depth, sky = street()
+    dense = complete_depth(rgb, sampled(depth), sky)
+    error, sure = relative_error(dense.depth, depth)[~sky], dense.confidence[~sky]
+    assert ((sure >= 0) & (sure <= 1)).all()
+    limits = np.quantile(sure, [0, 0.25, 0.5, 0.75, 1])
+    means = [error[(sure >= low) & (sure <= high)].mean() for low, high in zip(limits[:-1], limits[1:])]
+    assert means[0] > 3 * means[1]
+    assert means[1] >= means[3]
+
+
+def test_nothing_measured_is_nothing_known() -> None:
+    rgb, depth, sky = street()
+    dense = complete_depth(rgb, np.full_like(depth, np.nan), sky)
+    assert np.isnan(dense.depth[~sky]).all()
+    assert (dense.confidence[~sky] == 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_few_measurements_are_enough_for_finite_depth(count: int) -> None:
+    rgb, depth, _ = street()
+    measured = np.full_like(depth, np.nan)
+    measured[50, 10 : 10 + count] = 6.0
+    dense = complete_depth(rgb, measured)
+    assert np.isfinite(dense.depth).all()
+    assert (dense.depth > 0).all()
+
+
+def test_same_in_same_out_and_inputs_untouched() -> None:
+    rgb, depth, sky = street()
+    measured = sampled(depth)
+    copies = rgb.copy(), measured.copy(), sky.copy()
+    beyond = np.zeros_like(sky)
+    first, second = (complete_depth(rgb, measured, sky, beyond) for _ in range(2))
+    assert np.array_equal(first.depth, second.depth)
+    for now, before in zip((rgb, measured, sky), copies, strict=True):
+        assert np.array_equal(now, before, equal_nan=now.dtype == np.float32)
+
+
+def test_what_does_not_answer_is_far() -> None:
+    view = View(CAMERA, LEVEL, 0.0)
+    rgb = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
+    rgb[:, 30:60] = 180
+    measured = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+    measured[::3, :28], measured[::3, 62:] = 12.0, 12.0
+    beyond = beyond_reach(view, measured, 0.35, gap_deg=3.0)
+    assert beyond[20, 45]
+    assert not beyond[55, 45]  # below the horizon
+    assert not beyond[:, :30].any()
+    dense = complete_depth(rgb, measured, None, beyond)
+    assert dense.depth[20, 45] > 70
+    assert dense.confidence[20, 45] < 0.5
+    assert abs(dense.depth[20, 10] / 12 - 1) < 0.01
+
+
+def test_points_seen_through_a_nearer_surface_are_dropped() -> None:
+    view = View(CAMERA, np.eye(4), 0.0)
+    u, v = np.meshgrid(np.arange(20, 60) + 0.5, np.arange(10, 50) + 0.5)
+    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1).reshape(-1, 3)
+    fence = rays[(np.round(v.ravel()) % 3) == 1] * 5  # rows of a near surface
+    behind = rays[(np.round(v.ravel()) % 3) == 2] * 20  # between them shines a far one
+    beside = np.array([[0.5, 0.0, 1]]) * 20
+    depth = visible_depth(view, np.concatenate([fence, behind, beside, [[np.nan] * 3]]), gap_deg=3.0)
+    known = np.isfinite(depth)
+    inner = np.zeros_like(known)
+    inner[14:46, 24:56] = True
+    assert (depth[known & inner] < 5.01).all()
+    assert (known & inner).sum() > 300
+    assert depth[30, 85] == pytest.approx(20)
+
+
+def test_of_two_points_in_a_pixel_the_nearer_stays() -> None:
+    view = View(CAMERA, np.eye(4), 0.0)
+    depth = visible_depth(view, np.array([[0.01, 0.01, 9.0], [0.005, 0.005, 4.0]], np.float32))
+    assert depth[30, 45] == 4
+    assert np.isfinite(depth).sum() == 1
+
+
+def test_conjugate_gradients_solve_what_a_direct_solver_solves() -> None:
+    rng = np.random.default_rng(0)
+    factor = sparse.random(80, 80, 0.1, random_state=1, dtype=np.float32)
+    matrix = (factor @ factor.T + sparse.identity(80, dtype=np.float32)).tocsr()
+    goal = rng.normal(size=80).astype(np.float32)
+    found = conjugate_gradients(matrix, goal, np.zeros(80, np.float32), 1 / matrix.diagonal(), 400, 1e-7)
+    assert np.abs(found - np.linalg.solve(matrix.toarray().astype(np.float64), goal)).max() < 1e-4
+
+
+def test_bad_input_is_named() -> None:
+    rgb, depth, sky = street()
+    with pytest.raises(InputError, match="size"):
+        complete_depth(rgb[:-1], depth, sky)
+    with pytest.raises(InputError, match="positive"):
+        complete_depth(rgb, np.where(np.isfinite(depth), -depth, np.nan).astype(np.float32), sky)
+    with pytest.raises(InputError, match="shape"):
+        visible_depth(View(CAMERA, np.eye(4), 0.0), np.zeros((3, 2)))
+    with pytest.raises(UsageError):
+        CompletionRules(rounds=0)
+    with pytest.raises(UsageError):
+        CompletionRules(near_m=5, far_m=2)
+
+
+def test_elevation_grows_upwards() -> None:
+    elevation = ray_elevation(View(CAMERA, LEVEL, 0.0))
+    assert elevation[HEIGHT // 2 - 1, WIDTH // 2] == pytest.approx(0.5 / FOCAL, rel=1e-3)
+    assert (np.diff(elevation, axis=0) < 0).all()
