@@ -13,9 +13,9 @@ from PIL import Image
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Source, SweepPoints, Track
-from mudg.data.importers import box_keys, drive_log
-from mudg.data.importers.box_keys import BoxKey, build_tracks, clip_track
-from mudg.data.importers.box_times import BoxTimes, reach_images
+from mudg.data.importers import drive_log
+from mudg.data.importers.box_times import BoxTimes, clip_track, reach_images
+from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, nearest_index, write_log
 from mudg.data.importers.options import ImportOptions
 
@@ -132,28 +132,48 @@ def test_stamps_in_another_unit_are_refused(stamp: int, per_second: int) -> None
 # --- tracks ---------------------------------------------------------------------------------------------------------
 
 
-def key(time_s: float, x: float, track: str = "7", size: tuple[float, float, float] = (4.0, 2.0, 1.5)) -> BoxKey:
-    return BoxKey(track, "car", time_s, size, yaw_matrix(0.0, (x, 0.0, 0.0)))
+def tracks_of(*keys: tuple[float, float], max_gap_s: float = 1.0) -> tuple[list[Track], list[str]]:
+    """Tracks of car 7 from (time, x)."""
+    boxes = BoxTracks("table", {}, max_gap_s)
+    for time_s, x in keys:
+        boxes.add("7", "car", time_s, (4.0, 2.0, 1.5), yaw_matrix(0.0, (x, 0.0, 0.0)))
+    return boxes.tracks()
 
 
 def test_tracks_are_sorted_and_split_at_gaps() -> None:
-    tracks, notes = build_tracks([key(t, t) for t in (2.0, 0.0, 0.5, 1.0, 5.0)], 1.1, "table")
+    tracks, notes = tracks_of(*((t, t) for t in (2.0, 0.0, 0.5, 1.0, 5.0)), max_gap_s=1.1)
     assert [(t.id, t.times_s.tolist()) for t in tracks] == [("7", [0.0, 0.5, 1.0, 2.0]), ("7.1", [5.0])]
-    assert notes == ["1 tracks were split where a box is not seen for more than 1.1 s"]
+    assert notes == ["1 tracks are not seen for more than 1.1 s and were split there"]
     with pytest.raises(InputError, match="two boxes"):
-        build_tracks([key(1.0, 0.0), key(1.0, 1.0)], 1.1, "table")
+        tracks_of((1.0, 0.0), (1.0, 1.0))
 
 
 def test_swapped_sides_are_refused_when_most_vehicles_have_them() -> None:
-    wide = (2.0, 4.0, 1.5)
-    build_tracks([key(0, 0, "a"), key(0, 9, "b"), key(0, 20, "c", wide)], 1, "table")
+    def boxes(*widths: float) -> BoxTracks:
+        found = BoxTracks("table", {})
+        for number, width in enumerate(widths):
+            found.add(str(number), "car", 0.0, (6.0 - width, width, 1.5), yaw_matrix(0.0, (9.0 * number, 0.0, 0.0)))
+        return found
+
+    assert len(boxes(2.0, 2.0, 4.0).tracks()[0]) == 3
     with pytest.raises(InputError, match="swapped") as caught:
-        build_tracks([key(0, 0, "a", wide), key(0, 9, "b"), key(0, 20, "c", wide)], 1, "table")
+        boxes(4.0, 2.0, 4.0).tracks()
     assert "2 of 3" in caught.value.got
 
 
+def test_a_track_takes_its_commonest_label_and_sizes_are_checked() -> None:
+    boxes = BoxTracks("table", {})
+    for time_s, label in ((0.0, "van"), (0.1, "car"), (0.2, "car")):
+        boxes.add("7", label, time_s, (4.0, 2.0, 1.5), np.eye(4))
+    assert boxes.tracks()[0][0].label == "car"
+    for bad in ((0.0, 2.0, 1.5), (4.0, float("nan"), 1.5), (4.0, 2.0, 1e6), (None, 2.0, 1.5)):
+        with pytest.raises(InputError, match="box size") as caught:
+            boxes.add("8", "car", 0.0, bad, np.eye(4), where="table: row 3")
+        assert caught.value.where == "table: row 3"
+
+
 def test_clip_keeps_one_key_beyond_each_end() -> None:
-    track = build_tracks([key(0.5 * n, n) for n in range(9)], 1, "table")[0][0]
+    track = tracks_of(*((0.5 * n, n) for n in range(9)))[0][0]
     kept = clip_track(track, 1.2, 2.0)
     assert kept is not None
     assert kept.times_s.tolist() == [1.0, 1.5, 2.0]
@@ -163,10 +183,10 @@ def test_clip_keeps_one_key_beyond_each_end() -> None:
 
 
 def test_unknown_categories_keep_their_last_word() -> None:
-    unknown: set[str] = set()
-    assert box_keys.label_of("vehicle.hover Craft", {"vehicle.car": "car"}, unknown) == "hover_craft"
-    assert box_keys.label_of("vehicle.car", {"vehicle.car": "car"}, unknown) == "car"
-    assert unknown == {"vehicle.hover Craft"}
+    boxes = BoxTracks("table", {"vehicle.car": "car"})
+    assert boxes.word("vehicle.hover Craft") == "hover_craft"
+    assert boxes.word("vehicle.car") == "car"
+    assert boxes.tracks()[1] == ["classes that are not known here keep their names: 'vehicle.hover Craft' (1 boxes)"]
 
 
 def drawn(speed: float, delays: list[float], x0: float = 20.0) -> tuple[Track, list[SweepPoints]]:

@@ -205,16 +205,24 @@ def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source
     assert in_ego[:3, 3] == pytest.approx([0.85, 0.0, 1.8], abs=0.1)
 
 
-def test_unknown_classes_and_swapped_sizes_are_said(source: Path, tmp_path: Path, truth: Scene) -> None:
+def test_swapped_sizes_are_refused(source: Path, tmp_path: Path, truth: Scene) -> None:
     for index, sweep in enumerate(truth.sweeps):
         table = cuboids(truth, sweep.time_s)
         table["dimensions.x"], table["dimensions.y"] = table["dimensions.y"], table["dimensions.x"]
+        write_frame(source / "annotations" / "cuboids" / f"{index:02d}.pkl.gz", table)
+    with pytest.raises(InputError, match="swapped"):
+        ingest(source, tmp_path / "out")
+    assert not (tmp_path / "out" / "scene.json").exists()
+
+
+def test_unknown_classes_are_said(source: Path, tmp_path: Path, truth: Scene) -> None:
+    for index, sweep in enumerate(truth.sweeps):
+        table = cuboids(truth, sweep.time_s)
         table["label"] = ["Hover Board", *table["label"][1:]]  # type: ignore[index]
         write_frame(source / "annotations" / "cuboids" / f"{index:02d}.pkl.gz", table)
     scene = ingest(source, tmp_path / "out")
     words = " | ".join(scene.source.notes)
-    assert "'Hover Board' (1)" in words
-    assert "may be swapped" in words
+    assert "'Hover Board' (5 boxes)" in words
     assert scene.tracks[0].label == "hover_board"
 
 

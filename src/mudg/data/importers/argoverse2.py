@@ -28,8 +28,10 @@ from mudg.base import log
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
-from mudg.data.importers import box_keys, common, drive_log
+from mudg.data.importers import common, drive_log
+from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
+from mudg.data.importers.layout import chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -59,8 +61,6 @@ CAMERAS: Final[Mapping[str, str]] = {
 }
 SENSOR: Final = "lidar"
 _UPPER: Final = "up_lidar"
-MAX_GAP_S: Final = 0.55
-"""Boxes come with every sweep, 10 times a second; a track that is not seen for longer than this is split."""
 NANOSECONDS: Final = 10**9
 _POSE_SLACK_S: Final = 0.02
 _MAX_OFFSET_NS: Final = 500_000_000
@@ -179,7 +179,7 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
             expected="seven ring cameras",
             remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing",
         )
-    chosen = drive_log.choose_cameras(options, there, [CAMERAS[name] for name in RING_CAMERAS], where)
+    chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, RING_CAMERAS)}
     files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
     scans = _files_by_time(sweep_folder, (".feather",)) if sweep_folder.is_dir() else {}
     stamps = [stamp for found in (*files.values(), scans) for stamp in found]
@@ -190,7 +190,7 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     ego = read_ego(folder / "city_SE3_egovehicle.feather", zero_ns)
 
     def map_from_ego(stamp: int) -> Matrix:
-        return drive_log.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, ego_where)
+        return common.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, ego_where)
 
     ego_where = str(folder / "city_SE3_egovehicle.feather")
     images = [
@@ -352,19 +352,17 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     stamps, poses = _stamps(columns, where), _poses(columns, where)
     sizes = _numbers(columns, ("length_m", "width_m", "height_m"), where)
     map_from_ego = {
-        int(t): drive_log.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where) for t in set(stamps)
+        int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where) for t in set(stamps)
     }
-    unknown: set[str] = set()
-    boxes = []
+    tracks = BoxTracks(where, LABELS)
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
-        label = box_keys.label_of(str(columns["category"][row]), LABELS, unknown)
+        label = tracks.word(str(columns["category"][row]))
         length, width, height = sizes[row].tolist()
-        size = box_keys.box_size(length, width, height, f"{where}: row {row}")
         time_s = (int(stamp) - zero_ns) / NANOSECONDS
         track = str(columns["track_uuid"][row])
-        boxes.append(box_keys.BoxKey(track, label, time_s, size, map_from_ego[int(stamp)] @ pose))
-    box_keys.warn_unknown("argoverse2", unknown)
-    return box_keys.build_tracks(boxes, MAX_GAP_S, where)
+        pose = map_from_ego[int(stamp)] @ pose
+        tracks.add(track, label, time_s, (length, width, height), pose, where=f"{where}: row {row}")
+    return tracks.tracks()
 
 
 def read_sweep(path: Path, ego_from_lidar: Matrix) -> SweepPoints:

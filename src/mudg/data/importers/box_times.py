@@ -115,3 +115,12 @@ def reach_images(track: Track) -> Track:
         after[:3, 3] += (poses[-1, :3, 3] - poses[-2, :3, 3]) / (times[-1] - times[-2]) * REACH_S
     times = np.concatenate([[times[0] - REACH_S], times, [times[-1] + REACH_S]])
     return Track(track.id, track.label, track.size_m, times, np.concatenate([before[None], poses, after[None]]))
+
+
+def clip_track(track: Track, start_s: float, end_s: float) -> Track | None:
+    """The keys of a track that matter from ``start_s`` to ``end_s``: those inside and one beyond each end; None if it is not there then."""
+    if track.times_s[-1] < start_s - 1e-6 or track.times_s[0] > end_s + 1e-6:
+        return None
+    first = max(0, int(np.searchsorted(track.times_s, start_s + 1e-6)) - 1)
+    last = min(len(track.times_s), int(np.searchsorted(track.times_s, end_s - 1e-6)) + 1)
+    return Track(track.id, track.label, track.size_m, track.times_s[first:last], track.world_from_object[first:last])

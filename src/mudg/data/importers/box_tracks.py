@@ -1,16 +1,15 @@
-"""Boxes of many frames -> tracks: one place for what every format with tracked boxes needs."""
+"""Boxes of many frames -> tracks: words for classes, sizes that make sense, keys in time order, splits where a box is not seen."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, quaternion_from_matrix, slerp
 from mudg.base.types import Track
@@ -19,14 +18,31 @@ Matrix = NDArray[np.float64]
 MAX_GAP_S: Final = 0.55
 """A moving object that is not seen for longer than this is split: interpolating across would invent its path."""
 MAX_SIDE_M: Final = 100.0
-_LONGER_THAN_WIDE: Final = frozenset(("car", "van", "truck", "bus", "trailer", "vehicle", "caravan", "tram", "train"))
+LONGER_THAN_WIDE: Final = frozenset(("car", "van", "bus"))
+"""Labels whose boxes are longer than wide in every data set (a truck's cab may be a box of its own)."""
 _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
 
 
+def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, float, float]:
+    """Length, width, height as finite positive metres, or an InputError."""
+    try:
+        size = (float(length), float(width), float(height))
+    except (TypeError, ValueError) as error:
+        raise InputError("box size is not made of numbers", where=where, got=str(error)) from error
+    if not all(np.isfinite(side) and 0 < side <= MAX_SIDE_M for side in size):
+        raise InputError(
+            "box size makes no sense",
+            where=where,
+            expected=f"length, width and height in metres, above 0 and at most {MAX_SIDE_M:g}",
+            got=f"length {length}, width {width}, height {height}",
+        )
+    return size
+
+
 @dataclass(slots=True)
 class _Member:
-    label: str
+    labels: dict[str, int] = field(default_factory=dict)
     rows: array = field(default_factory=lambda: array("d"))
     standing: bool = False
 
@@ -36,17 +52,25 @@ class BoxTracks:
 
     Args:
         where: the file or folder the boxes come from, for messages.
-        words: the data set's class -> the product's word (``car``, ``pedestrian``, ...). Other classes keep their name in
-            lower case, and are named once in the notes.
+        words: the data set's class -> the product's word (``car``, ``pedestrian``, ...). Other classes keep the last part (after
+            a dot) of their name in lower case, and are named once in the notes.
+        max_gap_s: an object that is not seen for longer than this is split.
     """
 
-    def __init__(self, where: str, words: Mapping[str, str]) -> None:
-        self._where, self._words = where, words
+    def __init__(self, where: str, words: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
+        self._where, self._words, self._max_gap_s = where, words, max_gap_s
         self._members: dict[str, _Member] = {}
         self._unknown: dict[str, int] = {}
 
     def __len__(self) -> int:
         return len(self._members)
+
+    def word(self, category: str) -> str:
+        """The product's word for a class of the data set; what is not known is counted."""
+        if category in self._words:
+            return self._words[category]
+        self._unknown[category] = self._unknown.get(category, 0) + 1
+        return category.rsplit(".", 1)[-1].strip().lower().replace(" ", "_") or "unknown"
 
     def add(
         self,
@@ -57,48 +81,38 @@ class BoxTracks:
         world_from_box: Matrix,
         standing: bool = False,
         late_s: float = 0.0,
+        where: str = "",
     ) -> None:
         """Add one box.
 
         Args:
             track: the object's id, the same in all frames.
-            label: the data set's class.
+            label: the product's word for it (``word``). The track takes its commonest one.
             time_s: when, seconds of the scene's clock.
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
             standing: the data set says that the object does not move in the whole log.
             late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The track's key
                 stands at ``time_s``, moved there with the object's velocity.
+            where: file and record, for messages.
 
         Raises:
             InputError: the size is not positive or absurd.
         """
-        if not all(np.isfinite(size_m)) or min(size_m) <= 0 or max(size_m) > MAX_SIDE_M:
-            raise InputError(
-                "box size makes no sense",
-                where=f"{self._where}: object {track} ({label})",
-                expected=f"length, width and height in metres, above 0 and at most {MAX_SIDE_M:g}",
-                got=", ".join(f"{side:g}" for side in size_m),
-            )
-        member = self._members.get(track)
-        if member is None:
-            member = self._members[track] = _Member(self._word(label))
+        size = box_size(*size_m, where=where or f"{self._where}: object {track} ({label})")
+        member = self._members.setdefault(track, _Member())
+        member.labels[label] = member.labels.get(label, 0) + 1
         member.standing = standing
-        member.rows.extend((time_s, late_s, *size_m, *world_from_box[:3].ravel().tolist()))
-
-    def _word(self, label: str) -> str:
-        if label not in self._words:
-            self._unknown[label] = self._unknown.get(label, 0) + 1
-        return self._words.get(label, label.strip().lower().replace(" ", "_") or "unknown")
+        member.rows.extend((time_s, late_s, *size, *world_from_box[:3].ravel().tolist()))
 
     def tracks(self) -> tuple[list[Track], list[str]]:
-        """All tracks, and notes for people.
+        """All tracks in the order of their first boxes, and notes for people.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to its last
-        moment. What may move is split where it is not seen for more than ``MAX_GAP_S``: ``7``, ``7.1``, ...
+        moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
 
         Raises:
-            InputError: an object has two boxes at one moment.
+            InputError: an object has two boxes at one moment; length and width are swapped.
         """
         tracks: list[Track] = []
         split = 0
@@ -115,38 +129,49 @@ class BoxTracks:
                     remedy="are two logs mixed?",
                 )
             size = np.median(rows[:, 2:5], axis=0)
+            label = max(member.labels, key=lambda word: member.labels[word])
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
             poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
             if member.standing:
                 ends = times[[0, -1]] if len(times) > 1 else times
-                tracks.append(Track(name, member.label, size, ends, np.stack([_mean_pose(poses)] * len(ends))))
+                tracks.append(Track(name, label, size, ends, np.stack([_mean_pose(poses)] * len(ends))))
                 continue
-            pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > MAX_GAP_S) + 1)
+            pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
             split += len(pieces) > 1
             for piece in pieces:
                 poses[piece, :3, 3] -= _velocity(times[piece] + rows[piece, 1], poses[piece, :3, 3]) * rows[piece, 1:2]
             tracks += [
-                Track(f"{name}.{part}" if part else name, member.label, size, times[piece], poses[piece])
+                Track(f"{name}.{part}" if part else name, label, size, times[piece], poses[piece])
                 for part, piece in enumerate(pieces)
             ]
-        return tracks, self._notes(split, tracks)
+        check_sides(tracks, self._where)
+        tracks.sort(key=lambda track: float(track.times_s[0]))
+        return tracks, self._notes(split)
 
-    def _notes(self, split: int, tracks: list[Track]) -> list[str]:
+    def _notes(self, split: int) -> list[str]:
         notes = []
-        long = [track for track in tracks if track.label in _LONGER_THAN_WIDE]
-        wide = [track for track in long if track.size_m[1] > 1.3 * track.size_m[0]]
-        if len(wide) * 2 > len(long):
-            notes.append(
-                f"{len(wide)} of {len(long)} vehicles are wider than long (first: {wide[0].id}): "
-                "length and width may be swapped in the source"
-            )
-            log.warn(f"{self._where}: {notes[-1]}")
         if split:
-            notes.append(f"{split} tracks are not seen for more than {MAX_GAP_S} s and were split there")
+            notes.append(f"{split} tracks are not seen for more than {self._max_gap_s:g} s and were split there")
         if self._unknown:
-            some = ", ".join(f"{label!r} ({count})" for label, count in sorted(self._unknown.items())[:8])
+            some = ", ".join(f"{label!r} ({count} boxes)" for label, count in sorted(self._unknown.items())[:8])
             notes.append(f"classes that are not known here keep their names: {some}")
         return notes
+
+
+def check_sides(tracks: Sequence[Track], where: str) -> None:
+    """Refuse a log in which most vehicles are wider than long: length and width were read in the wrong order."""
+    vehicles = [track for track in tracks if track.label in LONGER_THAN_WIDE]
+    wide = [track for track in vehicles if track.size_m[1] > track.size_m[0]]
+    if vehicles and 2 * len(wide) > len(vehicles):
+        length, width, _ = wide[0].size_m
+        raise InputError(
+            "length and width of boxes are swapped",
+            where=where,
+            expected="vehicles longer than wide",
+            got=f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
+            f"{length:.2f} m long, {width:.2f} m wide",
+            remedy="check the order in which the sizes were written",
+        )
 
 
 def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:

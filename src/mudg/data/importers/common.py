@@ -245,7 +245,7 @@ def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matri
     return from_rotation_translation(matrix_from_quaternion(q), t)
 
 
-def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> Matrix:
+def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path") -> Matrix:
     """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
 
     Raises:
@@ -259,9 +259,10 @@ def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATI
     if beyond > max_beyond_s:
         raise InputError(
             "vehicle poses do not cover the images and scans",
-            where="ego path",
+            where=where,
             got=f"{beyond:.2f} s outside",
             expected="poses from the first to the last frame",
+            remedy="is the pose file cut off, or of another log?",
         )
     if len(ego.times_s) == 1:
         return ego.world_from_ego[0]

@@ -34,14 +34,15 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
-from mudg.data.importers import box_keys, common, drive_log
+from mudg.data.importers import common, drive_log
+from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
+from mudg.data.importers.layout import chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
 
 LICENCE: Final = "the data set's own (DDAD: CC BY-NC-SA 4.0, Toyota Research Institute); see the folder's licence file"
-MAX_GAP_S: Final = 0.55
 MICROSECONDS: Final = 10**6
 _YEAR_2100_US: Final = 4_102_444_800 * MICROSECONDS
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
@@ -144,7 +145,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
         data = _read_data(scene, where)
         calibrations = {key: _read_calibration(folder, key) for key in sorted({d.calibration for d in data})}
         names = {d.sensor: d.sensor.lower() for d in data if d.kind == "image"}
-        chosen = drive_log.choose_cameras(options, dict(sorted(names.items())), names.values(), where)
+        chosen = {names[raw]: raw for raw in chosen_cameras(dict(sorted(names.items())), options, where, tuple(names))}
         clouds = [d for d in data if d.kind == "point_cloud"]
         used = [d for d in data if d.kind == "image" and d.sensor in chosen.values()] + clouds
         ticks_per_second, notes = _clock(used, where)
@@ -292,8 +293,7 @@ def _read_tracks(
     if not any(files):
         return [], ["no 3-D boxes in this scene: everything counts as static"]
     names = _class_names(folder, scene)
-    unknown: set[str] = set()
-    boxes = []
+    tracks = BoxTracks(str(folder / "bounding_box_3d"), LABELS)
     for datum, time_s, name in zip(clouds, times_s, files, strict=True):
         if not name:
             continue
@@ -306,12 +306,11 @@ def _read_tracks(
                     expected=", ".join(str(number) for number in names),
                 )  # fmt: skip
             box = item["box"]
-            size = box_keys.box_size(box["length"], box["width"], box["height"], where)
-            label = box_keys.label_of(names[item["class_id"]], LABELS, unknown)
+            size = box["length"], box["width"], box["height"]
+            label = tracks.word(names[item["class_id"]])
             pose = datum.map_from_sensor @ _pose(box["pose"], where)
-            boxes.append(box_keys.BoxKey(str(item["instance_id"]), label, time_s, size, pose))
-    box_keys.warn_unknown("dgp", unknown)
-    return box_keys.build_tracks(boxes, MAX_GAP_S, str(folder / "bounding_box_3d"))
+            tracks.add(str(item["instance_id"]), label, time_s, size, pose, where=where)
+    return tracks.tracks()
 
 
 def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:

@@ -10,7 +10,7 @@ recorded nearer to that image than to its neighbours belongs to frame n. ``--fra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -22,8 +22,7 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, yaw_matrix, yaw_of
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
-from mudg.data.importers.box_keys import clip_track
-from mudg.data.importers.box_times import REACH_S, BoxTimes, reach_images
+from mudg.data.importers.box_times import REACH_S, BoxTimes, clip_track, reach_images
 from mudg.data.importers.common import for_each
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.options import ImportOptions, holdout_split
@@ -243,30 +242,6 @@ def _without_missing(chosen: _Chosen, options: ImportOptions) -> _Chosen:
     )
 
 
-def choose_cameras(
-    options: ImportOptions, names: Mapping[str, str], default: Collection[str], where: str
-) -> dict[str, str]:
-    """Cameras to import: scene name -> name in the data set, in the data set's order.
-
-    Args:
-        names: data-set name -> scene name, of the cameras that are there. Users may write either.
-        default: scene names to take when the user chose none; those that are not there are left out.
-
-    Raises:
-        UsageError: the user named a camera that is not there.
-    """
-    by_either = {**{scene: raw for raw, scene in names.items()}, **{raw: raw for raw in names}}
-    unknown = [name for name in options.cameras if name not in by_either]
-    if unknown:
-        raise UsageError(
-            "the log has no such camera", where=where, expected=", ".join(names.values()), got=", ".join(unknown)
-        )
-    wanted = {by_either[name] for name in options.cameras} or {raw for raw, scene in names.items() if scene in default}
-    if not wanted:
-        raise InputError("the log has no cameras", where=where, expected=", ".join(default))
-    return {scene: raw for raw, scene in names.items() if raw in wanted}
-
-
 def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
     """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its sweeps."""
     if options.untwist == "yes":
@@ -388,23 +363,6 @@ def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:
     order = np.argsort(times, kind="stable")
     kept = order[np.r_[True, np.diff(times[order]) > 1e-6]]
     return EgoPath(times[kept], np.stack([poses[i] for i in kept]))
-
-
-def pose_near(ego: EgoPath, time_s: float, slack_s: float, where: str) -> Matrix:
-    """Vehicle pose at a time; the nearest one up to ``slack_s`` outside the path, an InputError beyond."""
-    inside = ego.pose_at(time_s)
-    if inside is not None:
-        return inside
-    beyond = float(max(ego.times_s[0] - time_s, time_s - ego.times_s[-1]))
-    if beyond > slack_s:
-        raise InputError(
-            "vehicle poses do not cover the recording",
-            where=where,
-            got=f"a record {beyond:.3f} s outside the poses",
-            expected="poses from the first to the last image and sweep",
-            remedy="is the pose file cut off, or of another log?",
-        )
-    return ego.world_from_ego[0 if time_s < ego.times_s[0] else -1]
 
 
 def _ego_between(ego: EgoPath, start_s: float, end_s: float, where: str) -> EgoPath:

@@ -456,7 +456,7 @@ def _read_tracks(
                 )
             elif box.frame in time_of:
                 seen.add(box.frame)
-                tracks.add(box.object_id, box.label, time_of[box.frame], box.size_m, pose)
+                tracks.add(box.object_id, tracks.word(box.label), time_of[box.frame], box.size_m, pose)
             else:
                 outside += 1
             continue
@@ -469,7 +469,7 @@ def _read_tracks(
     for name, (box, pose, first, last) in spans.items():
         for number in dict.fromkeys((first, last)):
             tracks.add(
-                f"s-{name}" if name in moving else name, box.label, time_of[number], box.size_m, pose, standing=True
+                f"s-{name}" if name in moving else name, tracks.word(box.label), time_of[number], box.size_m, pose, standing=True
             )
     if outside:
         notes.append(f"{outside} boxes lie outside the imported frames and were left out")

@@ -76,7 +76,7 @@ def some_numbers(numbers: Sequence[int]) -> str:
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
-    """The data set's names of the cameras to import.
+    """The data set's names of the cameras to import, in the order of ``available``.
 
     Args:
         available: the data set's name -> the name in the scene; either may be asked for.
@@ -90,7 +90,7 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
     words = ", ".join(f"{ours} ({theirs})" for theirs, ours in available.items()) or "no cameras"
     if not options.cameras:
-        chosen = [name for name in usual if name in available]
+        chosen = [name for name in available if name in usual]
         if not chosen:
             raise InputError(
                 "the log has no camera that can be imported", where=where, expected=", ".join(usual), got=words
@@ -99,7 +99,8 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     unknown = [name for name in options.cameras if name not in available and name not in by_scene_name]
     if unknown:
         raise UsageError("the log has no such camera", where=where, expected=words, got=", ".join(unknown))
-    return list(dict.fromkeys(by_scene_name.get(name, name) for name in options.cameras))
+    wanted = {by_scene_name.get(name, name) for name in options.cameras}
+    return [name for name in available if name in wanted]
 
 
 def refuse_options(options: ImportOptions, title: str, *names: str) -> None:

@@ -304,7 +304,7 @@ def _write(opened: NuplanLog, plan: _Plan, out: Path, options: ImportOptions) ->
     for token, track, label, (x, y, z, yaw, *size) in opened.boxes(*span):
         if token in time_of:
             pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
-            tracks.add(track, label, time_of[token], (size[0], size[1], size[2]), pose)
+            tracks.add(track, tracks.word(label), time_of[token], (size[0], size[1], size[2]), pose)
     found, track_notes = tracks.tracks()
     notes += track_notes
     for note in notes:

@@ -32,9 +32,11 @@ from numpy.typing import NDArray
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
-from mudg.data.importers import box_keys, common, drive_log
+from mudg.data.importers import common, drive_log
 from mudg.data.importers import nuscenes_tables as tables
+from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
+from mudg.data.importers.layout import chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -168,7 +170,7 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
         sensor = sensors.get(calibration, "sensor_token", calibrations.where)
         channel_of[row["token"]] = tables.text(sensor, "channel", sensors.where)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
-    chosen = drive_log.choose_cameras(options, there, CAMERAS.values(), where)
+    chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, tuple(CAMERAS))}
     _check_all_cameras(there, options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
@@ -343,21 +345,18 @@ def _read_tracks(release: _Release, samples: Mapping[str, int], zero_us: int) ->
     instances = release.those("instance", "token", {str(r.get("instance_token")) for r in annotations.rows.values()})
     categories = release.all_of("category")
     attributes = release.all_of("attribute") if release.path("attribute").is_file() else None
-    unknown: set[str] = set()
-    boxes = []
+    tracks = BoxTracks(annotations.where, LABELS, MAX_GAP_S)
     for row in annotations.rows.values():
         instance = instances.get(row, "instance_token", annotations.where)
         category = categories.get(instance, "category_token", instances.where)
-        label = box_keys.label_of(tables.text(category, "name", categories.where), LABELS, unknown)
+        label = tracks.word(tables.text(category, "name", categories.where))
         if attributes is not None and label in _RIDDEN and _is_ridden(row, attributes):
             label = _RIDDEN[label]
         width, length, height = tables.numbers(row, "size", 3, annotations.where)  # in this order in the tables
         where = f"{annotations.where}: record {row['token']!r}"
-        size = box_keys.box_size(length, width, height, where)
         time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
-        boxes.append(box_keys.BoxKey(instance["token"], label, time_s, size, _pose(row, annotations.where)))
-    box_keys.warn_unknown("nuscenes", unknown)
-    return box_keys.build_tracks(boxes, MAX_GAP_S, annotations.where)
+        tracks.add(instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where)
+    return tracks.tracks()
 
 
 def _is_ridden(row: tables.Row, attributes: tables.Table) -> bool:

@@ -18,8 +18,10 @@ from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import EgoPath, Scene, Source, Track
-from mudg.data.importers import box_keys, common, drive_log
+from mudg.data.importers import common, drive_log
+from mudg.data.importers.box_tracks import box_size, check_sides
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
+from mudg.data.importers.layout import chosen_cameras
 from mudg.data.importers.nuscenes import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scenefile import decode_image
@@ -80,7 +82,7 @@ def _drive_log(
     lidar = sample["lidar_points"]
     map_from_lidar = map_from_ego @ common.rigid_pose(lidar["lidar2ego"], f"{where}: lidar2ego")
     names = {raw: name for raw, name in CAMERAS.items() if raw in sample["images"]}
-    chosen = drive_log.choose_cameras(options, names, CAMERAS.values(), where)
+    chosen = {names[raw]: raw for raw in chosen_cameras(names, options, where, tuple(CAMERAS))}
     cameras, images = {}, []
     for name, raw in chosen.items():
         item = sample["images"][raw]
@@ -108,10 +110,10 @@ def _tracks(meta: dict[str, Any], instances: list[dict[str, Any]], map_from_lida
             continue
         here = f"{where}: instances[{index}]"
         x, y, z, length, width, height, yaw = (float(value) for value in item["bbox_3d"])
-        size = box_keys.box_size(length, width, height, here)
+        size = box_size(length, width, height, here)
         if not np.isfinite([x, y, z, yaw]).all():
             raise InputError("box is not finite", where=here, got=str(item["bbox_3d"]))
         pose = map_from_lidar @ yaw_matrix(yaw, (x, y, z))
         tracks.append(Track(str(index), names[int(item["bbox_label_3d"])], np.array(size), np.zeros(1), pose[None]))
-    box_keys.check_sides(tracks, where)
+    check_sides(tracks, where)
     return tracks

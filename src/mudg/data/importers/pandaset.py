@@ -481,5 +481,5 @@ def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> lis
             doubled += name in kept
             kept.setdefault(name, box)
         for name, box in kept.items():
-            tracks.add(name, box.label, box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s)
+            tracks.add(name, tracks.word(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s)
     return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []
