@@ -303,16 +303,26 @@ class Named:
 
 def test_view_order_is_a_function_of_seed_and_step_and_fair():
     views = fit_views.ViewSet(tuple(map(Named, "abcd")), tuple(map(Named, "xy")))
-    drawn = [views.choose(7, step, 0.0) for step in range(40)]
-    assert drawn == [views.choose(7, step, 0.0) for step in range(40)]
+    drawn = [views.choose(7, step, 0.0)[0] for step in range(40)]
+    assert drawn == [views.choose(7, step, 0.0)[0] for step in range(40)]
     assert all(sorted(drawn[i : i + 4]) == list("abcd") for i in range(0, 40, 4))
     virtual = [views.choose(7, step, 0.3) for step in range(400)]
-    assert 0.2 < sum(v in "xy" for v in virtual) / 400 < 0.4
+    assert all(len(views) == 1 for views in virtual)
+    assert 0.2 < sum(v in "xy" for (v,) in virtual) / 400 < 0.4
+
+
+def test_virtual_views_beside_recorded_ones_take_nothing_from_them():
+    views = fit_views.ViewSet(tuple(map(Named, "abcd")), tuple(map(Named, "xy")))
+    alone = [views.choose(7, step, 0.3) for step in range(200)]
+    beside = [views.choose(7, step, 0.3, beside=True) for step in range(200)]
+    assert [step[0] for step in beside] == [views.choose(7, step, 0.0)[0] for step in range(200)]
+    assert [step[-1] for step in beside] == [step[-1] for step in alone]
+    assert {len(step) for step in beside} == {1, 2}
 
 
 def test_virtual_views_join_from_near_to_far():
     views = fit_views.ViewSet(tuple(map(Named, "ab")), tuple(map(Named, "wxyz")), (2.0, 2.01, 3.0, 4.0))
-    draws = lambda reach: {views.choose(3, step, 1.0, reach_m=reach) for step in range(80)}  # noqa: E731
+    draws = lambda reach: {views.choose(3, step, 1.0, reach_m=reach)[0] for step in range(80)}  # noqa: E731
     assert draws(2.0) == {"w", "x"}
     assert draws(3.2) == {"w", "x", "y"}
     assert draws(float("inf")) == set("wxyz")

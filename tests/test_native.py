@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import subprocess
 import sys
 import threading
@@ -157,6 +158,7 @@ library = native.require()
 native.set_threads(3)
 expected = 100000 * 99999 // 2
 import ctypes
+import math
 library.mudg_parallel_sum.argtypes = [ctypes.c_int64, ctypes.c_int64]
 library.mudg_parallel_sum.restype = ctypes.c_int64
 assert library.mudg_parallel_sum(100000, 100) == expected
@@ -235,6 +237,85 @@ def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.Mon
     assert fused.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
     fused.adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
     torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
+    cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
+    torch.testing.assert_close(fused.over(prediction, cover, target), fused.torch_over(prediction, cover, target))
+    got = fused.class_loss(prediction, labels, cover[0], 2.0)
+    torch.testing.assert_close(got, losses.class_loss(prediction, labels, cover[0], 2.0))
+
+
+# ---- cross entropy of classes, pictures over the sky -----------------------------------------------------------------
+
+
+def _gradients(value: Tensor, *inputs: Tensor) -> list[Tensor]:
+    value.backward()
+    return [t.grad.double() for t in inputs]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (5, 16, 16), (17, 33, 41), (19, 70, 61)])
+@pytest.mark.parametrize("lifted", [False, True])
+def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int], lifted: bool) -> None:
+    generator = torch.Generator().manual_seed(1)
+    values = 20 * torch.randn(shape, generator=generator)
+    target = torch.randint(0, shape[0], shape[1:], generator=generator)
+    target[torch.rand(shape[1:], generator=generator) < 0.2] = 255
+    weight, lift = torch.rand(shape[1:], generator=generator), 9 * torch.rand(shape[1:], generator=generator)
+    mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
+    channel = shape[0] - 1
+    got = fused.class_loss(mine, target, weight, 7.0, (channel, lift) if lifted else None)
+    want = losses.class_loss(exact, target, weight.double(), 7.0, (channel, lift.double()) if lifted else None)
+    assert got.item() == pytest.approx(want.item(), rel=2e-6, abs=1e-6)
+    (found,), (true,) = _gradients(3 * got, mine), _gradients(3 * want, exact)
+    assert (found - true).norm() <= 3e-6 * true.norm() + 1e-9
+    assert found[:, target == 255].abs().sum() == 0
+
+
+@needs_native
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_class_loss_shows_a_logit_that_is_not_finite(isa: str, bad: float) -> None:
+    logits = torch.zeros(6, 20, 20)
+    logits[4, 7, 3] = bad
+    assert not math.isfinite(fused.class_loss(logits, torch.zeros(20, 20, dtype=torch.int64), torch.ones(20, 20), 400.0).item())
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [((3, 1, 1), (1, 1)), ((3, 7, 9), (3, 2)), ((1, 32, 64), (8, 16)), ((3, 33, 50), (5, 13)), ((2, 9, 12), (9, 12)), ((3, 6, 5), (9, 11))],
+)
+def test_picture_over_the_sky_equals_its_float64_twin(isa: str, sizes: tuple[tuple[int, int, int], tuple[int, int]]) -> None:
+    generator = torch.Generator().manual_seed(2)
+    (channels, height, width), small = sizes
+    inputs = [torch.rand(shape, generator=generator) for shape in ((channels, height, width), (1, height, width), (channels, *small))]
+    upstream = torch.randn(channels, height, width, generator=generator)
+    mine, exact = [t.clone().requires_grad_() for t in inputs], [t.double().requires_grad_() for t in inputs]
+    got, want = fused.over(*mine), fused.torch_over(*exact)
+    torch.testing.assert_close(got.double(), want, rtol=1e-6, atol=2e-6)
+    for found, true in zip(_gradients((got * upstream).sum(), *mine), _gradients((want * upstream).sum(), *exact), strict=True):
+        torch.testing.assert_close(found, true, rtol=2e-5, atol=2e-5)
+
+
+@needs_native
+def test_class_loss_and_sky_do_not_depend_on_the_number_of_threads(pool: Any) -> None:
+    generator = torch.Generator().manual_seed(3)
+    logits, coarse, rgb = (torch.randn(shape, generator=generator) for shape in ((9, 90, 70), (3, 20, 15), (3, 90, 70)))
+    target, weight = torch.randint(0, 9, (90, 70), generator=generator), torch.rand(90, 70, generator=generator)
+    results = []
+    for threads in (1, 3):
+        native.set_threads(threads)
+        leaves = [t.clone().requires_grad_() for t in (logits, coarse, rgb, weight)]
+        value = fused.class_loss(leaves[0], target, weight, 10.0) + fused.over(leaves[2], leaves[3][None], leaves[1]).square().sum()
+        results.append([value.item(), *_gradients(value, *leaves)])
+    assert results[0][0] == results[1][0]
+    assert all(torch.equal(one, other) for one, other in zip(results[0][1:], results[1][1:], strict=True))
+
+
+def test_class_loss_and_sky_refuse_what_does_not_fit() -> None:
+    logits, target, weight = torch.zeros(3, 4, 4), torch.zeros(4, 4, dtype=torch.int64), torch.ones(4, 4)
+    with pytest.raises(InputError, match="class loss"):
+        fused.class_loss(logits, target[:3], weight, 1.0)
+    with pytest.raises(InputError, match="lift"):
+        fused.class_loss(logits, target, weight, 1.0, (3, weight))
+    with pytest.raises(InputError, match="over"):
+        fused.over(logits, torch.zeros(1, 4, 5), torch.zeros(3, 2, 2))
 
 
 # ---- Adam ----------------------------------------------------------------------------------------------------------

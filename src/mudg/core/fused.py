@@ -1,7 +1,7 @@
-"""Training steps that touch much memory, done in one native pass: the photometric loss with its gradient, and Adam.
+"""Training steps that touch much memory, done in one native pass: losses with their gradients, pictures over the sky, and Adam.
 
-Both have a plain-torch twin (``core.losses.photometric``, ``core.table.torch_adam_columns``), which is used, and named once, where
-the native library is missing or the tensors are not float32 on the CPU.
+Each has a plain-torch twin (``core.losses.photometric``, ``core.losses.class_loss``, ``torch_over``, ``core.table.torch_adam_columns``),
+which is used, and named once, where the native library is missing or the tensors are not float32 on the CPU.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
 from mudg import native
 from mudg.base import log
@@ -40,6 +41,61 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     if library is None or prediction.numel() == 0:
         return losses.photometric(prediction, target, ssim_weight)
     return _Photometric.apply(prediction, target.detach(), ssim_weight, library)
+
+
+def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
+    """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``.
+
+    Differentiable in the logits (once); everything else is data. The value does not depend on the number of threads.
+
+    Args:
+        logits: ``[C, H, W]``.
+        target: i64[H, W] in 0..C-1; anything else (255) is unlabelled and counts nothing.
+        weight: ``[H, W]``.
+        total: positive.
+        lift: a channel, and ``[H, W]`` to add to its logits.
+
+    Raises:
+        InputError: sizes differ, or there is no channel.
+    """
+    size = logits.shape[1:]
+    if logits.ndim != 3 or not len(logits) or target.shape != size or weight.shape != size:
+        raise InputError("class loss: logits must be [C, H, W], target and weight [H, W]", expected=str(tuple(size)),
+                         got=str([tuple(t.shape) for t in (logits, target, weight)]))  # fmt: skip
+    if lift is not None and (lift[1].shape != size or not 0 <= lift[0] < len(logits)):
+        raise InputError("class loss: the lift must be of one channel and [H, W]", expected=f"0..{len(logits) - 1}, {tuple(size)}",
+                         got=f"{lift[0]}, {tuple(lift[1].shape)}")  # fmt: skip
+    library = _library_for((logits, weight))
+    if library is None or logits.numel() == 0 or target.dtype != torch.int64:
+        return losses.class_loss(logits, target, weight, total, lift)
+    channel, added = (-1, None) if lift is None else (lift[0], lift[1].detach().to(torch.float32).contiguous())
+    return _ClassLoss.apply(logits, target.contiguous(), weight.detach().contiguous(), 1.0 / total, channel, added, library)
+
+
+def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
+    """``rgb + (1 - alpha) * coarse``, with the coarse picture enlarged to the size of the other (bilinear between pixel centres).
+
+    Differentiable (once) in all three.
+
+    Args:
+        rgb: ``[C, H, W]``. alpha: ``[1, H, W]``. coarse: ``[C, h, w]``.
+
+    Raises:
+        InputError: shapes do not fit.
+    """
+    if rgb.ndim != 3 or coarse.ndim != 3 or len(rgb) != len(coarse) or alpha.shape != (1, *rgb.shape[1:]):
+        raise InputError("over: pictures must be [C, H, W] and [C, h, w], alpha [1, H, W]",
+                         got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]))  # fmt: skip
+    library = _library_for((rgb, alpha, coarse))
+    if library is None or rgb.numel() == 0 or coarse.numel() == 0:
+        return torch_over(rgb, alpha, coarse)
+    return _Over.apply(rgb, alpha, coarse, library)
+
+
+def torch_over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
+    """``over`` in plain torch."""
+    size = (rgb.shape[1], rgb.shape[2])
+    return rgb + (1 - alpha) * functional.interpolate(coarse[None], size=size, mode="bilinear", align_corners=False)[0]
 
 
 def adam(
@@ -143,13 +199,68 @@ class _Photometric(torch.autograd.Function):
         return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None
 
 
+class _ClassLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, logits: Tensor, target: Tensor, weight: Tensor, scale: float, channel: int, added: Tensor | None, library: ctypes.CDLL
+    ) -> Tensor:
+        values = logits.detach().contiguous()
+        gradient, status = torch.empty_like(values), ctypes.c_int(0)
+        library.mudg_class_loss.restype = ctypes.c_double
+        value = library.mudg_class_loss(
+            *map(_address, (values, target, weight, added)), ctypes.c_int(channel), ctypes.c_int(len(values)),
+            ctypes.c_int64(target.numel()), ctypes.c_float(scale), _address(gradient), ctypes.byref(status),
+        )  # fmt: skip
+        if status.value != 0:
+            raise ResourceError("not enough memory for the class loss", where=f"logits {tuple(values.shape)}")
+        ctx.save_for_backward(gradient)
+        return logits.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        # As above; callers put the weight of the term into ``total``.
+        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None, None, None, None
+
+
+class _Over(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rgb: Tensor, alpha: Tensor, coarse: Tensor, library: ctypes.CDLL) -> Tensor:
+        picture, cover, small = (t.detach().contiguous() for t in (rgb, alpha, coarse))
+        out = torch.empty_like(picture)
+        ctx.library, ctx.sizes = library, (ctypes.c_int * 5)(*picture.shape, *small.shape[1:])
+        _done(library.mudg_over(*map(_address, (picture, cover, small)), ctx.sizes, *map(_address, (out, None, None, None))))
+        ctx.save_for_backward(cover, small)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        cover, small = ctx.saved_tensors
+        of_alpha, of_coarse, gradient = torch.empty_like(cover), torch.empty_like(small), upstream.contiguous()
+        _done(ctx.library.mudg_over(
+            *map(_address, (None, cover, small)), ctx.sizes, *map(_address, (None, gradient, of_alpha, of_coarse))
+        ))  # fmt: skip
+        return upstream, of_alpha, of_coarse, None
+
+
+def _address(tensor: Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+def _done(status: int) -> None:
+    if status != 0:
+        raise ResourceError("not enough memory to put a picture over the sky")
+
+
 def _library_for(tensors: tuple[Tensor, ...]) -> ctypes.CDLL | None:
     """The library where it can work on these tensors; says once why not."""
     library = native.library()
     if library is None:
-        log.info_once(f"photometric loss and Adam: plain torch, slower ({native.status()})")
+        log.info_once(f"losses and Adam: plain torch, slower ({native.status()})")
         return None
     fits = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
     if not fits:
-        log.info_once(f"photometric loss and Adam: plain torch for {tensors[0].dtype} on {tensors[0].device}")
+        log.info_once(f"losses and Adam: plain torch for {tensors[0].dtype} on {tensors[0].device}")
     return library if fits else None

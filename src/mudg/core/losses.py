@@ -164,6 +164,17 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
     return F.cross_entropy(logits[None], target[None], ignore_index=UNLABELLED, reduction="none")[0]
 
 
+def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
+    """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
+
+    ``core.fused.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
+    """
+    if lift is not None:
+        logits = logits.index_add(0, torch.tensor([lift[0]], device=logits.device), lift[1].detach()[None].to(logits.dtype))
+    labelled = torch.where((target >= 0) & (target < len(logits)), target, UNLABELLED)
+    return (semantic_map(logits, labelled) * weight).sum() / total
+
+
 def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) -> Tensor:
     """Regulariser of an objects-only render (Street Gaussians, lambda 0.1, after densification).
 

@@ -31,6 +31,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, Track, View
+from mudg.core import fused as kernels
 from mudg.core.table import Table
 from mudg.models import motion
 
@@ -357,10 +358,15 @@ class SkyNode:
         return int(self.table["panorama"].shape[2])
 
     def at(self, view: View) -> Tensor:
-        """Sky colour ``[3, H, W]`` at every pixel of a view; differentiable in the panorama.
+        """Sky colour ``[3, H, W]`` at every pixel of a view; differentiable in the panorama."""
+        size = (view.camera.height, view.camera.width)
+        return F.interpolate(self.coarsely_at(view)[None], size=size, mode="bilinear", align_corners=False)[0]
 
-        The panorama is far coarser than an image, so it is sampled on every s-th pixel (s chosen such that samples stay
-        denser than texels) and interpolated between them.
+    def coarsely_at(self, view: View) -> Tensor:
+        """Sky colour ``[3, h, w]`` on a coarse grid of a view's pixels; differentiable in the panorama.
+
+        The panorama is far coarser than an image, so it is sampled for every s-by-s block of pixels (s chosen such that samples
+        stay denser than texels), to be interpolated between them.
         """
         camera = view.camera
         texel_rad = np.pi / self.rows
@@ -368,18 +374,17 @@ class SkyNode:
         height, width = -(-camera.height // stride), -(-camera.width // stride)
         grid = torch.from_numpy(self._grid(view, height, width)).to(self.table["panorama"].dtype)
         padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
-        coarse = F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)
-        if stride == 1:
-            return coarse[0]
-        return F.interpolate(coarse, size=(camera.height, camera.width), mode="bilinear", align_corners=False)[0]
+        return F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)[0]
 
     def _grid(self, view: View, height: int, width: int) -> NDArray[np.float32]:
         """Sampling positions in the padded panorama, ``f32[height, width, 2]`` in [-1, 1]."""
         camera = view.camera.resized(width, height)
         x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
         y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
-        rays = np.stack([np.broadcast_to(x, (height, width)), np.broadcast_to(y[:, None], (height, width)), np.ones((height, width))], -1)
-        return self.panorama_grid(rays @ view.world_from_cam[:3, :3].T, padding=1)
+        # Written out: a matrix product of this shape wakes the threads of BLAS at every step of a fit.
+        right, down, ahead = view.world_from_cam[:3, 0], view.world_from_cam[:3, 1], view.world_from_cam[:3, 2]
+        rays = x[None, :, None] * right + (y[:, None, None] * down + ahead)
+        return self.panorama_grid(rays, padding=1)
 
     def panorama_grid(self, directions_world: NDArray[np.float64], padding: int = 0) -> NDArray[np.float32]:
         """Directions ``[..., 3]`` to panorama positions ``[..., 2]`` in [-1, 1] (x: longitude, y: from up to down)."""
@@ -603,19 +608,21 @@ def reflected(means: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
 
 def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> Tensor:
     """Colours ``[3, H, W]`` over the sky: ``rgb + (1 - alpha) * sky``."""
-    return rgb if model.sky is None else rgb + (1 - alpha) * model.sky.at(view)
+    return rgb if model.sky is None else kernels.over(rgb, alpha, model.sky.coarsely_at(view))
 
 
-def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
-    """Rendered class logits ``[C, H, W]`` with the sky's logit added where nothing covers it.
+def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
+    """Channel of the sky among the class logits and what it gains ``[H, W]`` where nothing covers it; None without that class.
 
     The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
     """
-    if ID["sky"] not in model.classes:
-        return extra
-    one_hot = torch.zeros(len(model.classes), 1, 1, dtype=extra.dtype)
-    one_hot[model.classes.index(ID["sky"])] = SKY_LOGIT
-    return extra + (1 - alpha.detach()) * one_hot
+    return None if ID["sky"] not in model.classes else (model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0]))
+
+
+def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
+    """Rendered class logits ``[C, H, W]`` with the sky's logit added where nothing covers it (``sky_lift``)."""
+    lift = sky_lift(model, alpha)
+    return extra if lift is None else extra.index_add(0, torch.tensor([lift[0]]), lift[1][None])
 
 
 # ---- starting values ---------------------------------------------------------------------------------------------

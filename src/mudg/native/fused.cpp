@@ -1,4 +1,4 @@
-// C interface of the fused training kernels: photometric loss and Adam.
+// C interface of the fused training kernels: photometric loss, class loss, pictures over a coarse sky, and Adam.
 #include <cmath>
 
 #include "api.h"
@@ -12,6 +12,25 @@ struct PhotometricScratch {
   mudg::Buffer<float> maps, workers;
   mudg::Buffer<double> partial;
 };
+
+struct OverScratch {
+  mudg::Buffer<float> row_sums, workers;
+  mudg::Buffer<std::int32_t> columns;
+};
+
+// Fills in what both directions share; false: no memory.
+bool prepare_over(OverScratch& scratch, mudg::OverJob& job) {
+  job.workers = mudg::thread_count();
+  const std::size_t rows = job.gradient == nullptr ? 0 : static_cast<std::size_t>(job.channels) * job.height;
+  const std::size_t line = static_cast<std::size_t>(job.coarse_width) + job.width;
+  if (!scratch.row_sums.reserve(rows * job.coarse_width) || !scratch.workers.reserve(line * job.workers) ||
+      !scratch.columns.reserve(static_cast<std::size_t>(3) * job.width))
+    return false;
+  job.row_sums = scratch.row_sums.data();
+  job.worker_scratch = scratch.workers.data();
+  job.columns = scratch.columns.data();
+  return true;
+}
 
 }  // namespace
 
@@ -44,6 +63,43 @@ MUDG_API double mudg_photometric(const float* x, const float* y, int planes, int
   job.worker_scratch = scratch.workers.data();
   job.partial = scratch.partial.data();
   return mudg::kernels().photometric(job);
+}
+
+// scale * sum of weight * cross entropy, and its gradient (f32[classes][pixels], like the logits). NaN and status 1: no
+// memory.
+MUDG_API double mudg_class_loss(const float* logits, const std::int64_t* target, const float* weight, const float* lift,
+                                int raised, int classes, std::int64_t pixels, float scale, float* gradient,
+                                int* status) {
+  static thread_local mudg::Buffer<double> partial;
+  mudg::ClassLossJob job{logits, target, weight, lift, raised, classes, pixels, scale, gradient, nullptr};
+  const std::int64_t pieces = (pixels + mudg::kClassLossPiece - 1) / mudg::kClassLossPiece;
+  *status = partial.reserve(static_cast<std::size_t>(pieces)) ? 0 : 1;
+  if (*status != 0) return NAN;
+  job.partial = partial.data();
+  return mudg::kernels().class_loss(job);
+}
+
+// rgb + (1 - alpha) * coarse enlarged to [channels][height][width]; `sizes` holds channels, height, width, coarse height and
+// coarse width. With a gradient: writes those of alpha and coarse instead. Status 1: no memory.
+MUDG_API int mudg_over(const float* rgb, const float* alpha, const float* coarse, const int* sizes, float* out,
+                       const float* gradient, float* of_alpha, float* of_coarse) {
+  static thread_local OverScratch scratch;
+  mudg::OverJob job{};
+  job.rgb = rgb;
+  job.alpha = alpha;
+  job.coarse = coarse;
+  job.channels = sizes[0];
+  job.height = sizes[1];
+  job.width = sizes[2];
+  job.coarse_height = sizes[3];
+  job.coarse_width = sizes[4];
+  job.out = out;
+  job.gradient = gradient;
+  job.of_alpha = of_alpha;
+  job.of_coarse = of_coarse;
+  if (!prepare_over(scratch, job)) return 1;
+  mudg::kernels().over(job);
+  return 0;
 }
 
 // One Adam step in place on the columns of a table; visible u8[rows] or null. `step` counts from 1.

@@ -43,6 +43,33 @@ struct AdamJob {
   float inv_root_bias2;  // 1 / sqrt(1 - beta2^step)
 };
 
+// Weighted cross entropy (classes.h) of logits [classes][pixels].
+constexpr std::int64_t kClassLossPiece = 4096;  // pixels per piece of work, a multiple of 16
+struct ClassLossJob {
+  const float* logits;
+  const std::int64_t* target;  // [pixels]; outside 0..classes-1: no label
+  const float* weight;         // [pixels]
+  const float* lift;           // [pixels], added to the logits of channel `raised`; null with raised = -1
+  int raised, classes;
+  std::int64_t pixels;
+  float scale;
+  float* gradient;  // like logits
+  double* partial;  // one per piece
+};
+
+// A picture over a coarse one (over.h), [channels][height][width]: forward with gradient = null, else backward.
+struct OverJob {
+  const float *rgb, *alpha, *coarse;  // rgb: forward only
+  int channels, height, width, coarse_height, coarse_width;
+  float* out;             // forward
+  const float* gradient;  // of out
+  float *of_alpha, *of_coarse;
+  float* row_sums;        // [channels][height][coarse_width], backward
+  float* worker_scratch;  // [workers][coarse_width + width]
+  void* columns;          // 12 bytes for every column
+  int workers;
+};
+
 struct Kernels {
   void (*project_forward)(RasterState&, RasterImage&);
   void (*blend_forward)(RasterState&, RasterImage&);
@@ -50,6 +77,8 @@ struct Kernels {
   void (*project_backward)(RasterState&, RasterGradient&);
   double (*photometric)(const PhotometricJob&);
   void (*adam)(const AdamJob&);
+  double (*class_loss)(const ClassLossJob&);
+  void (*over)(const OverJob&);
   double (*peak_multiply_add)(std::int64_t rounds, float* sink);
 };
 

@@ -2,8 +2,10 @@
 #pragma once
 
 #include "adam.h"
+#include "classes.h"
 #include "kernels.h"
 #include "loss.h"
+#include "over.h"
 #include "peak.h"
 #include "raster_backward.h"
 #include "raster_forward.h"
@@ -70,7 +72,7 @@ void blend_backward(RasterState& state, const RasterImageGradient& image) {
 }
 
 constexpr Kernels kTable = {project_forward, blend_forward, blend_backward, project_backward, photometric, adam,
-                            peak_multiply_add};
+                            class_loss, over, peak_multiply_add};
 
 }  // namespace
 }  // namespace mudg::MUDG_ISA_NAMESPACE

@@ -377,8 +377,10 @@ class FitConfig:
     """LiDAR depth on recorded views (best 95 % of the points, relative error)."""
     sky_weight: float = Field(default=0.05, ge=0)
     semantic_weight: float = Field(default=0.1, ge=0)
-    virtual_probability: float = Field(default=0.2, ge=0, le=1)
-    """mudg_s: how often a virtual view is taken instead of a recorded one (theta)."""
+    virtual_probability: float = Field(default=0.4, ge=0, le=1)
+    """mudg_s: how often a step takes a virtual view (theta; published: 0.2, in place of the recorded one)."""
+    virtual_beside: bool = True
+    """A step that takes a virtual view learns from its recorded one as well; off: from the virtual one alone, as published."""
     virtual_start: float = Field(default=0.15, ge=0, le=1)
     """mudg_s: share of the iterations before virtual views join."""
     virtual_stop: float = Field(default=0.9, ge=0, le=1)

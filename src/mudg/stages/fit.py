@@ -40,7 +40,7 @@ from mudg.data.scenefile import read_scene
 from mudg.models.appearance import Appearance
 from mudg.models.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
 from mudg.models.mcmc import McmcSettings, drift, relocate_and_grow
-from mudg.models.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky
+from mudg.models.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky, sky_lift
 from mudg.stages.config import FitConfig
 from mudg.stages.fit_objects import boxes_in_view, objects_only
 from mudg.stages.fit_perception import Perception, perception_of
@@ -192,7 +192,7 @@ def start_state(
 
 
 def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
-    """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each.
+    """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``virtual_beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C is taken at the end of a step: checkpoint, then KeyboardInterrupt.
@@ -207,23 +207,13 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
                 state.unseen = admit_virtual_views(state, config, raster)
             probability = config.virtual_probability if virtual_from < step <= virtual_to else 0.0
             reach_m = _virtual_reach_m(state.views, config, step)
-            sample = state.views.choose(config.seed, step, probability, state.unseen, reach_m)
-            observation = sample.observation
-            recorded = observation.kind == "recorded"
-            wanted = recorded or config.virtual_densify
-            growing = wanted and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
-
-            with_classes = not recorded or step % config.semantic_every == 0
-            gaussians = compose(state.model, observation.view.time_s, None, with_classes, recorded and shows_mirrored(config, step))
-            pose = state.appearance.world_from_cam(observation.view, sample.name) if recorded else None
-            render = rasterize(gaussians, observation.view, raster, absgrad=growing, world_from_cam=pose)
-            terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception, state.appearance)
-            terms |= regularisers(gaussians, config) | correction_terms(state, gaussians, sample, config, raster, step)
-            finite_or_refuse(terms, sample.name, step)
-            torch.stack(list(terms.values())).sum().backward()
-            gradients_or_refuse(state.model, sample.name, step)
-            state.appearance.refuse_non_finite(sample.name, step)
-            adam_step(state.model, step, config, render.trace.visible)
+            samples = state.views.choose(config.seed, step, probability, state.unseen, reach_m, config.virtual_beside)
+            learnt = [_learn_from(state, sample, config, raster, perception, step, index) for index, sample in enumerate(samples)]
+            (render, terms), sample = learnt[0], samples[0]
+            visible = render.trace.visible
+            for other, _ in learnt[1:]:
+                visible = visible | other.trace.visible
+            adam_step(state.model, step, config, visible)
             state.appearance.adam_step(step, appearance_rates(step, config.iterations), kernels.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.longest_to_middle)
@@ -231,9 +221,6 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             if pose_round_due(config, step):
                 moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
                 folder.log(step=step, boxes_moved_m=round(moved_m, 5))
-            if growing:
-                camera = observation.view.camera
-                state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0])
             grown = _densify_if_due(state, config, step)
 
             state.step, state.seconds = step, state.seconds + time.perf_counter() - began
@@ -249,6 +236,37 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
             if interrupted.is_set():
                 folder.pause(state.summary())
                 raise KeyboardInterrupt
+
+
+def _learn_from(
+    state: FitState, sample: Sample, config: FitConfig, raster: RasterConfig, perception: Perception, step: int, index: int
+) -> tuple[Render, dict[str, Tensor]]:
+    """Render a view and add the gradients of its loss to the parameters'.
+
+    Args:
+        index: place of the view among those of this step; what does not depend on the view counts with the first.
+
+    Returns:
+        The picture, and the weighted loss terms.
+    """
+    observation = sample.observation
+    recorded = observation.kind == "recorded"
+    wanted = recorded or config.virtual_densify
+    growing = wanted and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
+    with_classes = not recorded or step % config.semantic_every == 0
+    gaussians = compose(state.model, observation.view.time_s, None, with_classes, recorded and shows_mirrored(config, step))
+    pose = state.appearance.world_from_cam(observation.view, sample.name) if recorded else None
+    render = rasterize(gaussians, observation.view, raster, absgrad=growing, world_from_cam=pose)
+    terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception, state.appearance)
+    terms |= (regularisers(gaussians, config) if index == 0 else {}) | correction_terms(state, gaussians, sample, config, raster, step)
+    finite_or_refuse(terms, sample.name, step)
+    torch.stack(list(terms.values())).sum().backward()
+    gradients_or_refuse(state.model, sample.name, step)
+    state.appearance.refuse_non_finite(sample.name, step)
+    if growing:
+        camera = observation.view.camera
+        state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0])
+    return render, terms
 
 
 def _virtual_reach_m(views: ViewSet, config: FitConfig, step: int) -> float:
@@ -298,9 +316,8 @@ def recorded_terms(
     if sample.sky is not None and config.sky_weight and model.sky is not None:
         terms["sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), labels)
     if render.extra is not None and seen.semantics is not None and config.semantic_weight:
-        logits = composite_semantics(model, render.extra, render.alpha)
-        loss = losses.semantic_map(logits, seen.semantics)
-        terms["semantics"] = config.semantic_weight * losses.weighted_mean(loss, labels[0])
+        total = max(float(labels.sum()), 1e-12) / config.semantic_weight
+        terms["semantics"] = kernels.class_loss(render.extra, seen.semantics, labels[0], total, sky_lift(model, render.alpha))
     return terms
 
 
@@ -332,9 +349,8 @@ def virtual_terms(
     if sample.sky is not None and config.sky_weight and model.sky is not None:
         terms["virtual_sky"] = config.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, sample.sky), weight)
     if render.extra is not None and seen.semantics is not None and config.virtual_semantic_weight:
-        logits = composite_semantics(model, render.extra, render.alpha)
-        loss = losses.semantic_map(logits, seen.semantics)
-        terms["virtual_semantics"] = config.virtual_semantic_weight * losses.confident_mean(loss, weight[0])
+        total, lift = weight[0].numel() / config.virtual_semantic_weight, sky_lift(model, render.alpha)
+        terms["virtual_semantics"] = kernels.class_loss(render.extra, seen.semantics, weight[0], total, lift)
     return terms
 
 

@@ -106,15 +106,17 @@ class ViewSet:
     offsets_m: tuple[float, ...] = ()
 
     def choose(
-        self, run_seed: int, step: int, virtual_probability: float, unseen: Tensor | None = None, reach_m: float = math.inf
-    ) -> Sample:
-        """The view of a step: virtual with the given probability (if there are any), else the next recorded one.
+        self, run_seed: int, step: int, virtual_probability: float, unseen: Tensor | None = None, reach_m: float = math.inf,
+        beside: bool = False,
+    ) -> tuple[Sample, ...]:  # fmt: skip
+        """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
 
         Recorded views come in a fresh random order per round, so that every one is seen equally often.
 
         Args:
             unseen: u8[V, H, W], what only the virtual views see (see ``fit_trust``).
             reach_m: virtual views farther than this from the recorded path are not taken yet.
+            beside: the virtual view comes after the recorded one, not in its place.
         """
         generator = seeds.numpy_rng(run_seed, step, "view")
         if self.virtual and generator.random() < virtual_probability:
@@ -122,7 +124,12 @@ class ViewSet:
             if math.isfinite(reach_m):
                 within = [i for i, offset in enumerate(self.offsets_m) if offset <= reach_m + NEXT_TO_M]
             index = within[int(generator.integers(len(within)))]
-            return self.virtual[index].sample(None if unseen is None else unseen[index])
+            drawn = self.virtual[index].sample(None if unseen is None else unseen[index])
+            return (self._recorded_of(run_seed, step), drawn) if beside else (drawn,)
+        return (self._recorded_of(run_seed, step),)
+
+    def _recorded_of(self, run_seed: int, step: int) -> Sample:
+        """The recorded view of a step."""
         turn, place = divmod(step, len(self.recorded))
         order = seeds.numpy_rng(run_seed, turn, "recorded order").permutation(len(self.recorded))
         return self.recorded[int(order[place])].sample()
