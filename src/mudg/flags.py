@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import io
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from types import MappingProxyType
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 from pydantic import ValidationError
@@ -65,7 +68,7 @@ class Ingest(Many):
     """A dataset log, a scene, or the word city; its format is recognised unless named before it; the folder to write after it."""
     out: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Folder to write, where it is not given after the log. A finished result of the same settings and inputs is reused."""
-    settings: Annotated[stage_config.IngestConfig, arg(name="")] = stage_config.IngestConfig()
+    settings: Annotated[stage_config.IngestConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +79,7 @@ class Annotate(Many):
     """Scene made by ingest."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Folder to write. A finished result of the same settings and inputs is verified and reused."""
-    settings: Annotated[stage_config.AnnotateConfig, arg(name="")] = stage_config.AnnotateConfig()
+    settings: Annotated[stage_config.AnnotateConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,14 +90,14 @@ class Fuse(Many):
     """Scene made by ingest or annotate."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Folder to write. A finished result of the same settings and inputs is verified and reused."""
-    settings: Annotated[stage_config.FuseConfig, arg(name="")] = stage_config.FuseConfig()
+    settings: Annotated[stage_config.FuseConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learn(Output):
     """Flags of ``mudg learn``."""
 
-    settings: Annotated[stage_config.LearnConfig, arg(name="")] = stage_config.LearnConfig()
+    settings: Annotated[stage_config.LearnConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +110,7 @@ class Convert(Common):
     """Model folder to write."""
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a model that is there already."""
-    settings: Annotated[stage_config.ConvertConfig, arg(name="")] = stage_config.ConvertConfig()
+    settings: Annotated[stage_config.ConvertConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +123,7 @@ class Synthesize(Output):
     """Clouds made by fuse."""
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Scene made by fit: its renders tell what stands where LiDAR measured nothing."""
-    settings: Annotated[stage_config.SynthesizeConfig, arg(name="")] = stage_config.SynthesizeConfig()
+    settings: Annotated[stage_config.SynthesizeConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +136,7 @@ class Fit(Output):
     """Clouds made by fuse."""
     observations: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Output of synthesize: virtual views to learn from (method mudg_s)."""
-    settings: Annotated[stage_config.FitConfig, arg(name="")] = stage_config.FitConfig()
+    settings: Annotated[stage_config.FitConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +147,7 @@ class Render(Output):
     """The scene the model was fitted to."""
     model: Annotated[Path, arg(metavar="FOLDER")]
     """Model made by fit."""
-    settings: Annotated[stage_config.RenderConfig, arg(name="")] = stage_config.RenderConfig()
+    settings: Annotated[stage_config.RenderConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +160,7 @@ class Score(Output):
     """Methods to compare, each a name and its output of render or synthesize, e.g. mudg_s=runs/render."""
     fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Clouds made by fuse, for the baseline that needs no model (not given: no baseline)."""
-    settings: Annotated[stage_config.ScoreConfig, arg(name="")] = stage_config.ScoreConfig()
+    settings: Annotated[stage_config.ScoreConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +177,7 @@ class Run(Output):
     """Cameras to move sideways (not given: the first one)."""
     shifts_m: tuple[float, ...] = ()
     """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
-    settings: Annotated[stage_config.RunConfig, arg(name="")] = stage_config.RunConfig()
+    settings: Annotated[stage_config.RunConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +192,7 @@ class Demo(Output):
     """Seed of the city and of every random draw in the chain (not given: city 3, draws 0, or what --config says)."""
     shifts_m: tuple[float, ...] = ()
     """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
-    settings: Annotated[stage_config.RunConfig, arg(name="")] = stage_config.RunConfig()
+    settings: Annotated[stage_config.RunConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +201,7 @@ class Bench(Output):
 
     name: Positional[str]
     """mdm, mdm-ablation, poses or shift."""
-    settings: Annotated[stage_config.BenchConfig, arg(name="")] = stage_config.BenchConfig()
+    settings: Annotated[stage_config.BenchConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,8 +226,9 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
         SystemExit: --help (0), or a flag that does not exist or fit (2); it has been said already.
     """
     flags = FLAGS[verb]
-    kind = next((f.default for f in fields(flags) if f.name == "settings"), None)
-    default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(type(kind), words))
+    kind = get_type_hints(flags).get("settings")
+    default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(kind, words))
+    _explain(flags, {})
     try:
         return tyro.cli(flags, args=list(words), default=default, prog=f"mudg {verb}", description=description)
     except ValidationError as error:
@@ -265,4 +269,45 @@ def _settings(kind: type[Any], words: Sequence[str]) -> Any:
 def _with_settings(flags: type[Any], settings: Any) -> Any:
     """An instance of ``flags`` whose required fields are still missing, for tyro to fill."""
     values = {f.name: tyro.MISSING for f in fields(flags) if f.default is f.default_factory}
-    return flags(**values, settings=settings)
+    return flags(**{**values, "settings": settings})
+
+
+def _explain(kind: type[Any], read: dict[str, dict[str, dict[str, str]]]) -> None:
+    """Give the fields of a dataclass, and of those inside it, the text written below each in the source.
+
+    tyro would find the same texts by parsing a class's whole module once or twice for every class, and its lines once more in
+    Python: half of the time of ``mudg run --help``. Where a source file is missing, that is left to tyro.
+
+    Args:
+        kind: a dataclass. read: texts by module, class and field of the modules read so far; modules are added.
+    """
+    inside = {name: inner for name, inner in get_type_hints(kind).items() if is_dataclass(inner)}
+    for field in fields(kind):
+        owner = next(base for base in kind.__mro__ if field.name in base.__dict__.get("__annotations__", {}))
+        if owner.__module__ not in read:
+            read[owner.__module__] = _texts_below_fields(getattr(sys.modules[owner.__module__], "__file__", None))
+        texts = read[owner.__module__].get(owner.__qualname__)
+        if texts is None:
+            continue
+        text = texts.get(field.name, "")
+        if field.name in inside:
+            _explain(inside[field.name], read)
+            text = text or " ".join((inside[field.name].__doc__ or "").split())
+        field.metadata = MappingProxyType({**field.metadata, "help": text})
+
+
+def _texts_below_fields(source: str | None) -> dict[str, dict[str, str]]:
+    """By class and field: the string that stands below the field in a source file, as one line. Empty without a file."""
+    if source is None or not Path(source).is_file():
+        return {}
+    texts: dict[str, dict[str, str]] = {}
+    for node in ast.parse(Path(source).read_bytes()).body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        of = texts.setdefault(node.name, {})
+        for field, below in zip(node.body, node.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
+                value = below.value
+                if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                    of[field.target.id] = " ".join(value.value.split())
+    return texts

@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 
@@ -54,6 +56,32 @@ def test_every_verb_has_flags_and_every_flag_an_explanation(capsys: pytest.Captu
         text = help_text(verb, capsys)
         assert "(default:" in text
         assert "usage: mudg " + verb in text
+
+
+def test_every_field_has_a_text(capsys: pytest.CaptureFixture[str]) -> None:
+    bare = []
+    for verb, kind in flags.FLAGS.items():
+        help_text(verb, capsys)
+        todo = [(verb, kind)]
+        while todo:
+            name, of = todo.pop()
+            inside = {n: t for n, t in get_type_hints(of).items() if dataclasses.is_dataclass(t)}
+            todo += [(f"{name}.{n}", t) for n, t in inside.items()]
+            bare += [f"{name}.{f.name}" for f in dataclasses.fields(of) if not f.metadata.get("help")]
+    assert not bare
+
+
+def test_help_reads_no_source_class_by_class(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What tyro does for a field without a text: it parses the module anew for every class, which took longer than all else."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the source of a class was asked for")
+
+    monkeypatch.setattr("inspect.getsource", refuse)
+    assert "Optimisation steps" in help_text("fit", capsys)
+    assert "Hold out every n-th frame" in help_text("run", capsys)
 
 
 def test_help_lists_only_what_exists() -> None:

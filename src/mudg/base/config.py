@@ -14,8 +14,11 @@ from mudg.base.errors import InputError, UsageError
 
 Config = TypeVar("Config")
 
-STRICT = ConfigDict(extra="forbid")
-"""Pass as ``@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)``."""
+STRICT = ConfigDict(extra="forbid", defer_build=True)
+"""Pass as ``@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)``.
+
+Validators are built at the first use: a command builds those of its own verb only. A default that is itself a configuration
+is therefore a ``default_factory``."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class IngestConfig:
     """Leave out frames of which an image or scan is missing, instead of refusing."""
     untwist: Literal["auto", "yes", "no"] = "auto"
     """Undo the distortion of LiDAR scans by the vehicle's motion (auto = where the dataset says they are distorted)."""
-    city: CityConfig = CityConfig()
+    city: CityConfig = Field(default_factory=CityConfig)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -115,6 +115,7 @@ class LearnConfig:
     all_cities_at: float = Field(default=0.6, ge=0, le=1)
     """Share of the steps after which all cities are in use."""
     clips_per_city: int = Field(default=4, ge=1)
+    """Clips that each generated city gives."""
     held_out: int = Field(default=6, ge=1)
     """Cities kept for scoring only."""
     watched: int = Field(default=1, ge=1)
@@ -141,6 +142,7 @@ class LearnConfig:
     tensorboard: bool = False
     """Also write losses for TensorBoard (needs the package tensorboard, extra [track])."""
     width: int = Field(default=192, ge=32)
+    """Width of the training images, pixels."""
     height: int = Field(default=128, ge=32)
     """Logs: only the area counts; the aspect is the camera's."""
     window: int = Field(default=8, ge=1)
@@ -148,18 +150,27 @@ class LearnConfig:
     widths: tuple[int, ...] = (64, 128, 224)
     """Channels of the network's levels."""
     blocks: tuple[int, ...] = (1, 1, 2)
+    """Residual blocks per level."""
     spatial_attention: tuple[bool, ...] = (False, False, True)
+    """Whether a level attends between the places of a frame."""
     temporal_attention: tuple[bool, ...] = (False, False, True)
+    """Whether a level attends between frames."""
     patch: int = Field(default=2, ge=1)
+    """Side of the squares of latent pixels that the network takes as one."""
     refine_widths: tuple[int, ...] = (64, 128)
     """Channels of the refiner at the latent resolution and at half of it; none = no refiner."""
     refine_blocks: tuple[int, ...] = (2, 3)
+    """Residual blocks per level of the refiner."""
     refined_share: float = Field(default=0.5, gt=0, le=1)
     """Share of each side of the image on which the refiner is trained at a step."""
     codec_steps: int = Field(default=400, ge=1)
+    """Steps of the codec's decoder."""
     codec_batch: int = Field(default=16, ge=1)
+    """Images per step of the codec's decoder."""
     codec_fit_batches: int = Field(default=8, ge=1)
+    """Batches to which the codec's linear part is fitted."""
     codec_lr: float = Field(default=2e-3, gt=0)
+    """Learning rate of the codec's decoder."""
     steps: int = Field(default=2800, ge=1)
     """Steps of the denoising network."""
     batch_frames: int = Field(default=16, ge=1)
@@ -167,14 +178,19 @@ class LearnConfig:
     full_window_share: float = Field(default=0.3, ge=0, le=1)
     """Share of the steps, at the end, with whole windows."""
     lr: float = Field(default=1e-3, gt=0)
+    """Largest learning rate of the denoising network."""
     warmup_steps: int = Field(default=100, ge=0)
+    """Steps over which the learning rate rises to it."""
     decay_share: float = Field(default=0.5, gt=0, le=1)
     """Share of the steps, at the end, over which the learning rate falls."""
     last_lr_share: float = Field(default=0.02, gt=0, le=1)
     """Share of the learning rate at the end (1 = constant)."""
     beta1: float = Field(default=0.9, ge=0, lt=1)
+    """AdamW: decay of the gradients' mean."""
     beta2: float = Field(default=0.99, ge=0, lt=1)
+    """AdamW: decay of the mean of their squares."""
     weight_decay: float = Field(default=0.01, ge=0)
+    """AdamW: how strongly weights are pulled to zero."""
     clip_norm: float = Field(default=1.0, ge=0)
     """Gradients are scaled down to this norm (0 = never)."""
     frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
@@ -191,11 +207,15 @@ class LearnConfig:
     average_decay: float = Field(default=0.998, ge=0, lt=1)
     """Decay of the moving average of the weights (0 = no average)."""
     checkpoint_every: int = Field(default=100, ge=1)
+    """Steps per checkpoint."""
     log_every: int = Field(default=50, ge=1)
     """Steps per line of log.jsonl."""
     sample_every: int = Field(default=400, ge=1)
+    """Steps per scoring and picture of the watched cities."""
     sample_steps: int = Field(default=2, ge=1)
+    """Denoising steps of these pictures."""
     score_steps: int = Field(default=2, ge=1)
+    """Denoising steps of the scores at the end."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -211,10 +231,15 @@ class BenchConfig:
     steps: tuple[int, ...] = (1, 2, 8)
     """Denoising steps to compare."""
     sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
+    """How the denoising steps are taken."""
     eta: float = Field(default=1.0, ge=0, le=1)
+    """Noise that ddim adds between steps: 0 = deterministic, 1 = ancestral."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
+    """mdm, mdm-ablation, poses: threads of torch."""
     seed: int = 0
+    """Fixes every random draw."""
     ablation_steps: int = Field(default=1500, ge=1)
     """mdm-ablation: training steps of each variant."""
     ablation_cities: int = Field(default=40, ge=1)
@@ -259,6 +284,7 @@ class SynthesizeConfig:
     """condition, render: start from the condition, or from the fitted scene's renders, with noise on it, and run only the
     share `strength` of the schedule."""
     strength: float = Field(default=1.0, gt=0, le=1)
+    """start condition, render: share of the noise schedule that is run (1 = all of it)."""
     samples: int = Field(default=1, ge=1)
     """Samples per clip; the first is kept, the spread of all lowers the confidence. Costs that many times the passes."""
     given_classes: bool = True
@@ -286,6 +312,7 @@ class SynthesizeConfig:
     memory_budget_gb: float = Field(default=0.0, ge=0)
     """Published-type models: cut the work so that it fits into this memory (0 = do not cut)."""
     seed: int = 0
+    """Fixes the noise."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -318,6 +345,7 @@ class FitConfig:
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
     """Optimisation steps, one view each. Schedules and learning rates follow this number."""
     seed: int = 0
+    """Fixes every random draw."""
     cameras: tuple[str, ...] = ()
     """Cameras whose recorded frames are fitted; empty = all."""
     width_px: int = Field(default=0, ge=0)
@@ -331,6 +359,7 @@ class FitConfig:
     longest_to_middle: float = Field(default=10.0, ge=1)
     """A Gaussian's longest axis is kept within this factor of its middle one: needles look right along the recorded line only."""
     max_gaussians: int = Field(default=120_000, ge=100)
+    """Gaussians are added up to this number."""
     initial_gaussians: int = Field(default=70_000, ge=50)
     """Upper bound for the static points taken from the fused cloud, and for those of all objects together."""
     voxel_m: float = Field(default=0.15, gt=0)
@@ -373,10 +402,13 @@ class FitConfig:
     object_weight: float = Field(default=0.0, ge=0)
     """Moving objects decide, inside their boxes, between there and not there, and leave no haze outside (published: 0.1)."""
     ssim_weight: float = Field(default=0.2, ge=0, le=1)
+    """Share of structural similarity in the colour term of recorded views; the rest is absolute difference."""
     lidar_weight: float = Field(default=0.1, ge=0)
     """LiDAR depth on recorded views (best 95 % of the points, relative error)."""
     sky_weight: float = Field(default=0.05, ge=0)
+    """Sky stays free of Gaussians, on recorded views."""
     semantic_weight: float = Field(default=0.1, ge=0)
+    """Classes of recorded views (cross-entropy)."""
     virtual_probability: float = Field(default=0.4, ge=0, le=1)
     """mudg_s: how often a step takes a virtual view (theta; published: 0.2, in place of the recorded one)."""
     virtual_beside: bool = True
@@ -398,9 +430,11 @@ class FitConfig:
     virtual_densify: bool = False
     """mudg_s: virtual views also decide where Gaussians are added."""
     virtual_color_weight: float = Field(default=1.0, ge=0)
+    """mudg_s: colour of virtual views."""
     virtual_ssim_weight: float = Field(default=0.3, ge=0, le=1)
     """mudg_s: share of structural similarity in the colour term, as `ssim_weight` for recorded views."""
     virtual_perceptual_weight: float = Field(default=0.3, ge=0)
+    """mudg_s: likeness of virtual views in the eyes of `virtual_perception`."""
     virtual_perception: Literal["filters", "codec", "lpips"] = "filters"
     """mudg_s: in whose eyes renders are like virtual views. filters: fixed ones; codec: the shipped diffusion model's, which is slower;
     lpips: that network, from `lpips_weights`."""
@@ -413,7 +447,9 @@ class FitConfig:
     virtual_semantic_weight: float = Field(default=0.02, ge=0)
     """Small: the shipped diffusion model tells classes less well than Gaussians that learned them from recorded frames."""
     checkpoint_every: int = Field(default=500, ge=1)
+    """Steps per checkpoint."""
     preview_every: int = Field(default=500, ge=1)
+    """Steps per preview picture."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Backend of the renderer; auto takes the fastest there is and says which."""
 
@@ -423,6 +459,7 @@ class RenderConfig:
     """Render a fitted scene on recorded and shifted trajectories."""
 
     cameras: tuple[str, ...] = ("front",)
+    """Cameras to render. Names that the scene lacks are an error; empty = the first camera."""
     shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
     """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded drive."""
     height_m: float = 0.0
@@ -436,8 +473,11 @@ class RenderConfig:
     sky_below_alpha: float = Field(default=0.5, ge=0, le=1)
     """Pixels covered less than this are sky: no depth, semantics sky."""
     video: bool = True
+    """Also write a video per trajectory."""
     fps: float = Field(default=10.0, gt=0)
+    """Pictures per second of the videos."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
+    """Backend of the renderer; auto takes the fastest there is and says which."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -462,13 +502,13 @@ class ScoreConfig:
 class RunConfig:
     """The whole chain. Each verb's settings carry its name as prefix."""
 
-    ingest: IngestConfig = IngestConfig()
-    annotate: AnnotateConfig = AnnotateConfig()
-    fuse: FuseConfig = FuseConfig()
-    synthesize: SynthesizeConfig = SynthesizeConfig()
-    fit: FitConfig = FitConfig()
-    render: RenderConfig = RenderConfig()
-    score: ScoreConfig = ScoreConfig()
+    ingest: IngestConfig = Field(default_factory=IngestConfig)
+    annotate: AnnotateConfig = Field(default_factory=AnnotateConfig)
+    fuse: FuseConfig = Field(default_factory=FuseConfig)
+    synthesize: SynthesizeConfig = Field(default_factory=SynthesizeConfig)
+    fit: FitConfig = Field(default_factory=FitConfig)
+    render: RenderConfig = Field(default_factory=RenderConfig)
+    score: ScoreConfig = Field(default_factory=ScoreConfig)
 
 
 DEMO_CITY = 3
