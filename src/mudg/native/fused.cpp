@@ -71,11 +71,25 @@ MUDG_API double mudg_class_loss(const float* logits, const std::int64_t* target,
                                 int raised, int classes, std::int64_t pixels, float scale, float* gradient,
                                 int* status) {
   static thread_local mudg::Buffer<double> partial;
-  mudg::ClassLossJob job{logits, target, weight, lift, raised, classes, pixels, scale, gradient, nullptr};
+  static thread_local mudg::Buffer<float> workers;
+  mudg::ClassLossJob job{};
+  job.logits = logits;
+  job.target = target;
+  job.weight = weight;
+  job.lift = lift;
+  job.raised = raised;
+  job.classes = classes;
+  job.pixels = pixels;
+  job.scale = scale;
+  job.gradient = gradient;
+  job.workers = mudg::thread_count();
   const std::int64_t pieces = (pixels + mudg::kClassLossPiece - 1) / mudg::kClassLossPiece;
-  *status = partial.reserve(static_cast<std::size_t>(pieces)) ? 0 : 1;
-  if (*status != 0) return NAN;
+  const bool ok = partial.reserve(static_cast<std::size_t>(pieces)) &&
+                  workers.reserve(static_cast<std::size_t>(job.workers) * classes * mudg::kClassLossBlock);
+  *status = ok ? 0 : 1;
+  if (!ok) return NAN;
   job.partial = partial.data();
+  job.worker_scratch = workers.data();
   return mudg::kernels().class_loss(job);
 }
 

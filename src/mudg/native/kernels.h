@@ -44,7 +44,8 @@ struct AdamJob {
 };
 
 // Weighted cross entropy (classes.h) of logits [classes][pixels].
-constexpr std::int64_t kClassLossPiece = 4096;  // pixels per piece of work, a multiple of 16
+constexpr int kClassLossBlock = 64;  // pixels worked on together
+constexpr std::int64_t kClassLossPiece = 4096;  // pixels per piece of work, a multiple of the block
 struct ClassLossJob {
   const float* logits;
   const std::int64_t* target;  // [pixels]; outside 0..classes-1: no label
@@ -53,7 +54,9 @@ struct ClassLossJob {
   int raised, classes;
   std::int64_t pixels;
   float scale;
-  float* gradient;  // like logits
+  float* gradient;        // like logits
+  float* worker_scratch;  // [workers][classes][kClassLossBlock], 64-byte aligned
+  int workers;
   double* partial;  // one per piece
 };
 
