@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mudg.base.errors import UsageError
+from mudg.base.errors import MudgError, UsageError
 from mudg.core import flicker
 from mudg.data import city_clips, clip_shards
 from mudg.models import mdm
@@ -91,6 +91,14 @@ def test_reported_and_development_cities_differ():
     rules = city_clips.CityClipRules()
     for number in (city_clips.REPORTED[0], city_clips.DEVELOPMENT[0]):
         assert city_clips.city_config(rules, number) == city_clips.city_config(replace(rules, seed=7), number)
+
+
+def test_what_reads_no_model_does_not_depend_on_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(bench.BENCHES, "poses", lambda config, out: ({"cities": []}, "nothing"))
+    out = bench.run("poses", BenchConfig(model=str(tmp_path / "no model here")), tmp_path / "out")
+    assert json.loads((out / "run.json").read_text())["inputs"] == {}
+    with pytest.raises(MudgError, match="no model|model"):
+        bench.run("mdm", BenchConfig(model=str(tmp_path / "no model here")), tmp_path / "other")
 
 
 @pytest.mark.slow

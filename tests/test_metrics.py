@@ -10,6 +10,7 @@ import torch
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, ID
 from mudg.core import metrics
+from mudg.core.losses import ssim_map
 from mudg.core.metrics import METRICS, Pair
 
 
@@ -69,16 +70,16 @@ def test_prediction_outside_the_classes_is_wrong_not_ignored():
 
 def test_miou_is_pooled_over_the_trajectory_not_averaged_over_views():
     metric = metrics.Segmentation("miou")
-    metric.update(pair(semantics=torch.zeros(1, 9, dtype=torch.long), truth_semantics=torch.zeros(1, 9, dtype=torch.long)))
-    metric.update(pair(semantics=torch.ones(1, 1, dtype=torch.long), truth_semantics=torch.zeros(1, 1, dtype=torch.long)))
+    metric.add(metric.source(pair(semantics=torch.zeros(1, 9, dtype=torch.long), truth_semantics=torch.zeros(1, 9, dtype=torch.long))))
+    metric.add(metric.source(pair(semantics=torch.ones(1, 1, dtype=torch.long), truth_semantics=torch.zeros(1, 1, dtype=torch.long))))
     assert metric.value() == pytest.approx(0.9)
 
 
 def test_rmse_is_pooled_over_pixels():
     metric = metrics.DepthError("rmse_m")
     valid = torch.ones(1, 1, 3, dtype=torch.bool)
-    metric.update(pair(depth=torch.full((1, 1, 3), 12.0), truth_depth=torch.full((1, 1, 3), 10.0), truth_depth_valid=valid))
-    metric.update(pair(depth=torch.full((1, 1, 1), 10.0), truth_depth=torch.full((1, 1, 1), 10.0)))
+    metric.add(metric.source(pair(depth=torch.full((1, 1, 3), 12.0), truth_depth=torch.full((1, 1, 3), 10.0), truth_depth_valid=valid)))
+    metric.add(metric.source(pair(depth=torch.full((1, 1, 1), 10.0), truth_depth=torch.full((1, 1, 1), 10.0))))
     assert metric.value() == pytest.approx(math.sqrt(3 * 4 / 4))
 
 
@@ -86,7 +87,7 @@ def test_absent_modalities_are_said_in_words():
     accumulators = metrics.build_all()
     rgb = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
     for metric in accumulators.values():
-        metric.update(pair(rgb=rgb, truth_rgb=rgb, truth_depth=torch.ones(1, 16, 16), truth_semantics=torch.zeros(16, 16)))
+        metric.add(metric.source(pair(rgb=rgb, truth_rgb=rgb, truth_depth=torch.ones(1, 16, 16), truth_semantics=torch.zeros(16, 16))))
     table = metrics.results(accumulators)
     assert table["psnr"] == 100.0
     assert table["ssim"] == pytest.approx(1.0, abs=1e-6)
@@ -97,3 +98,37 @@ def test_absent_modalities_are_said_in_words():
 
 def test_nothing_compared_is_not_zero():
     assert metrics.results(metrics.build_all())["miou"] == "not produced"
+
+
+def test_a_full_mask_and_none_give_the_same_similarity():
+    """Without a mask the native pass answers, with one the map in torch: both are the same number."""
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(3, 24, 40, generator=generator)
+    made = (truth + 0.1 * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
+    expected = float(ssim_map(made, truth).double().mean())
+    full = torch.ones(1, 24, 40, dtype=torch.bool)
+    assert metrics.ssim(made, truth) == pytest.approx(expected, abs=1e-6)
+    assert metrics.ssim(made, truth, full) == metrics.ssim(made, truth)
+    assert metrics.psnr(made, truth, full) == metrics.psnr(made, truth)
+    half = full.clone()
+    half[..., 20:] = False
+    assert metrics.ssim(made, truth, half) == pytest.approx(float(ssim_map(made, truth)[..., :20].double().mean()), abs=1e-6)
+
+
+def test_metrics_of_one_source_share_one_measurement(monkeypatch):
+    asked = []
+    found = metrics.depth_errors
+
+    def counted(*given):
+        asked.append(1)
+        return found(*given)
+
+    monkeypatch.setattr(metrics, "depth_errors", counted)
+    depth = torch.full((1, 4, 4), 12.0)
+    of = metrics.build_all()
+    measured = metrics.measure(pair(depth=depth, truth_depth=torch.full((1, 4, 4), 10.0)), of)
+    assert len(asked) == 1
+    for name, metric in of.items():
+        metric.add(measured[name])
+    table = metrics.results(of)
+    assert (table["abs_rel"], table["rmse_m"], table["delta1"]) == pytest.approx((0.2, 2.0, 1.0))

@@ -199,11 +199,27 @@ def test_flicker_is_change_of_static_surfaces_over_that_of_the_truth():
     metric = metrics.Flicker()
     assert metric.value() is None
     for number in range(4):
-        metric.update(still_pair(number, 0.25))
+        metric.add(metric.source(still_pair(number, 0.25)))
     assert metric.value() == pytest.approx(2.5, rel=1e-4)
     alone = metrics.Flicker()
-    alone.update(still_pair(0, 0.25))
+    alone.add(alone.source(still_pair(0, 0.25)))
     assert alone.value() is None
+
+
+def test_flicker_of_several_methods_shares_what_the_truth_does():
+    motion = metrics.StaticMotion()
+    shared = [metrics.Flicker(motion) for _ in range(3)]
+    alone = [metrics.Flicker() for _ in range(3)]
+    for number in range(4):
+        true = still_pair(number, 0.0)
+        for place, noise in enumerate((0.1, 0.25, 0.0)):
+            made = dataclasses.replace(true, rgb=still_pair(number, noise).rgb)
+            shared[place].add(made)
+            alone[place].add(made)
+    assert [one.value() for one in shared] == [one.value() for one in alone]
+    assert shared[1].value() == pytest.approx(2.5, rel=1e-4)
+    with pytest.raises(InputError, match="true colours"):
+        motion.between(pair(), pair())
 
 
 def test_psnr_of_movers_counts_their_pixels_only_and_leaves_specks_out():
@@ -214,13 +230,13 @@ def test_psnr_of_movers_counts_their_pixels_only_and_leaves_specks_out():
     made[:, 10:20, 10:20] = 0.1
     made[:, 30:] = 1.0  # elsewhere
     of = metrics.build_all()["psnr_movers"]
-    of.update(pair(rgb=made, truth_rgb=truth, moving=moving))
+    of.add(of.source(pair(rgb=made, truth_rgb=truth, moving=moving)))
     assert of.value() == pytest.approx(20.0, abs=1e-4)
     speck = torch.zeros_like(moving)
     speck[0, 0, 0] = True
     empty = metrics.build_all()["psnr_movers"]
-    empty.update(pair(rgb=made, truth_rgb=truth, moving=speck))
-    empty.update(pair(rgb=made, truth_rgb=truth))
+    empty.add(empty.source(pair(rgb=made, truth_rgb=truth, moving=speck)))
+    empty.add(empty.source(pair(rgb=made, truth_rgb=truth)))
     assert empty.value() is None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -33,25 +34,54 @@ def changes(
     Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
     there (bilinear), if the same surface is seen there (depths within 3 %).
     """
-    height, width = truth.shape[-2:]
-    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    static = ~torch.isin(ids, torch.tensor(MOVABLE)) & (depth[:, 0] < 90.0)
+    seen = [Seen(*one) for one in zip(depth, ids, world_from_cam, intrinsics, strict=True)]
     pairs = []
     for t in range(len(truth) - 1):
-        fx, fy, cx, cy = intrinsics[t].float()
-        z = depth[t, 0]
-        points = torch.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z, torch.ones_like(z)])
-        pose = (torch.linalg.inv(world_from_cam[t + 1]) @ world_from_cam[t]).float()
-        x, y, ahead, _ = torch.einsum("ij,jhw->ihw", pose, points)
-        fx, fy, cx, cy = intrinsics[t + 1].float()
-        there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[
-            None
-        ]
-        look = lambda image, mode, grid=there: torch.nn.functional.grid_sample(  # noqa: E731
-            image[None], grid, mode=mode, align_corners=False)[0]  # fmt: skip
-        within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)
-        same = within & static[t] & ((look(depth[t + 1], "nearest")[0] / ahead - 1).abs() < 0.03)
-        pairs.append(
-            tuple(float((look(v[t + 1], "bilinear") - v[t]).abs().mean(0)[same].double().sum()) for v in (made, truth))
-        )
+        where = carried(seen[t], seen[t + 1])
+        pairs.append((change(made[t], made[t + 1], where), change(truth[t], truth[t + 1], where)))
     return pairs
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Truth of one frame: depth f32[1,H,W] metres, ids i64[H,W], world_from_cam f64[4,4], intrinsics f64[4]: fx, fy, cx, cy."""
+
+    depth: Tensor
+    ids: Tensor
+    world_from_cam: Tensor
+    intrinsics: Tensor
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Where each pixel of a frame lies in the next one: ``there`` f32[1,H,W,2] in [-1, 1] as `grid_sample` takes it; ``same``
+    bool[H,W]: static, and the same surface is seen there."""
+
+    there: Tensor
+    same: Tensor
+
+
+def carried(frame: Seen, following: Seen) -> Carried:
+    """Carry every pixel of a frame by its depth into the following one."""
+    height, width = frame.ids.shape
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    static = ~torch.isin(frame.ids, torch.tensor(MOVABLE)) & (frame.depth[0] < 90.0)
+    fx, fy, cx, cy = frame.intrinsics.float()
+    z = frame.depth[0]
+    points = torch.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z, torch.ones_like(z)])
+    pose = (torch.linalg.inv(following.world_from_cam) @ frame.world_from_cam).float()
+    x, y, ahead, _ = torch.einsum("ij,jhw->ihw", pose, points)
+    fx, fy, cx, cy = following.intrinsics.float()
+    there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[None]
+    within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)
+    depth_there = _looked_up(following.depth, there, "nearest")[0]
+    return Carried(there, within & static & ((depth_there / ahead - 1).abs() < 0.03))
+
+
+def change(frame: Tensor, following: Tensor, where: Carried) -> float:
+    """Summed absolute change of colours f32[3,H,W] from a frame to the following one, over the pixels in ``where.same``."""
+    return float((_looked_up(following, where.there, "bilinear") - frame).abs().mean(0)[where.same].double().sum())
+
+
+def _looked_up(image: Tensor, there: Tensor, mode: str) -> Tensor:
+    return torch.nn.functional.grid_sample(image[None], there, mode=mode, align_corners=False)[0]

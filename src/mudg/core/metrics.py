@@ -1,6 +1,7 @@
 """Image, depth and semantic metrics, each as a small accumulator over a whole trajectory.
 
-A metric takes a predicted and a true observation and adds what it needs to its sums; ``value()`` is asked once at the end.
+A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums, and is asked
+for its ``value()`` once at the end. Metrics with the same source share one measurement.
 What a method did not produce stays None ("not produced"); what needs weights that are not there is listed in ``METRICS``
 with ``build=None`` ("not computed"). Nothing is ever reported as zero for want of data.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +20,7 @@ from torch import Tensor
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.types import View
-from mudg.core import flicker
+from mudg.core import flicker, fused
 from mudg.core.losses import ssim_map
 
 CLASS_COUNT: Final = len(CLASSES)
@@ -37,9 +38,10 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
     Returns:
         dB from the mean squared error over all counted values; infinity for equal images, NaN when nothing counts.
     """
+    if mask is not None and not bool(mask.all()):
+        chosen = mask.expand_as(truth)
+        prediction, truth = prediction[chosen], truth[chosen]
     squared = (prediction.clamp(0, 1) - truth).double() ** 2
-    if mask is not None:
-        squared = squared[mask.expand_as(squared)]
     if squared.numel() == 0:
         return math.nan
     error = float(squared.mean())
@@ -51,9 +53,12 @@ def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
 
     ``[C, H, W]`` in [0, 1]; mean over channels and over the pixels in ``mask`` (bool ``[1, H, W]``). NaN if none.
     """
+    if prediction.numel() == 0:
+        return math.nan
+    if mask is None or bool(mask.all()):
+        return 1.0 - float(fused.photometric(prediction.clamp(0, 1), truth, 1.0))
     values = ssim_map(prediction.clamp(0, 1), truth)
-    if mask is not None:
-        values = values[mask.expand_as(values)]
+    values = values[mask.expand_as(values)]
     return float(values.double().mean()) if values.numel() else math.nan
 
 
@@ -79,12 +84,22 @@ def perceptual_distance(
     Raises:
         InputError: the two have other shapes.
     """
+    return distance_of_units(unit_features(prediction), unit_features(truth), mask, weights)
+
+
+def distance_of_units(
+    prediction: Sequence[Tensor],
+    truth: Sequence[Tensor],
+    mask: Tensor | None = None,
+    weights: Sequence[Tensor] | None = None,
+) -> float:
+    """``perceptual_distance`` of features that ``unit_features`` has brought to length 1 already."""
     total = 0.0
     for stage, (mine, theirs) in enumerate(zip(prediction, truth, strict=True)):
         if mine.shape != theirs.shape:
             raise InputError("features of two pictures differ in shape", where=f"stage {stage}",
                              expected=str(tuple(theirs.shape)), got=str(tuple(mine.shape)))  # fmt: skip
-        squared = (_unit(mine) - _unit(theirs)) ** 2
+        squared = (mine - theirs) ** 2
         places = squared.sum(0) if weights is None else (squared * weights[stage].view(-1, 1, 1)).sum(0)
         if mask is None:
             total += float(places.double().mean())
@@ -94,9 +109,9 @@ def perceptual_distance(
     return total / len(truth) if weights is None else total
 
 
-def _unit(features: Tensor) -> Tensor:
-    """Feature vectors ``[C, h, w]`` brought to length 1."""
-    return features / (features.square().sum(0, keepdim=True).sqrt() + 1e-6)
+def unit_features(stages: Sequence[Tensor]) -> list[Tensor]:
+    """Feature vectors of every place brought to length 1; per stage ``[C_l, h_l, w_l]``."""
+    return [features / (features.square().sum(0, keepdim=True).sqrt() + 1e-6) for features in stages]
 
 
 @dataclass(frozen=True)
@@ -188,8 +203,13 @@ class Pair:
 class Metric(Protocol):
     """Accumulates over the pairs of one trajectory."""
 
-    def update(self, pair: Pair) -> None:
-        """Add one view."""
+    @property
+    def source(self) -> Callable[[Pair], Any]:
+        """What it measures of a view: a pure function."""
+        ...
+
+    def add(self, measured: Any) -> None:
+        """Add one view, as ``source`` measured it. Views come in order."""
         ...
 
     def value(self) -> float | None:
@@ -197,19 +217,27 @@ class Metric(Protocol):
         ...
 
 
+def measure(pair: Pair, metrics: Mapping[str, Metric]) -> dict[str, Any]:
+    """What the named metrics measure of one view, ready for ``Metric.add``; each source is asked once."""
+    found: dict[Callable[[Pair], Any], Any] = {}
+    for metric in metrics.values():
+        if metric.source not in found:
+            found[metric.source] = metric.source(pair)
+    return {name: found[metric.source] for name, metric in metrics.items()}
+
+
 class FrameMean:
     """Mean over views of a per-view number; views without the modality do not count."""
 
-    def __init__(self, of: Callable[[Pair], float | None]) -> None:
-        self._of = of
+    def __init__(self, source: Callable[[Pair], float | None]) -> None:
+        self.source = source
         self._sum = 0.0
         self._views = 0
 
-    def update(self, pair: Pair) -> None:
+    def add(self, measured: float | None) -> None:
         """Add one view; a view whose number is None or NaN (nothing to compare) is left out."""
-        number = self._of(pair)
-        if number is not None and not math.isnan(number):
-            self._sum += min(number, 100.0)  # equal images give infinite dB; 100 keeps the mean readable
+        if measured is not None and not math.isnan(measured):
+            self._sum += min(measured, 100.0)  # equal images give infinite dB; 100 keeps the mean readable
             self._views += 1
 
     def value(self) -> float | None:
@@ -222,21 +250,16 @@ class DepthError:
 
     def __init__(self, field: Literal["abs_rel", "rmse_m", "delta1"]) -> None:
         self._field: Literal["abs_rel", "rmse_m", "delta1"] = field
+        self.source = _depth_errors_of
         self._sum = 0.0
         self._pixels = 0
 
-    def update(self, pair: Pair) -> None:
-        """Add one view with predicted and true depth."""
-        if pair.depth is None or pair.truth_depth is None:
-            return
-        mask = torch.ones_like(pair.truth_depth, dtype=torch.bool) if pair.mask is None else pair.mask
-        if pair.truth_depth_valid is not None:
-            mask = mask & pair.truth_depth_valid
-        errors = depth_errors(pair.depth, pair.truth_depth, mask)
-        if errors.pixels:
-            number = {"abs_rel": errors.abs_rel, "rmse_m": errors.rmse_m**2, "delta1": errors.delta1}[self._field]
-            self._sum += number * errors.pixels
-            self._pixels += errors.pixels
+    def add(self, measured: DepthErrors | None) -> None:
+        """Add the errors of one view; None and no pixels do not count."""
+        if measured is not None and measured.pixels:
+            number = {"abs_rel": measured.abs_rel, "rmse_m": measured.rmse_m**2, "delta1": measured.delta1}[self._field]
+            self._sum += number * measured.pixels
+            self._pixels += measured.pixels
 
     def value(self) -> float | None:
         """Pooled error, or None."""
@@ -251,12 +274,13 @@ class Segmentation:
 
     def __init__(self, field: Literal["miou", "accuracy"]) -> None:
         self._field = field
+        self.source = _confusion_of
         self.counts = torch.zeros(CLASS_COUNT, CLASS_COUNT + 1, dtype=torch.int64)
 
-    def update(self, pair: Pair) -> None:
-        """Add one view with predicted and true semantics."""
-        if pair.semantics is not None and pair.truth_semantics is not None:
-            self.counts += confusion(pair.semantics, pair.truth_semantics, pair.mask)
+    def add(self, measured: Tensor | None) -> None:
+        """Add the confusion counts of one view; None does not count."""
+        if measured is not None:
+            self.counts += measured
 
     def value(self) -> float | None:
         """Pooled value in [0, 1], or None."""
@@ -269,41 +293,87 @@ class Segmentation:
         return sum(iou.values()) / len(iou)
 
 
-class Flicker:
-    """Change of static surfaces from each frame to the next, over that in the truth, pooled over the trajectory (see
-    ``core.flicker``). Wants every frame of a trajectory in order, with exact colour, depth and classes."""
+class StaticMotion:
+    """Where static surfaces of one true frame are in the next, and what they change there (see ``core.flicker``).
+
+    The last answer is kept: method after method is held against the same two frames.
+    """
 
     def __init__(self) -> None:
+        self._frames: tuple[Tensor, Tensor] | None = None
+        self._found: tuple[flicker.Carried, float] | None = None
+
+    def between(self, before: Pair, pair: Pair) -> tuple[flicker.Carried, float]:
+        """For two neighbouring pairs that hold exact colour, depth, classes and the view."""
+        if before.truth_rgb is None or pair.truth_rgb is None:
+            raise InputError("flicker needs true colours")
+        same = self._frames is not None and self._frames[0] is before.truth_rgb and self._frames[1] is pair.truth_rgb
+        if self._found is None or not same:
+            carried = flicker.carried(_seen_by(before), _seen_by(pair))
+            self._found = carried, flicker.change(before.truth_rgb, pair.truth_rgb, carried)
+            self._frames = before.truth_rgb, pair.truth_rgb
+        return self._found
+
+
+def _seen_by(pair: Pair) -> flicker.Seen:
+    view, depth, ids = pair.view, pair.truth_depth, pair.truth_semantics
+    if view is None or depth is None or ids is None:
+        raise InputError("flicker needs exact depth, classes and the view")
+    camera = view.camera
+    depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0)
+    lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    return flicker.Seen(depth, ids, torch.from_numpy(view.world_from_cam.copy()), lens)
+
+
+class Flicker:
+    """Change of static surfaces from each frame to the next, over that in the truth, pooled over the trajectory (see
+    ``core.flicker``). Wants every frame of a trajectory in order, with exact colour, depth and classes.
+
+    Args:
+        motion: shared by the metrics of several methods on the same trajectory.
+    """
+
+    def __init__(self, motion: StaticMotion | None = None) -> None:
+        self.source = _whole
+        self._motion = motion or StaticMotion()
         self._before: Pair | None = None
         self._made = 0.0
         self._true = 0.0
 
-    def update(self, pair: Pair) -> None:
+    def add(self, measured: Pair) -> None:
         """Add the next frame."""
-        before, self._before = self._before, pair
-        if before is not None and _dense(before) and _dense(pair):
-            of = (before, pair)
-            stack = lambda name: torch.stack([getattr(p, name) for p in of])  # noqa: E731
-            depth = stack("truth_depth")
-            depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0)
-            views = [p.view for p in of if p.view is not None]
-            poses = torch.stack([torch.from_numpy(v.world_from_cam.copy()) for v in views])
-            lens = torch.tensor(
-                [[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in views], dtype=torch.float64
-            )
-            made = stack("rgb").clamp(0, 1)
-            ((changed, truly),) = flicker.changes(
-                made, stack("truth_rgb"), depth, stack("truth_semantics"), poses, lens
-            )
-            self._made, self._true = self._made + changed, self._true + truly
+        before, self._before = self._before, measured
+        if before is not None and _dense(before) and _dense(measured):
+            carried, truly = self._motion.between(before, measured)
+            made = [p.rgb.clamp(0, 1) for p in (before, measured) if p.rgb is not None]
+            self._made, self._true = self._made + flicker.change(*made, carried), self._true + truly
 
     def value(self) -> float | None:
         """1 = as calm as the truth; None without two neighbouring frames or without static surfaces."""
         return self._made / self._true if self._true > 0 else None
 
 
+def _whole(pair: Pair) -> Pair:
+    return pair
+
+
 def _dense(pair: Pair) -> bool:
     return all(x is not None for x in (pair.rgb, pair.truth_rgb, pair.truth_depth, pair.truth_semantics, pair.view))
+
+
+def _depth_errors_of(pair: Pair) -> DepthErrors | None:
+    if pair.depth is None or pair.truth_depth is None:
+        return None
+    mask = torch.ones_like(pair.truth_depth, dtype=torch.bool) if pair.mask is None else pair.mask
+    if pair.truth_depth_valid is not None:
+        mask = mask & pair.truth_depth_valid
+    return depth_errors(pair.depth, pair.truth_depth, mask)
+
+
+def _confusion_of(pair: Pair) -> Tensor | None:
+    if pair.semantics is None or pair.truth_semantics is None:
+        return None
+    return confusion(pair.semantics, pair.truth_semantics, pair.mask)
 
 
 def _psnr_of(pair: Pair) -> float | None:
@@ -353,10 +423,17 @@ METRICS: Final[dict[str, MetricRow]] = {
 }
 
 
-def build_all(distances: Mapping[str, Callable[[Pair], float | None]] | None = None) -> dict[str, Metric]:
-    """A fresh accumulator for every metric that can be computed; ``distances``: what computes a row that needs weights."""
+def build_all(
+    distances: Mapping[str, Callable[[Pair], float | None]] | None = None, motion: StaticMotion | None = None
+) -> dict[str, Metric]:
+    """A fresh accumulator for every metric that can be computed.
+
+    Args:
+        distances: what computes a row that needs weights.
+        motion: shared by several methods on one trajectory (see ``Flicker``).
+    """
     own = {name: row.build() for name, row in METRICS.items() if row.build is not None}
-    return {**own, **{name: FrameMean(of) for name, of in (distances or {}).items()}}
+    return {**own, "flicker": Flicker(motion), **{name: FrameMean(of) for name, of in (distances or {}).items()}}
 
 
 def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:
@@ -373,5 +450,6 @@ def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:
 
 __all__ = [
     "CLASS_COUNT", "METRICS", "UNLABELLED", "DepthError", "DepthErrors", "Flicker", "FrameMean", "Metric", "MetricRow", "Pair",
-    "Segmentation", "build_all", "confusion", "depth_errors", "iou_of", "perceptual_distance", "psnr", "results", "ssim",
+    "Segmentation", "StaticMotion", "build_all", "confusion", "depth_errors", "distance_of_units", "iou_of", "measure",
+    "perceptual_distance", "psnr", "results", "ssim", "unit_features",
 ]  # fmt: skip

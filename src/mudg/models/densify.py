@@ -124,9 +124,10 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
     clone_rows = (grow & (largest <= settings.split_above_m)).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool)
     keep[split_rows] = False
-    for columns, labels in (_clones(model, clone_rows), *_halves(model, split_rows, step, run_seed)):
-        if len(labels["node"]):
-            model.table.append(columns, labels)
+    halves = [(split_rows, *half) for half in _halves(model, split_rows, step, run_seed)]
+    for parents, columns, labels in ((clone_rows, *_rows(model, clone_rows)), *halves):
+        if len(parents):
+            model.table.append(columns, labels, like=parents)
     keep = torch.cat([keep, torch.ones(len(model.table) - len(keep), dtype=torch.bool)])
     doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
     pruned = int((doomed & keep).sum())
@@ -173,10 +174,6 @@ def _rows(model: SceneModel, rows: Tensor) -> tuple[dict[str, Tensor], dict[str,
     table = model.table
     columns = {name: value.detach()[rows].clone() for name, value in table.columns.items()}
     return columns, {name: value[rows].clone() for name, value in table.labels.items()}
-
-
-def _clones(model: SceneModel, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    return _rows(model, rows)
 
 
 def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:

@@ -16,6 +16,7 @@ The bank is differentiable, deterministic, and costs about as much as SSIM.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from typing import Final
 
@@ -24,7 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mudg.base.errors import InputError
-from mudg.core.metrics import Pair, perceptual_distance
+from mudg.core.metrics import Pair, distance_of_units, unit_features
 from mudg.models.vae import PatchCodec
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
@@ -103,7 +104,8 @@ class CodecFeatures(nn.Module):
         for _ in range(self.SIZES):
             code = self.codec.encode_rgb(image)
             others = sum(count for modality, count in self.codec.channels.items() if modality != "rgb")
-            x = self.codec.enter(torch.cat([code, code.new_zeros(1, others, *code.shape[-2:])], 1))
+            whole = torch.cat([code, code.new_zeros(1, others, *code.shape[-2:])], 1)
+            x = self.codec.enter(whole.contiguous(memory_format=torch.channels_last))  # as the codec's norms want it
             features.append(x[0])
             for block in self.codec.blocks:
                 x = block(x)
@@ -165,20 +167,22 @@ def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], wher
 
 
 class PerceptualDistance:
-    """``metrics.perceptual_distance`` of a pair's colours in the features of a network.
+    """``metrics.perceptual_distance`` of a pair's colours in the features of a network. Several threads may ask.
 
-    Truth is compared with one method after another: its features are kept until another truth comes.
+    Truth is compared with one method after another: each thread keeps its features until another truth comes.
     """
 
     def __init__(self, features: nn.Module, weights: list[Tensor] | None = None) -> None:
         self._features, self._weights = features, weights
-        self._known: tuple[Tensor, list[Tensor]] | None = None
+        self._known = threading.local()
 
     def __call__(self, pair: Pair) -> float | None:
         """The distance, or None where colour is missing."""
         if pair.rgb is None or pair.truth_rgb is None:
             return None
         with torch.no_grad():
-            if self._known is None or self._known[0] is not pair.truth_rgb:
-                self._known = (pair.truth_rgb, self._features(pair.truth_rgb))
-            return perceptual_distance(self._features(pair.rgb), self._known[1], pair.mask, self._weights)
+            if getattr(self._known, "picture", None) is not pair.truth_rgb:
+                self._known.features = unit_features(self._features(pair.truth_rgb))
+                self._known.picture = pair.truth_rgb
+            seen = unit_features(self._features(pair.rgb))
+            return distance_of_units(seen, self._known.features, pair.mask, self._weights)

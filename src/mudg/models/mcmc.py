@@ -146,9 +146,10 @@ def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_
     repeated = sources.repeat_interleave(copies[sources])
     columns = {name: value.detach()[repeated] for name, value in table.columns.items()}
     labels = {name: value[repeated] for name, value in table.labels.items()}
+    place_left = torch.cumsum(~dead, 0) - 1
     table.take(~dead)
     if len(repeated):
-        table.append(columns, labels)
+        table.append(columns, labels, like=place_left[repeated])
     model.sort_rows()
     gone, came = int(dead.sum()), len(repeated)
     return {
@@ -192,6 +193,8 @@ def _correct(model: SceneModel, sources: Tensor, members: Tensor, opacity: Tenso
     log_scales[sources] = (log_scales[sources].double() + torch.log(factor)[:, None]).float()
     for name in table.columns:
         table.reset_moments(name, sources)
+    for name in table.partial:
+        table.reset_moments(name, table.partial_index(sources))
 
 
 def drift(model: SceneModel, step: int, rate: float, settings: McmcSettings, run_seed: int) -> None:

@@ -49,7 +49,8 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
         return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
         raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
-    inputs = {"model": mdm.digest(config.model)}
+    read = {"mdm": config.model, "mdm-ablation": "embedded"}.get(name)  # poses reads no diffusion model
+    inputs = {} if read is None else {"model": mdm.digest(read)}
     directory = store.RunDir.open(out, f"bench {name}", to_dict(config), inputs, _VERSION, overwrite)
     if directory.complete:
         return directory.reused()

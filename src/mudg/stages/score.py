@@ -278,10 +278,11 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
 def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[], None]) -> list[dict[str, Any]]:
     """Score all methods on one trajectory; writes its truth, its baseline and its error pictures."""
     names = [*([BASELINE] if by.baseline is not None else []), *course.sets]
-    sums = {name: metrics.build_all(by.distances) for name in names}
+    motion = metrics.StaticMotion()
+    sums = {name: metrics.build_all(by.distances, motion) for name in names}
     # Recorded training frames were seen by the fit and do not count; views off the path never were.
     counted = [n for n, frame in enumerate(course.frames) if frame is None or frame.id in by.held_out]
-    looked_at = set(evenly(counted, by.distance_views or len(counted)))
+    wanted = _wanted(course, by, counted)
     truth_has: set[str] = set()
     scored = 0
     middle = len(course.views) // 2
@@ -292,22 +293,19 @@ def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[]
             truths = stack.enter_context(writer)
         if by.baseline is not None:
             fills = stack.enter_context(ObservationWriter(out / BASELINE / course.name, course.name, BASELINE))
-        for number, (true, found) in enumerate(_ahead(lambda number: _seen(course, by, number), len(course.views))):
+        made = _ahead(lambda number: _measured(course, by, number, wanted[number], sums), len(course.views))
+        for number, (true, found, measured) in enumerate(made):
             if fills is not None:
                 fills.add(found[BASELINE])
             if true is not None:
                 if truths is not None:
                     truths.add(true.seen)
-                pairs = {name: pair_of(seen, true.seen, true.moving) for name, seen in found.items()}
-                wanted = {"flicker"} if by.truth.exact else set()  # wants all frames, in order
                 if number in counted:
                     scored += 1
                     truth_has |= _contents(true, by.truth.exact)
-                    wanted |= (metrics.METRICS.keys() - by.distances.keys()) - {"flicker"}
-                    wanted |= by.distances.keys() if number in looked_at else set()
-                for name, pair in pairs.items():
-                    for metric in wanted & sums[name].keys():
-                        sums[name][metric].update(pair)
+                for name, of in measured.items():
+                    for metric, value in of.items():
+                        sums[name][metric].add(value)
                 if by.error_pictures and number == middle:
                     _write_error_picture(out / "errors" / f"{course.name}.png", found, true.seen)
             advance()
@@ -315,6 +313,31 @@ def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[]
         {"method": name, "trajectory": course.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
         for name, of in sums.items()
     ]
+
+
+def _wanted(course: Course, by: Yardstick, counted: Sequence[int]) -> list[set[str]]:
+    """The metrics that each view of a trajectory enters."""
+    looked_at = set(evenly(counted, by.distance_views or len(counted)))
+    every_frame = {"flicker"} if by.truth.exact else set()  # wants all frames, in order
+    usual = metrics.METRICS.keys() - by.distances.keys() - {"flicker"}
+    return [
+        every_frame | (usual if n in counted else set()) | (by.distances.keys() if n in looked_at else set())
+        for n in range(len(course.views))
+    ]
+
+
+def _measured(
+    course: Course, by: Yardstick, number: int, wanted: set[str], sums: Mapping[str, Mapping[str, metrics.Metric]]
+) -> tuple[TrueView | None, dict[str, Observation], dict[str, dict[str, Any]]]:
+    """Truth and methods' views of one number, and by method what the wanted metrics measure there; adds nothing to the sums."""
+    true, found = _seen(course, by, number)
+    if true is None:
+        return true, found, {}
+    measured = {}
+    for name, seen in found.items():
+        pair = pair_of(seen, true.seen, true.moving)
+        measured[name] = metrics.measure(pair, {m: of for m, of in sums[name].items() if m in wanted})
+    return true, found, measured
 
 
 def evenly(items: Sequence[int], count: int) -> list[int]:
@@ -342,14 +365,30 @@ def _seen(course: Course, by: Yardstick, number: int) -> tuple[TrueView | None, 
 
 def _ahead(make: Callable[[int], Made], count: int) -> Iterator[Made]:
     """``make(0)``, ``make(1)``, ... in order, a few of them made beforehand by other threads."""
-    with ThreadPoolExecutor(native.default_threads()) as pool:
+    threads = native.threads()
+    with _one_thread_each(), ThreadPoolExecutor(threads) as pool:
         waiting: deque[Future[Made]] = deque()
         for number in range(count):
             waiting.append(pool.submit(make, number))
-            if len(waiting) > 2 * native.default_threads():
+            if len(waiting) > 2 * threads:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+
+
+@contextlib.contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """While several threads work on a view each, each of them counts as one: threads inside threads only wait for each other."""
+    before = torch.get_num_threads(), native.threads()
+    torch.set_num_threads(1)
+    if native.library() is not None:
+        native.set_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        if native.library() is not None:
+            native.set_threads(before[1])
 
 
 def _values(of: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str, float | str]:
