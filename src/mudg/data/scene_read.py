@@ -185,7 +185,8 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
     ==================== ============ ==================================================================
     name                 array        meaning
     ==================== ============ ==================================================================
-    depth                f32[H, W]    camera z in metres; NaN = no depth there (missing, or sky)
+    depth                f32[H, W]    camera z in metres; NaN = no depth there (not measured, or sky). ``mudg annotate``
+                                      writes it dense: a value everywhere, the sky at 100 m
     semantics            u8[H, W]     Cityscapes train id 0..18, 255 = unlabelled
     sky, ego, dynamic    bool[H, W]   sky; own vehicle; object that moves
     instance             i32[H, W]    id of an object, 0 = none

@@ -20,6 +20,7 @@ from mudg.data.importers.clouds import Cloud, read_cloud
 from mudg.data.importers.common import deskew, for_each, moments, pose_near
 from mudg.data.importers.custom_schema import INDEX, CustomLog, LogImage, LogLidar, LogSweep, read_log
 from mudg.data.importers.images import fit_images
+from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import Finding, SceneWriter, decode_image
 
@@ -45,7 +46,7 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
         UsageError: an option that this format does not have, or a camera that the log does not have.
         InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
-    _refuse_options(options)
+    refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     content = _chosen(read_log(source), options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
     images, sweeps = _numbered(content.images), _numbered(content.sweeps)
@@ -88,20 +89,10 @@ def _raise(problem: MudgError) -> None:
     raise problem
 
 
-def _refuse_options(options: ImportOptions) -> None:
-    for name, value in (("--sequence", options.sequence), ("--poses", options.poses), ("--boxes", options.boxes)):
-        if value:
-            raise UsageError("a log in the neutral layout has no such choice", where=name, remedy="leave it out")
-
-
 def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
-    """The cameras, frames and files asked for. ``frames`` counts images of the first camera; the rest goes by time."""
-    unknown = [name for name in options.cameras if name not in content.cameras]
-    if unknown:
-        raise UsageError(
-            "the log has no such camera", where="--cameras", expected=", ".join(content.cameras), got=", ".join(unknown)
-        )
-    names = options.cameras or tuple(content.cameras)
+    """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the rest goes by time."""
+    there = {name: name for name in content.cameras}
+    names = chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
     images = [image for image in content.images if image.camera in names]
     sweeps = list(content.sweeps)
     if options.frames is not None:

@@ -25,6 +25,7 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, 
 from mudg.data.importers.box_times import REACH_S, BoxTimes, clip_track, reach_images
 from mudg.data.importers.common import for_each
 from mudg.data.importers.images import fit_images
+from mudg.data.importers.layout import refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scene_schema import ref_problem
 from mudg.data.scenefile import SceneWriter
@@ -251,10 +252,7 @@ def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
             got="--untwist yes",
             remedy="leave --untwist out",
         )
-    if options.poses is not None or options.boxes is not None:
-        raise UsageError(
-            f"poses and boxes of {dataset} come with the log", where=where, remedy="leave --poses and --boxes out"
-        )
+    refuse_options(options, dataset, "poses", "boxes")
 
 
 def path_inside(root: Path, name: Any, where: str) -> Path:

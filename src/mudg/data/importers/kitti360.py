@@ -41,6 +41,7 @@ from mudg.base.palette import UNLABELLED
 from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers import kitti_poses
 from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.common import deskew, for_each, pose_near, rigid_pose, seconds
 from mudg.data.importers.images import ImageFit
 from mudg.data.importers.kitti import read_scan
@@ -378,14 +379,7 @@ class _Sick:
 
 def _read_line(path: Path) -> NDArray[np.float32]:
     """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane; source: the data set's reader."""
-    content = store.read_bytes(path)
-    if len(content) % 8:
-        raise InputError(
-            "SICK line is cut off", where=str(path), expected="a multiple of 8 bytes", got=f"{len(content)} bytes"
-        )
-    pairs = np.frombuffer(content, "<f4").reshape(-1, 2)
-    if not np.isfinite(pairs).all():
-        raise InputError("SICK line holds values that are not finite", where=str(path))
+    pairs = read_float_rows(path, 2, "SICK line")
     pairs = pairs[np.any(pairs != 0, axis=1)]
     return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1)
 

@@ -91,7 +91,13 @@ def _boxes(instances: list[dict[str, Any]], rect0_from_velo: np.ndarray, where: 
         x, y, z, length, height, width, turn = (float(value) for value in item["bbox_3d"])
         if min(length, height, width) <= 0 or not np.isfinite([x, y, z, turn]).all():
             raise InputError("box makes no sense", where=f"{where}: instances[{index}]", got=str(item["bbox_3d"]))
-        label = LABELS[int(item["bbox_label_3d"])]
+        number = int(item["bbox_label_3d"])
+        if number >= len(LABELS):
+            raise InputError(
+                "box has a class that does not exist", where=f"{where}: instances[{index}]", got=str(number),
+                expected=f"0 to {len(LABELS) - 1}, or -1 for none",
+            )  # fmt: skip
+        label = LABELS[number]
         pose = velo_from_rect0 @ kitti_boxes.rect0_from_box((x, y, z), height, turn)
         left, top, right, bottom = (float(value) for value in item["bbox"])
         boxes.append(kitti_boxes.KittiBox(0, index, label, (length, width, height), pose, (left, top, right, bottom)))

@@ -88,7 +88,7 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
         UsageError: no such camera. InputError: none of the usual ones is there.
     """
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
-    words = ", ".join(f"{ours} ({theirs})" for theirs, ours in available.items()) or "no cameras"
+    words = ", ".join(o if o == t else f"{o} ({t})" for t, o in available.items()) or "no cameras"
     if not options.cameras:
         chosen = [name for name in available if name in usual]
         if not chosen:

@@ -109,6 +109,11 @@ def _tracks(meta: dict[str, Any], instances: list[dict[str, Any]], map_from_lida
         if int(item["bbox_label_3d"]) < 0:
             continue
         here = f"{where}: instances[{index}]"
+        if int(item["bbox_label_3d"]) not in names:
+            raise InputError(
+                "box has a class that metainfo.categories lacks", where=here, got=str(item["bbox_label_3d"]),
+                expected=", ".join(f"{number} ({name})" for number, name in names.items())[:200],
+            )  # fmt: skip
         x, y, z, length, width, height, yaw = (float(value) for value in item["bbox_3d"])
         size = box_size(length, width, height, here)
         if not np.isfinite([x, y, z, yaw]).all():

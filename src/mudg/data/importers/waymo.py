@@ -33,8 +33,9 @@ from mudg.base.types import EgoPath, Scene, Source, View
 from mudg.data.importers import waymo_camera, waymo_lidar
 from mudg.data.importers.common import for_each, seconds
 from mudg.data.importers.images import ImageFit, fit_images
+from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.importers.waymo_log import TOP, FrameContent, FrameRecord, LaserScan, Matrix, WaymoLog
+from mudg.data.importers.waymo_log import CAMERAS, TOP, FrameContent, FrameRecord, LaserScan, Matrix, WaymoLog
 from mudg.data.importers.waymo_tracks import (
     FAST_M_S,
     MOMENTS,
@@ -121,11 +122,7 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
 
 
 def _refuse_options(options: ImportOptions) -> None:
-    for name, given in (("--poses", options.poses), ("--boxes", options.boxes)):
-        if given is not None:
-            raise UsageError(
-                "Waymo logs hold their own poses and boxes", where=name, got=str(given), remedy="leave it out"
-            )
+    refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
         raise UsageError(
             "Waymo scans cannot be left twisted", where="--untwist", got="no", remedy="leave it out",
@@ -174,18 +171,13 @@ def _choose(names: Sequence[str], wanted: str, source: Path) -> str:
 
 def _chosen_cameras(waymo: WaymoLog, options: ImportOptions, source: Path) -> list[str]:
     recorded = {name for frame in waymo.frames for name in frame.shots}
-    there = [name for name in ("front", "front_left", "front_right", "side_left", "side_right") if name in recorded]
+    there = {name: name for name in CAMERAS.values() if name in recorded}
     if not there:
         raise InputError(
             "the log has no images", where=str(source), expected="images of the cameras",
             got=f"{len(waymo.frames)} frames with poses and boxes only", remedy="take the files with camera and LiDAR data",
         )  # fmt: skip
-    unknown = [name for name in options.cameras if name not in there]
-    if unknown:
-        raise UsageError(
-            "the log has no such camera", where=str(source), expected=", ".join(there), got=", ".join(unknown)
-        )
-    chosen = [name for name in there if name in options.cameras] or there
+    chosen = chosen_cameras(there, options, str(source), tuple(there))
     lacking = [name for name in chosen if name not in waymo.cameras]
     if lacking:
         raise InputError(
