@@ -30,7 +30,7 @@ MIN_CONTRAST: Final = 0.06
 """The peak must stand out from the median by this share of it, else the images have too few edges, or too many."""
 RIGHT_FROM: Final = 0.7
 LARGEST_RIGHT_TURN_DEG: Final = 0.75
-MIN_SIGMAS: Final = 2.0
+MIN_SIGMAS: Final = 1.5
 """A turn fits better than the given pose if the gain is this many of its standard errors: with few edges some turn always leads."""
 _CLUSTER_DEG: Final = 2.0
 """Jumps of one image within this much of azimuth are of one contour, mostly; they count as one observation."""

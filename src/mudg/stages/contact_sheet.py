@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw
 
 from mudg.base import geometry, store
 from mudg.base.types import Frame, Scene, Sweep, Track, View
+from mudg.data.scene_check import VEHICLES
 from mudg.data.scenefile import read_image, read_points
 
 NAME: Final = "contact_sheet.jpg"
@@ -47,10 +48,6 @@ _COLD_TO_WARM: Final = np.array(
 _EDGES: Final = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """Pairs of corners; corner bits: 4 = front, 2 = left, 1 = top."""
 
-VEHICLES: Final = frozenset(
-    ("car", "van", "truck", "bus", "vehicle", "trailer", "towed_object", "construction_vehicle", "tram", "train", "motorcycle",
-     "bicycle")
-)  # fmt: skip
 PEOPLE: Final = frozenset(
     ("pedestrian", "person", "person_sitting", "person (sitting)", "cyclist", "rider", "motorcyclist", "bicyclist", "stroller",
      "wheelchair")

@@ -54,11 +54,7 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     for note in notes:
         log.info(f"custom: {note}")
 
-    def warn(level: scene_check.Level, where: str, words: str) -> None:
-        if level == "warning":
-            log.warn(f"custom: {where}: {words}")
-
-    scene_check.check_records(as_scene(content, _raise)[0], warn)
+    as_scene(content, _raise)  # records without a pose are refused before anything is read
 
     def add_image(item: tuple[str, LogImage]) -> None:
         frame_id, image = item
@@ -168,7 +164,7 @@ def refuse_grey(path: Path) -> None:
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as image:
             mode = image.mode
-    except (OSError, SyntaxError, ValueError):
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return  # decode_image says better what is wrong
     if mode in ("1", "L", "LA"):
         raise InputError(

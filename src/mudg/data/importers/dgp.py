@@ -38,7 +38,7 @@ from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_npy
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -122,6 +122,11 @@ def _choose_scene(source: Path, options: ImportOptions) -> Path:
             got=options.sequence or "none chosen",
         )
     return matching[0]
+
+
+def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen scene's folder."""
+    return LogFiles((_choose_scene(source, options).parent,))
 
 
 # --- one scene ------------------------------------------------------------------------------------------------------

@@ -97,7 +97,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep
     counts as one moment, without point times, and boxes stay as drawn.
 
-    Images whose size is kept are copied byte for byte, after a check that they decode to their camera's size. At most two
+    Images whose size is kept are copied byte for byte, after a check that they are whole and of their camera's size. At most two
     images or sweeps per worker are in memory, beside the few that wait for the disk.
 
     Raises:

@@ -39,7 +39,7 @@ from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.common import for_each, pose_near, seconds
 from mudg.data.importers.images import ImageFit, fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, read_calibration_day, read_calibration_text
-from mudg.data.importers.layout import chosen_cameras, numbered_files, some_numbers, whole_frames
+from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import SceneWriter, decode_image
 
@@ -138,6 +138,23 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
         moments = [[f"{name}/{index:06d}" for name in fits] for index in range(len(frames))]
         writer.set_split(holdout_split(moments, options.test_every))
         return writer.finish()
+
+
+def files_of_kitti(source: Path, options: ImportOptions) -> LogFiles:
+    """The folder, with the calibration and poses beside it; of a folder with many sequences or frames only what is chosen."""
+    beside = [*source.parent.glob("calib_*.txt"), *_odometry_poses(source)]
+    beside = [path for path in beside if path.is_file()]
+    wanted = options.sequence
+    number = int(wanted) if wanted.isdigit() else -1
+    chosen = [
+        path
+        for path in (sorted(source.glob("*/*")) if wanted else ())
+        if path.stem == wanted or (path.stem.isdigit() and int(path.stem) == number)
+    ]
+    if not chosen:
+        return LogFiles((source, *sorted(beside)))
+    here = [path for path in sorted(source.iterdir()) if path.is_file() or path.name == "derived"]
+    return LogFiles((*chosen, *here, *sorted(beside)))
 
 
 # --- finding files --------------------------------------------------------------------------------------------------
@@ -370,7 +387,7 @@ def _poses_from_file(
     """World-from-velodyne f64[n, 4, 4]; the world is the velodyne of the first frame."""
     names = ("poses_velo.txt", "poses.txt", "poses_cam0.txt")
     found = [folder / name for folder in files.folders for name in names]
-    path = options.poses or _first_file(*found, *_odometry_poses(files))
+    path = options.poses or _first_file(*found, *_odometry_poses(files.folders[0]))
     if path is None and len(frames) == 1:
         return np.eye(4)[None]
     if path is None:
@@ -407,9 +424,8 @@ def _find_packets(files: KittiFiles, options: ImportOptions) -> Path | None:
     return _first_file(files.folders[0] / "oxts" / f"{options.sequence}.txt") if options.sequence else None
 
 
-def _odometry_poses(files: KittiFiles) -> tuple[Path, ...]:
+def _odometry_poses(source: Path) -> tuple[Path, ...]:
     """``poses/07.txt`` beside ``sequences/07``."""
-    source = files.folders[0]
     return (source.parent.parent / "poses" / f"{source.name}.txt",) if source.parent.name == "sequences" else ()
 
 

@@ -47,7 +47,7 @@ from mudg.data.importers.images import ImageFit
 from mudg.data.importers.kitti import read_scan
 from mudg.data.importers.kitti360_boxes import WORDS, read_boxes
 from mudg.data.importers.kitti360_calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
-from mudg.data.importers.layout import chosen_cameras, numbered_files, some_numbers, whole_frames
+from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import SceneWriter, decode_image
 
@@ -189,6 +189,16 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
             expected="--sequence with one of " + ", ".join(drives[:12]), got=wanted or "none chosen",
         )  # fmt: skip
     return _Folders(source, matching[0])
+
+
+def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
+    """The calibration and the parts of the chosen drive."""
+    folders = _find(source, options)
+    root, drive = folders.root, folders.drive
+    parts = [root / "calibration", *(root / name / drive for name in ("data_2d_raw", "data_3d_raw", "data_poses"))]
+    parts += [root / "data_2d_semantics" / "train" / drive]
+    parts += [root / "data_3d_bboxes" / part / f"{drive}.xml" for part in ("train_full", "train")]
+    return LogFiles(tuple(part for part in parts if part.exists()))
 
 
 def _fit(calibration: Kitti360Calibration, camera: str, first: Path, options: ImportOptions) -> ImageFit:

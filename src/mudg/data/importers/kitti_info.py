@@ -16,6 +16,7 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import EgoPath, Scene, Source, View
 from mudg.data.importers import kitti_boxes
+from mudg.data.importers.drive_log import path_inside
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, nearest_rotation
 from mudg.data.importers.options import ImportOptions
@@ -39,8 +40,8 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
         sample = record["data_list"][0]
         image_record, lidar = sample["images"][_CAMERA], sample["lidar_points"]
         image_path, scan_path = (
-            _plain(source, image_record["img_path"], where),
-            _plain(source, lidar["lidar_path"], where),
+            path_inside(source, image_record["img_path"], f"{where}: img_path"),
+            path_inside(source, lidar["lidar_path"], f"{where}: lidar_path"),
         )
         projection = np.array(image_record["cam2img"], np.float64)[:3]
         rect0_from_velo = np.array(image_record["lidar2cam"], np.float64)
@@ -71,15 +72,6 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
             writer.add_track(track)
         writer.set_ego(EgoPath(np.zeros(1), world_from_velo[None]))
         return writer.finish()
-
-
-def _plain(source: Path, name: Any, where: str) -> Path:
-    """A file beside the record; names that lead elsewhere are refused."""
-    if not isinstance(name, str) or name != Path(name).name or not name or name in (".", ".."):
-        raise InputError(
-            "record names a file outside its folder", where=where, got=repr(name)[:80], expected="a plain file name"
-        )
-    return source / name
 
 
 def _boxes(instances: list[dict[str, Any]], rect0_from_velo: np.ndarray, where: str) -> list[kitti_boxes.KittiBox]:

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.data.importers.options import ImportOptions
+
+
+@dataclass(frozen=True, slots=True)
+class LogFiles:
+    """What identifies the log that was chosen from a folder of many.
+
+    Args:
+        whole: files, and folders that count with everything in them.
+        entries: folders too large for that, of which only their own times count: these change when a file comes or goes.
+    """
+
+    whole: tuple[Path, ...]
+    entries: tuple[Path, ...] = ()
 
 
 def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:

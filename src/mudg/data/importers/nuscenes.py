@@ -37,7 +37,7 @@ from mudg.data.importers import nuscenes_tables as tables
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -129,6 +129,16 @@ def _releases(source: Path) -> list[Path]:
     folders = [source, *sorted(source.glob("v1.0-*"))] if source.is_dir() else []
     found = [f for f in folders if (f / "scene.json").is_file() and (f / "sample_data.json").is_file()]
     return sorted(found, key=lambda folder: (folder / "scene.json").stat().st_size)
+
+
+def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
+    """The tables, and which files there are beside them: which of those belong to a scene only the large tables know."""
+    tables_of = tuple(table for folder in _releases(source) for table in sorted(folder.glob("*.json")))
+    if not tables_of:
+        return LogFiles((source,))
+    root = tables_of[0].parent.parent
+    sensors = [path for name in ("samples", "sweeps") for path in sorted(root.glob(f"{name}/*")) if path.is_dir()]
+    return LogFiles(tables_of, tuple(sensors))
 
 
 # --- one scene ------------------------------------------------------------------------------------------------------

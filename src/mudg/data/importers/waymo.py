@@ -33,7 +33,7 @@ from mudg.base.types import EgoPath, Scene, Source, View
 from mudg.data.importers import waymo_camera, waymo_lidar
 from mudg.data.importers.common import for_each, seconds
 from mudg.data.importers.images import ImageFit, fit_images
-from mudg.data.importers.layout import chosen_cameras, refuse_options
+from mudg.data.importers.layout import LogFiles, chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.importers.waymo_log import CAMERAS, TOP, FrameContent, FrameRecord, LaserScan, Matrix, WaymoLog
 from mudg.data.importers.waymo_tracks import (
@@ -48,7 +48,7 @@ from mudg.data.importers.waymo_tracks import (
 )
 from mudg.data.importers.waymo_v1 import TfrecordLog
 from mudg.data.importers.waymo_v2 import REQUIRED, ParquetLog
-from mudg.data.scenefile import SceneWriter, decode_image
+from mudg.data.scenefile import SceneWriter
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
@@ -128,6 +128,20 @@ def _refuse_options(options: ImportOptions) -> None:
             "Waymo scans cannot be left twisted", where="--untwist", got="no", remedy="leave it out",
             expected="auto or yes: points carry the pose they were measured at",
         )  # fmt: skip
+
+
+def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen log's record file, or its tables."""
+    if source.is_file() or not source.is_dir():
+        return LogFiles((source,))
+    records = {path.stem: path for path in sorted(source.glob(f"*{_SUFFIX}"))}
+    if records:
+        return LogFiles((records[_choose(list(records), options.sequence, source)],))
+    segments = sorted({path.stem for path in source.glob("*/*.parquet")})
+    if not segments:
+        return LogFiles((source,))
+    segment = _choose(segments, options.sequence, source)
+    return LogFiles(tuple(sorted(source.glob(f"*/{segment}.parquet"))))
 
 
 # --- finding the log ------------------------------------------------------------------------------------------------
@@ -389,10 +403,8 @@ def _write_frame(writer: SceneWriter, plan: _Plan, frame: FrameRecord, content: 
             panoptic = content.panoptic[name]
             ids = waymo_camera.panoptic_ids(panoptic, fit.recorded, f"{where}: panoptic label")
             labels = waymo_camera.panoptic_labels(fit.ids(ids), panoptic.divisor)
-        image = content.images[name]
-        if fit.keeps_bytes:
-            decode_image(image, where, fit.recorded)  # refuses a damaged image with its place in the log
-        writer.add_frame(f"{name}/{index:06d}", plan.view(frame, name), fit.image(image, where), labels)
+        image = fit.image(content.images[name], where)
+        writer.add_frame(f"{name}/{index:06d}", plan.view(frame, name), image, labels)
     for name, scan in content.scans.items():
         points = _points(plan, frame, name, scan)
         sweep = waymo_lidar.sweep_points(
