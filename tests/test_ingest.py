@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import socket
 from pathlib import Path
 
 import kitti_folders as made
@@ -12,7 +14,7 @@ from toy_scene import ToyStreet
 
 from mudg import native
 from mudg.base import store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.data.city import CityConfig
 from mudg.data.importers import IMPORTERS, files_of
 from mudg.data.importers.options import ImportOptions
@@ -92,9 +94,9 @@ def test_words_of_the_command_line(words: list[str], out: str | None, expected: 
         ([], None, "no log"),
         (["log"], None, "no folder"),
         (["kitti", "log"], None, "no folder"),
-        (["waymoo", "log", "o"], None, "too many words"),
-        (["log", "o", "p"], None, "too many words"),
-        (["log", "o"], "p", "too many words"),
+        (["waymoo", "log", "o"], None, "neither such a format"),
+        ([".", "o", "p"], None, "too many words"),
+        ([".", "o"], "p", "too many words"),
     ],
 )
 def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:
@@ -186,18 +188,32 @@ def test_what_is_odd_about_a_scene_is_said_when_it_is_made(tmp_path: Path, capsy
     assert "track 7 (car): it moves sideways" in capsys.readouterr().err
 
 
-def test_a_failed_import_leaves_no_scene_and_a_repeat_finishes(tmp_path: Path) -> None:
+def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     scan = drive / "velodyne_points" / "data" / "0000000004.bin"
     content = scan.read_bytes()
     scan.write_bytes(content[:-5])
-    with pytest.raises(InputError, match="cut off"):
-        ingest.run(IngestConfig(), drive, tmp_path / "out")
-    assert not (tmp_path / "out" / "scene.json").exists()
-    assert not (tmp_path / "out" / "images").exists()
-    assert not list(tmp_path.glob(".out.*"))
+    for config, words in ((IngestConfig(), "cut off"), (IngestConfig(cameras=("frnt",)), "no such camera")):
+        with pytest.raises(MudgError, match=words):
+            ingest.run(config, drive, tmp_path / "out")
+        assert [path.name for path in tmp_path.iterdir()] == ["day"]
     scan.write_bytes(content)
-    assert len(read_scene(ingest.run(IngestConfig(), drive, tmp_path / "out", overwrite=True)).frames) == 6
+    assert len(read_scene(ingest.run(IngestConfig(), drive, tmp_path / "out")).frames) == 6
+
+
+def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    config, out = IngestConfig(contact_sheet=False), tmp_path / "out"
+    store.RunDir.open(out, "ingest", {"frames": "0:2"}, {"source": "another"}, 1)
+    partial = out / ".scene.999999999-1.part"
+    partial.mkdir()
+    store.write_json(out / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
+    with pytest.raises(UsageError, match="another configuration"):
+        ingest.run(config, drive, out)
+    assert partial.is_dir()
+    store.write_json(out / "lock", {"pid": 999_999_999, "host": socket.gethostname()})
+    assert len(read_scene(ingest.run(config, drive, out)).frames) == 6
+    assert not partial.exists()
 
 
 def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_again(tmp_path: Path) -> None:

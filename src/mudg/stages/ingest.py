@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import shutil
+import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +36,8 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
         config: see ``IngestConfig``.
         source: the word ``city``, the folder of a dataset log (its format is recognised), or a scene (directory or
             stored zip), which is checked and copied.
-        out: output folder; a finished result of the same configuration and source is verified and reused.
+        out: output folder; a finished result of the same configuration and source is verified and reused. What an import that
+            failed or was killed left there is replaced; one that fails in a folder it made leaves nothing.
 
     Raises:
         InputError: the log is missing, malformed or contradictory. UsageError: ``out`` holds something else.
@@ -44,13 +47,38 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
     inputs = {} if kind == CITY else {"source": source_digest(Path(source), kind, config)}
     idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
     settings = {name: value for name, value in to_dict(config).items() if name not in idle}
-    folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite)
+    fresh = not out.exists()
+    folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite or _abandoned(out))
     if folder.complete:
         return folder.reused()
+    try:
+        return _fill(folder, kind, config, Path(source))
+    except BaseException:
+        if (
+            fresh and not (folder.path / "scene.json").is_file()
+        ):  # nothing was made: the next try may ask for something else
+            shutil.rmtree(folder.path, ignore_errors=True)
+        raise
+
+
+def _abandoned(out: Path) -> bool:
+    """Whether an import that failed or was killed left nothing at ``out`` but its bookkeeping."""
+    try:
+        state = store.read_json(out / "run.json")
+        owner = store.read_json(out / "lock") if (out / "lock").is_file() else {}
+        made = state["verb"] != "ingest" or state["state"] == "complete" or (out / "scene.json").is_file()
+        here = owner.get("host") == socket.gethostname() and owner.get("pid") != os.getpid()
+        return not made and not (here and store.process_alive(int(owner["pid"])))
+    except (InputError, KeyError, TypeError, ValueError, AttributeError):
+        return False
+
+
+def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -> Path:
+    """Make the scene in its folder, draw its contact sheet and finish the run."""
     if (folder.path / "scene.json").is_file():
         scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
     else:
-        scene = _make(kind, config, Path(source), folder.path)
+        scene = _make(kind, config, source, folder.path)
         if kind not in (CITY, _SCENE):
             scene_check.check_records(scene, _say)
     held_out = sum(split == "test" for split in scene.split.values())
@@ -67,7 +95,7 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
         log.info(f"ingest: look at {sheet}")
-    folder.finish({**summary, **({} if source == CITY else _alignment(scene))})
+    folder.finish({**summary, **({} if kind == CITY else _alignment(scene))})
     return folder.path
 
 
@@ -114,9 +142,9 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
     if left and out is None:
         out = Path(left.pop(0))
     if left:
-        unknown = not many and not Path(source).exists() and source != CITY
-        got = f"{source!r}, which is no format ({', '.join(formats)})" if unknown else " ".join([source, *left])
-        raise UsageError("there are too many words", expected=usage, got=got)
+        if not many and not Path(source).exists() and source != CITY:
+            raise UsageError("there is neither such a format nor such a log", expected=", ".join(formats), got=source)
+        raise UsageError("there are too many words", expected=usage, got=" ".join([source, *left]))
     if out is None:
         raise UsageError("no folder to write was given", expected=usage)
     return Asked(config, source, out)

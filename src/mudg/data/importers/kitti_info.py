@@ -19,6 +19,7 @@ from mudg.data.importers import kitti_boxes
 from mudg.data.importers.drive_log import path_inside
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, nearest_rotation
+from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scenefile import SceneWriter, decode_image
 
@@ -30,11 +31,14 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import the one frame that ``source/info.json`` describes.
 
     Raises:
+        UsageError: an option that a single frame has no use for.
         InputError: the record is incomplete, or image or scan is missing or damaged.
     """
     from mudg.data.importers.kitti import LICENCE, SENSOR, read_scan
 
     where = str(source / "info.json")
+    refuse_options(options, "single-frame KITTI", "frames", "sequence", "poses", "boxes")
+    chosen_cameras({_CAMERA: "front"}, options, where, (_CAMERA,))
     record = store.read_json(source / "info.json")
     try:
         sample = record["data_list"][0]
