@@ -36,6 +36,7 @@ _PEOPLE_COLOUR: Final = (235, 130, 255)
 _OTHER_COLOUR: Final = (150, 205, 255)
 _SHADE: Final = (10, 10, 10)
 _SHADED_FROM_PX: Final = 24.0
+_THICKER_FROM_PX: Final = 700
 _FRONT_COLOUR: Final = (255, 80, 80)
 _PATH_COLOUR: Final = (60, 200, 255)
 _TEXT_COLOUR: Final = (235, 235, 235)
@@ -204,13 +205,14 @@ def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, t
     edges = visible_edges(view, box_corners(track.size_m, world_from_object))
     if not edges:
         return
+    line = 1 + view.camera.width // _THICKER_FROM_PX
     ends = np.concatenate([uv for _, uv in edges])
     if np.ptp(ends, axis=0).max() > _SHADED_FROM_PX:
         for _, uv in edges:
-            draw.line(_pairs(uv), fill=_SHADE, width=3)
+            draw.line(_pairs(uv), fill=_SHADE, width=line + 2)
     for number, uv in edges:
         front = all(corner & 4 for corner in _EDGES[number])
-        draw.line(_pairs(uv), fill=_FRONT_COLOUR if front else box_colour(track.label))
+        draw.line(_pairs(uv), fill=_FRONT_COLOUR if front else box_colour(track.label), width=line)
 
 
 def box_colour(label: str) -> tuple[int, int, int]:
