@@ -197,6 +197,10 @@ def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) ->
         with pytest.raises(MudgError, match=words):
             ingest.run(config, drive, tmp_path / "out")
         assert [path.name for path in tmp_path.iterdir()] == ["day"]
+    (tmp_path / "out").mkdir()
+    with pytest.raises(InputError, match="cut off"):
+        ingest.run(IngestConfig(), drive, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
     scan.write_bytes(content)
     assert len(read_scene(ingest.run(IngestConfig(), drive, tmp_path / "out")).frames) == 6
 

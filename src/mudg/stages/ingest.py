@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -37,7 +38,7 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
         source: the word ``city``, the folder of a dataset log (its format is recognised), or a scene (directory or
             stored zip), which is checked and copied.
         out: output folder; a finished result of the same configuration and source is verified and reused. What an import that
-            failed or was killed left there is replaced; one that fails in a folder it made leaves nothing.
+            failed or was killed left there is replaced; one that fails in a new or empty folder leaves nothing.
 
     Raises:
         InputError: the log is missing, malformed or contradictory. UsageError: ``out`` holds something else.
@@ -47,7 +48,8 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
     inputs = {} if kind == CITY else {"source": source_digest(Path(source), kind, config)}
     idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
     settings = {name: value for name, value in to_dict(config).items() if name not in idle}
-    fresh = not out.exists()
+    existed = out.exists()
+    fresh = not existed or (out.is_dir() and not any(out.iterdir()))
     folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite or _abandoned(out))
     if folder.complete:
         return folder.reused()
@@ -57,8 +59,17 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
         if (
             fresh and not (folder.path / "scene.json").is_file()
         ):  # nothing was made: the next try may ask for something else
-            shutil.rmtree(folder.path, ignore_errors=True)
+            _empty(folder.path, remove=not existed)
         raise
+
+
+def _empty(folder: Path, *, remove: bool) -> None:
+    """Take everything out of a folder, and the folder away."""
+    with contextlib.suppress(OSError):  # the error that brought us here is the one to tell
+        for entry in folder.iterdir():
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        if remove:
+            folder.rmdir()
 
 
 def _abandoned(out: Path) -> bool:

@@ -83,10 +83,17 @@ def whole_frames(
 
 
 def some_numbers(numbers: Sequence[int]) -> str:
-    """Frame numbers in words, a long list cut short."""
+    """Growing frame numbers in words: three or more in a row as first and last, a long list cut short."""
     if not numbers:
         return "none"
-    return ", ".join(str(n) for n in numbers[:8]) + (f", ... ({len(numbers)} in all)" if len(numbers) > 8 else "")
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    words = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
+    return ", ".join(words[:8]) + (f", ... ({len(numbers)} in all)" if len(words) > 8 else "")
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
