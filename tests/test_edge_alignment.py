@@ -91,6 +91,9 @@ def test_a_verdict_needs_a_peak_that_is_no_accident() -> None:
     assert verdict(middle + 2, middle, np.r_[40.0, np.zeros(39)]) == "unknown"  # one contour alone
     assert verdict(side - 1, middle, everywhere) == "unknown"  # at the end of the range: a slope, no peak
     assert verdict(middle + 2, middle, 0.01 * everywhere) == "unknown"
+    slope = edges.EdgeAlignment(0.1, (0.0, 2.0), 0.2, 900, "unknown", 6.0)
+    assert "end of the range" in words("front", slope)
+    assert "about as well" in words("front", replace(slope, best_turn_deg=(0.0, 1.0)))
     told = edges._judge(np.full((side * side, 40), 4.0), 400)
     assert "do not tell" in words("front", told) and "no turn" in words("front", told)
 

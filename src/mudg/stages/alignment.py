@@ -9,7 +9,7 @@ import numpy as np
 
 from mudg.base import log
 from mudg.base.types import Scene, View
-from mudg.core.edge_alignment import MIN_CONTRAST, MIN_JUMPS, EdgeAlignment, edge_alignment
+from mudg.core.edge_alignment import MIN_CONTRAST, MIN_JUMPS, TURNS_DEG, EdgeAlignment, edge_alignment
 from mudg.data.scenefile import read_image, read_points
 from mudg.stages.contact_sheet import sweeps_beside
 
@@ -42,11 +42,11 @@ def words(name: str, found: EdgeAlignment) -> str:
     if found.verdict == "unknown":
         if found.jumps < MIN_JUMPS:
             return f"camera {name}: too few depth edges to compare with its images ({found.jumps})"
-        why = (
-            "no turn of up to 2 degrees stands out"
-            if found.contrast < MIN_CONTRAST
-            else "other turns fit about as well"
-        )
+        why = "other turns fit about as well"
+        if found.contrast < MIN_CONTRAST:
+            why = f"no turn of up to {TURNS_DEG[-1]:g} degrees stands out"
+        elif max(abs(angle) for angle in found.best_turn_deg) == TURNS_DEG[-1]:
+            why = "the best turn is at the end of the range tried"
         return f"camera {name}: {found.jumps} depth edges do not tell whether LiDAR and images agree ({why}); look at the contact sheet"
     score = f"score {found.score:.2f}, {found.jumps} depth edges"
     if found.verdict == "right":
