@@ -20,6 +20,7 @@ from typing import Any
 
 import kitti_folders
 import numpy as np
+import pytest
 import roundtrip
 import write_av2
 import write_custom
@@ -53,6 +54,13 @@ class Files:
     image: Path
     cloud: Path
     options: Mapping[str, Any] = field(default_factory=dict)
+
+
+def shared(factory: pytest.TempPathFactory) -> Path:
+    """The folder of the logs, the same for all test modules."""
+    folder = factory.getbasetemp() / "bad logs"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @functools.cache

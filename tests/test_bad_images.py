@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import bad_logs
+import numpy as np
 import pytest
 from bad_logs import FORMATS, NEEDS_PYARROW, Change
+from PIL import Image
 from roundtrip import needs_native
 
 from mudg.base.errors import InputError
@@ -27,7 +30,7 @@ IMAGES: dict[str, tuple[Change, str]] = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("logs")
+    return bad_logs.shared(tmp_path_factory)
 
 
 def log_of(kind: str, folder: Path) -> bad_logs.Files | bad_logs.write_waymo.Log:
@@ -68,11 +71,6 @@ def test_what_is_checked_is_what_can_be_decoded(kind: str) -> None:
 
     Only a PNG's checksums are known to the check alone.
     """
-    import io
-
-    import numpy as np
-    from PIL import Image
-
     rng = np.random.default_rng(5)
     pixels = rng.integers(0, 255, (21, 34, 3)).astype(np.uint8)
     buffer = io.BytesIO()

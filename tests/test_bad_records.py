@@ -34,7 +34,7 @@ pytestmark = needs_native
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("logs")
+    return bad_logs.shared(tmp_path_factory)
 
 
 def written(kind: str, folder: Path) -> bad_logs.Files | write_waymo.Log:
