@@ -50,9 +50,9 @@ def main() -> None:
             right += [found.verdict for found in camera_alignment(scene).values()]
             for turn in TURNS_DEG:
                 wrong += [found.verdict for found in camera_alignment(turned(scene, *turn)).values()]
-    sys.stdout.write(
-        f"as it is: {right.count('right')} of {len(right)} right; turned by a degree: {wrong.count('doubtful')} of {len(wrong)} doubtful\n"
-    )
+    for title, found in (("as it is", right), ("turned by a degree", wrong)):
+        counts = ", ".join(f"{found.count(word)} {word}" for word in ("right", "doubtful", "unknown"))
+        sys.stdout.write(f"{title}: {counts} of {len(found)}\n")
 
 
 if __name__ == "__main__":

@@ -72,3 +72,27 @@ def test_scenes_that_lack_things_get_a_sheet_too(tmp_path: Path, lacking: str) -
     scene = street.write(tmp_path / "scene", labels=False, width=60, height=30)
     scene = scene if lacking == "one frame" else replace(scene, **{lacking: ()})
     assert sheets.contact_sheet(scene).height > sheets.TOP_HEIGHT_PX
+
+
+def test_single_images_of_several_cameras_share_rows(tmp_path: Path) -> None:
+    scene = ToyStreet(car_start=(12, 0), times=[0.0]).write(tmp_path / "scene", labels=False, width=60, height=30)
+    names = ("a", "b", "c", "d")
+    cameras = {name: replace(scene.cameras["front"], name=name) for name in names}
+    frames = tuple(
+        replace(scene.frames[0], view=View(cameras[name], scene.frames[0].view.world_from_cam, 0.0)) for name in names
+    )
+    many = replace(scene, cameras=cameras, frames=frames, split={})
+    assert sheets.contact_sheet(many).size == (sheets.WIDTH_PX, 2 * sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
+    assert sheets.contact_sheet(scene).size == (sheets.WIDTH_PX, sheets.WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
+
+
+def test_boxes_have_the_colour_of_their_class_also_where_there_are_no_points(tmp_path: Path) -> None:
+    scene = ToyStreet(car_start=(40, 0)).write(tmp_path / "scene", labels=False, width=60, height=30)
+    for label, colour in (
+        ("bus", sheets._BOX_COLOUR),
+        ("cyclist", sheets._PEOPLE_COLOUR),
+        ("barrier", sheets._OTHER_COLOUR),
+    ):
+        tracks = tuple(replace(track, label=label) for track in scene.tracks)
+        top = np.array(sheets.top_view(replace(scene, tracks=tracks, sweeps=()), 400, 300))[20:250]
+        assert (top == colour).all(2).sum() > 20, label

@@ -74,6 +74,30 @@ def test_depth_jumps_are_on_the_near_side() -> None:
     assert len(edges.depth_jumps(np.zeros((50, 3)))) == 0
 
 
+def test_a_verdict_needs_a_peak_that_is_no_accident() -> None:
+    """40 contours of 10 jumps: the sums of one turn are raised, by all contours or by a few."""
+    side = len(edges.TURNS_DEG)
+    flat = np.full((side, side, 40), 4.0)
+
+    def verdict(row: int, column: int, raised: np.ndarray) -> str:
+        sums = flat.copy()
+        sums[row, column] += raised
+        return edges._judge(sums.reshape(side * side, 40), 400).verdict
+
+    middle = side // 2
+    everywhere = np.full(40, 1.0)
+    assert verdict(middle, middle, everywhere) == "right"
+    assert verdict(middle + 2, middle, everywhere) == "doubtful"
+    assert verdict(middle + 2, middle, np.r_[40.0, np.zeros(39)]) == "unknown"  # one contour alone
+    assert verdict(side - 1, middle, everywhere) == "unknown"  # at the end of the range: a slope, no peak
+    assert verdict(middle + 2, middle, 0.01 * everywhere) == "unknown"
+    slope = edges.EdgeAlignment(0.1, (0.0, 2.0), 0.2, 900, "unknown", 6.0)
+    assert "end of the range" in words("front", slope)
+    assert "about as well" in words("front", replace(slope, best_turn_deg=(0.0, 1.0)))
+    told = edges._judge(np.full((side * side, 40), 4.0), 400)
+    assert "do not tell" in words("front", told) and "no turn" in words("front", told)
+
+
 def test_too_little_to_tell_is_said(tmp_path: Path) -> None:
     scene = ToyStreet().write(tmp_path / "scene", labels=False, width=60, height=30)
     found = camera_alignment(scene)["front"]

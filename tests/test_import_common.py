@@ -13,6 +13,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, yaw_matrix
 from mudg.base.types import Camera
 from mudg.data.importers import common, images
+from mudg.data.importers.layout import some_numbers
 from mudg.data.importers.options import ImportOptions, parse_resolution
 
 CAMERA = Camera("front", 96, 64, 70.0, 72.0, 47.0, 33.0)
@@ -203,3 +204,15 @@ def test_sizes_asked_for() -> None:
     for text in ("8", "x640", "960x", "-5", "wide"):
         with pytest.raises(UsageError, match="image size"):
             parse_resolution(text)
+
+
+def test_frame_numbers_in_words() -> None:
+    for numbers, words in (
+        ([], "none"),
+        ([3], "3"),
+        ([1, 5], "1, 5"),
+        (range(16), "0 to 15"),
+        ([1, 2, 4, 5, 6], "1, 2, 4 to 6"),
+    ):
+        assert some_numbers(list(numbers)) == words
+    assert some_numbers(list(range(0, 40, 2))) == "0, 2, 4, 6, 8, 10, 12, 14, ... (20 in all)"

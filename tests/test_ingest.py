@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import socket
 from pathlib import Path
 
 import kitti_folders as made
@@ -11,9 +14,9 @@ from toy_scene import ToyStreet
 
 from mudg import native
 from mudg.base import store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.data.city import CityConfig
-from mudg.data.importers import IMPORTERS
+from mudg.data.importers import IMPORTERS, files_of
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene_schema import scene_to_json_text
 from mudg.data.scenefile import read_image, read_label, read_points, read_scene, write_zip
@@ -91,9 +94,9 @@ def test_words_of_the_command_line(words: list[str], out: str | None, expected: 
         ([], None, "no log"),
         (["log"], None, "no folder"),
         (["kitti", "log"], None, "no folder"),
-        (["waymoo", "log", "o"], None, "too many words"),
-        (["log", "o", "p"], None, "too many words"),
-        (["log", "o"], "p", "too many words"),
+        (["waymoo", "log", "o"], None, "neither such a format"),
+        ([".", "o", "p"], None, "too many words"),
+        ([".", "o"], "p", "too many words"),
     ],
 )
 def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:
@@ -136,18 +139,85 @@ def test_finished_work_is_reused_and_other_settings_are_refused(tmp_path: Path) 
     assert len(read_scene(ingest.run(IngestConfig(), drive, out, overwrite=True)).tracks) == 0
 
 
-def test_a_failed_import_leaves_no_scene_and_a_repeat_finishes(tmp_path: Path) -> None:
+def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -> None:
+    root = made.write_tracking(tmp_path / "training")
+    for part in ("image_02", "velodyne"):
+        shutil.copytree(root / part / "0003", root / part / "0004")
+    config = IngestConfig(sequence="0003", contact_sheet=False)
+    out = ingest.run(config, root, tmp_path / "out")
+    (root / "image_02" / "0004" / "000001.png").write_bytes(b"another log")
+    assert ingest.run(config, root, out) == out
+    labels = root / "label_02" / "0003.txt"
+    labels.write_text(labels.read_text() + "\n")
+    with pytest.raises(UsageError, match="another configuration") as caught:
+        ingest.run(config, root, out)
+    assert "input 'source' changed" in caught.value.got
+    listed = files_of("kitti", root, ImportOptions(sequence="0003")).whole
+    assert {path.relative_to(root).as_posix() for path in listed} == {
+        "image_02/0003", "velodyne/0003", "label_02/0003.txt", "calib/0003.txt", "oxts/0003.txt",
+    }  # fmt: skip
+
+
+def test_of_large_releases_the_tables_and_the_names_of_files_count(tmp_path: Path) -> None:
+    for name in (
+        "v1.0-mini/scene.json",
+        "v1.0-mini/sample_data.json",
+        "samples/CAM_FRONT/a.jpg",
+        "sweeps/LIDAR_TOP/b.bin",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("[]")
+    found = files_of("nuscenes", tmp_path, ImportOptions())
+    assert [path.name for path in found.whole] == ["sample_data.json", "scene.json"]
+    assert [path.name for path in found.entries] == ["CAM_FRONT", "LIDAR_TOP"]
+    before = ingest.source_digest(tmp_path, "nuscenes", IngestConfig())
+    assert ingest.source_digest(tmp_path, "nuscenes", IngestConfig()) == before
+    (tmp_path / "samples/CAM_FRONT/c.jpg").write_text("one more")
+    assert ingest.source_digest(tmp_path, "nuscenes", IngestConfig()) != before
+
+
+def test_what_is_odd_about_a_scene_is_said_when_it_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "drive").mkdir()
+    drive = made.write_derived(tmp_path / "drive")
+    labels = drive / "derived" / "label_02.txt"
+    rows = [line.split() for line in labels.read_text().splitlines()]
+    for row in rows:
+        row[-1] = str(float(row[-1]) + np.pi / 2)
+    labels.write_text("\n".join(" ".join(row) for row in rows) + "\n")
+    ingest.run(IngestConfig(contact_sheet=False), drive, tmp_path / "out")
+    assert "track 7 (car): it moves sideways" in capsys.readouterr().err
+
+
+def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     scan = drive / "velodyne_points" / "data" / "0000000004.bin"
     content = scan.read_bytes()
     scan.write_bytes(content[:-5])
+    for config, words in ((IngestConfig(), "cut off"), (IngestConfig(cameras=("frnt",)), "no such camera")):
+        with pytest.raises(MudgError, match=words):
+            ingest.run(config, drive, tmp_path / "out")
+        assert [path.name for path in tmp_path.iterdir()] == ["day"]
+    (tmp_path / "out").mkdir()
     with pytest.raises(InputError, match="cut off"):
         ingest.run(IngestConfig(), drive, tmp_path / "out")
-    assert not (tmp_path / "out" / "scene.json").exists()
-    assert not (tmp_path / "out" / "images").exists()
-    assert not list(tmp_path.glob(".out.*"))
+    assert list((tmp_path / "out").iterdir()) == []
     scan.write_bytes(content)
-    assert len(read_scene(ingest.run(IngestConfig(), drive, tmp_path / "out", overwrite=True)).frames) == 6
+    assert len(read_scene(ingest.run(IngestConfig(), drive, tmp_path / "out")).frames) == 6
+
+
+def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: Path) -> None:
+    drive = made.write_raw_drive(tmp_path / "day")
+    config, out = IngestConfig(contact_sheet=False), tmp_path / "out"
+    store.RunDir.open(out, "ingest", {"frames": "0:2"}, {"source": "another"}, 1)
+    partial = out / ".scene.999999999-1.part"
+    partial.mkdir()
+    store.write_json(out / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
+    with pytest.raises(UsageError, match="another configuration"):
+        ingest.run(config, drive, out)
+    assert partial.is_dir()
+    store.write_json(out / "lock", {"pid": 999_999_999, "host": socket.gethostname()})
+    assert len(read_scene(ingest.run(config, drive, out)).frames) == 6
+    assert not partial.exists()
 
 
 def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_again(tmp_path: Path) -> None:

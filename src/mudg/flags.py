@@ -53,7 +53,8 @@ class Many(Common):
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace the result of other settings or inputs in the output folder instead of refusing."""
     list: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Many at once: a file with one source a line (SOURCE [name=NAME] ...), or a folder of them. Each goes to OUT/NAME."""
+    """Many at once: a file with one source a line (SOURCE [name=NAME] ...), or a folder of them. Each goes to OUT/NAME; the exit
+    code is 0, or 10 + the number that failed."""
     shard: Annotated[str, arg(metavar="i/n")] = ""
     """With --list: take every n-th entry from the i-th on, i from 0 to n-1."""
     jobs: Annotated[int, arg(metavar="INT")] = 0

@@ -30,6 +30,10 @@ MIN_CONTRAST: Final = 0.06
 """The peak must stand out from the median by this share of it, else the images have too few edges, or too many."""
 RIGHT_FROM: Final = 0.7
 LARGEST_RIGHT_TURN_DEG: Final = 0.75
+MIN_SIGMAS: Final = 1.5
+"""A turn fits better than the given pose if the gain is this many of its standard errors: with few edges some turn always leads."""
+_CLUSTER_DEG: Final = 2.0
+"""Jumps of one image within this much of azimuth are of one contour, mostly; they count as one observation."""
 _JUMP_RATIO: Final = 0.12
 _JUMP_M: Final = 0.6
 _MAX_RANGE_M: Final = 60.0
@@ -48,7 +52,8 @@ class EdgeAlignment:
         best_turn_deg: the turn that fits best, about the camera's y axis (right +) and its x axis (up +), degrees.
         contrast: how far the peak stands out, as a share of the median.
         jumps: depth jumps seen.
-        verdict: ``right``, ``doubtful``, or ``unknown`` if there is too little to tell.
+        verdict: ``right``; ``doubtful`` if a turn inside the range tried fits clearly better; ``unknown`` if edges do not tell.
+        sigmas: by how many of its standard errors ``best_turn_deg`` fits better than the given pose.
     """
 
     score: float
@@ -56,6 +61,7 @@ class EdgeAlignment:
     contrast: float
     jumps: int
     verdict: str
+    sigmas: float = 0.0
 
 
 def depth_jumps(xyz_lidar: NDArray[np.floating]) -> NDArray[np.intp]:
@@ -97,7 +103,7 @@ def edge_alignment(shots: Iterable[tuple[View, NDArray[np.uint8], Floats, NDArra
         shots: for some images of one camera: view, image u8[H, W, 3], world_from_lidar f64[4, 4] of the sweep of that moment, and
             its points [N, 3] in the LiDAR frame.
     """
-    totals = np.zeros((len(TURNS_DEG), len(TURNS_DEG)))
+    parts: list[Floats] = []
     jumps = 0
     for view, rgb, world_from_lidar, xyz_lidar in shots:
         camera = view.camera
@@ -106,9 +112,9 @@ def edge_alignment(shots: Iterable[tuple[View, NDArray[np.uint8], Floats, NDArra
         around = np.asarray(xyz_lidar, np.float64)[_in_sight(transform_points(cam_from_lidar, xyz_lidar), view)]
         xyz = transform_points(cam_from_lidar, around[depth_jumps(around)])
         sums, count = _turned_sums(edges, xyz, view)
-        totals += sums
+        parts.append(sums)
         jumps += count
-    return _judge(totals / max(jumps, 1), jumps)
+    return _judge(np.concatenate(parts, 1) if jumps else np.zeros((len(TURNS_DEG) ** 2, 0)), jumps)
 
 
 def _in_sight(xyz_cam: NDArray[np.floating], view: View) -> NDArray[np.bool_]:
@@ -122,7 +128,8 @@ def _in_sight(xyz_cam: NDArray[np.floating], view: View) -> NDArray[np.bool_]:
 
 
 def _turned_sums(edges: Floats, xyz_cam: Floats, view: View) -> tuple[Floats, int]:
-    """Sum of edge strength under the points for every turn; only points that stay in the image at all of them count."""
+    """Sums of edge strength under the points f64[turns, clusters] and the number of points; only those that stay in the image
+    at all turns count."""
     camera = view.camera
     places = []
     for about_y in TURNS_DEG:
@@ -134,8 +141,10 @@ def _turned_sums(edges: Floats, xyz_cam: Floats, view: View) -> tuple[Floats, in
     u, v = np.array([p[0] for p in places]), np.array([p[1] for p in places])
     inside = ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).all(0)
     u, v = u[:, inside].astype(int), v[:, inside].astype(int)
-    sums = edges[v, u].sum(1).reshape(len(TURNS_DEG), len(TURNS_DEG))
-    return sums, int(inside.sum())
+    azimuth = np.rad2deg(np.arctan2(xyz_cam[inside, 0], xyz_cam[inside, 2]))
+    first, cluster = np.unique(np.floor(azimuth / _CLUSTER_DEG), return_inverse=True)
+    sums = [np.bincount(cluster, strength, len(first)) for strength in edges[v, u]]
+    return np.array(sums).reshape(len(places), len(first)), int(inside.sum())
 
 
 def _turn(about_y_deg: float, about_x_deg: float) -> Floats:
@@ -145,16 +154,25 @@ def _turn(about_y_deg: float, about_x_deg: float) -> Floats:
     return about_y @ about_x
 
 
-def _judge(mean: Floats, jumps: int) -> EdgeAlignment:
+def _judge(sums: Floats, jumps: int) -> EdgeAlignment:
+    """Verdict from the sums f64[turns, clusters] of all images."""
     if jumps == 0:
         return EdgeAlignment(0.0, (0.0, 0.0), 0.0, 0, "unknown")
-    middle = len(TURNS_DEG) // 2
-    median, peak = float(np.median(mean)), float(mean.max())
-    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
+    side = len(TURNS_DEG)
+    mean = sums.sum(1) / jumps
+    given, best = side * side // 2, int(mean.argmax())
+    median, peak = float(np.median(mean)), float(mean[best])
     contrast = (peak - median) / max(median, 1e-9)
-    score = (float(mean[middle, middle]) - median) / max(peak - median, 1e-12)
-    best = (TURNS_DEG[row], TURNS_DEG[column])
-    verdict = "right" if score >= RIGHT_FROM and np.hypot(*best) <= LARGEST_RIGHT_TURN_DEG else "doubtful"
-    if jumps < MIN_JUMPS or contrast < MIN_CONTRAST:
-        verdict = "unknown"
-    return EdgeAlignment(score, best, contrast, jumps, verdict)
+    score = (float(mean[given]) - median) / max(peak - median, 1e-12)
+    turn = (TURNS_DEG[best // side], TURNS_DEG[best % side])
+    gains = sums[best] - sums[given]
+    sigmas = float(gains.sum() / max(np.sqrt((gains**2).sum()), 1e-12))
+    # a maximum at the end of the range is a slope: edges get more towards there, whatever the pose
+    inside = max(abs(angle) for angle in turn) < TURNS_DEG[-1]
+    verdict = "unknown"
+    if jumps >= MIN_JUMPS and contrast >= MIN_CONTRAST:
+        if score >= RIGHT_FROM and np.hypot(*turn) <= LARGEST_RIGHT_TURN_DEG:
+            verdict = "right"
+        elif inside and sigmas >= MIN_SIGMAS:
+            verdict = "doubtful"
+    return EdgeAlignment(score, turn, contrast, jumps, verdict, sigmas)

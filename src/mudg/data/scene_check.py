@@ -23,6 +23,11 @@ SAME_MOMENT_S = 0.06
 MAX_GAP_STEPS = 1.8
 MIN_STEP_M = 0.05
 MIN_COURSE_M = 3.0
+VEHICLES = frozenset(
+    ("car", "van", "truck", "bus", "vehicle", "trailer", "towed_object", "construction_vehicle", "tram", "train", "motorcycle",
+     "bicycle")
+)  # fmt: skip
+"""Labels of what drives. These are longer than wide; barriers, signs and people need not be."""
 
 
 Say = Callable[[Level, str, str], None]
@@ -197,7 +202,7 @@ def _check_tracks(scene: Scene, say: Say) -> None:
     for track in scene.tracks:
         where = f"track {track.id} ({track.label})"
         length, width, _ = track.size_m
-        if width > 1.5 * length and length > 0.5:
+        if track.label in VEHICLES and width > 1.5 * length and length > 0.5:
             say("warning", where, f"it is {width:.1f} m wide and {length:.1f} m long; are width and length swapped?")
         if max(track.size_m) > 60:
             say("warning", where, f"its box measures {max(track.size_m):.0f} m")

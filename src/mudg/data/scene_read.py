@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +20,7 @@ from mudg.data.scene_files import open_files
 
 MASK_LABELS: Final = ("sky", "ego", "dynamic")
 _EXIF_ORIENTATION: Final = 0x0112
+_PNG: Final = b"\x89PNG"
 
 
 def read_scene(path: Path | str) -> Scene:
@@ -85,37 +88,67 @@ def read_image(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
 
 def decode_image(content: bytes, where: str, camera: Camera | None = None) -> NDArray[np.uint8]:
     """Decode PNG or JPEG bytes to u8[H, W, 3]; the size is compared with ``camera`` before anything is unpacked."""
+    with _opened(content, where, camera) as image:
+        return np.array(image.convert("RGB"))
+
+
+def check_image(content: bytes, where: str, camera: Camera | None = None) -> bool:
+    """Refuse PNG or JPEG bytes that ``decode_image`` would refuse, at less cost; returns whether the image is grey.
+
+    All data are read. Of a JPEG they are turned into a picture of an eighth of the size, a tenth of the work; a PNG's
+    checksums are compared, too, which decoding leaves out.
+    """
+    if content[:4] == _PNG:
+        with _refusals(content, where), Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+            image.verify()
+    with _opened(content, where, camera) as image:
+        grey = image.mode == "L"
+        if image.format == "JPEG":
+            image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
+        image.load()
+        return grey
+
+
+@contextlib.contextmanager
+def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image.Image]:
+    """An opened image of a kind that scenes hold; what goes wrong with it in the block becomes an InputError."""
+    with _refusals(content, where), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+        if camera is not None and image.size != (camera.width, camera.height):
+            raise InputError(
+                "image does not have its camera's size",
+                where=where,
+                got=f"{image.width}x{image.height}",
+                expected=f"{camera.width}x{camera.height}",
+                remedy="correct the camera's size and intrinsics, or the image",
+            )
+        if max(image.size) > schema.MAX_IMAGE_SIDE_PX:
+            raise InputError("image is too large", where=where, got=f"{image.width}x{image.height}")
+        if image.getexif().get(_EXIF_ORIENTATION, 1) != 1:
+            raise InputError(
+                "image is stored rotated (EXIF orientation)",
+                where=where,
+                expected="upright pixels",
+                remedy="apply the rotation and write the image again",
+            )
+        sixteen_bits = content[:4] == _PNG and content[24:25] == b"\x10"  # Pillow would drop the lower half
+        if image.mode not in ("RGB", "L", "P", "RGBA") or sixteen_bits:
+            raise InputError(
+                "image is not 8-bit RGB or grey",
+                where=where,
+                expected="8 bits a channel",
+                got="16 bits a channel" if sixteen_bits else f"mode {image.mode}",
+                remedy="convert it to 8-bit RGB",
+            )
+        if image.mode == "RGBA" and image.getextrema()[3] != (255, 255):
+            raise InputError("image has transparent pixels", where=where, expected="an opaque image")
+        yield image
+
+
+@contextlib.contextmanager
+def _refusals(content: bytes, where: str) -> Iterator[None]:
+    """What Pillow raises, in words."""
     try:
-        with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
-            if camera is not None and image.size != (camera.width, camera.height):
-                raise InputError(
-                    "image does not have its camera's size",
-                    where=where,
-                    got=f"{image.width}x{image.height}",
-                    expected=f"{camera.width}x{camera.height}",
-                    remedy="correct the camera's size and intrinsics, or the image",
-                )
-            if max(image.size) > schema.MAX_IMAGE_SIDE_PX:
-                raise InputError("image is too large", where=where, got=f"{image.width}x{image.height}")
-            if image.getexif().get(_EXIF_ORIENTATION, 1) != 1:
-                raise InputError(
-                    "image is stored rotated (EXIF orientation)",
-                    where=where,
-                    expected="upright pixels",
-                    remedy="apply the rotation and write the image again",
-                )
-            sixteen_bits = content[:4] == b"\x89PNG" and content[24:25] == b"\x10"  # Pillow would drop the lower half
-            if image.mode not in ("RGB", "L", "P", "RGBA") or sixteen_bits:
-                raise InputError(
-                    "image is not 8-bit RGB or grey",
-                    where=where,
-                    expected="8 bits a channel",
-                    got="16 bits a channel" if sixteen_bits else f"mode {image.mode}",
-                    remedy="convert it to 8-bit RGB",
-                )
-            if image.mode == "RGBA" and image.getextrema()[3] != (255, 255):
-                raise InputError("image has transparent pixels", where=where, expected="an opaque image")
-            return np.array(image.convert("RGB"))
+        yield
     except UnidentifiedImageError as error:
         raise InputError(
             "file is not a PNG or JPEG image",
@@ -123,7 +156,11 @@ def decode_image(content: bytes, where: str, camera: Camera | None = None) -> ND
             got=_first_bytes(content),
             remedy="is it an empty or placeholder file? copy it again",
         ) from error
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError as error:
+        raise InputError(
+            "image is too large", where=where, got=str(error)[:120], remedy="is its header damaged? copy the file again"
+        ) from error
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError(
             "image cannot be decoded (is it cut off?)",
             where=where,
@@ -185,7 +222,8 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
     ==================== ============ ==================================================================
     name                 array        meaning
     ==================== ============ ==================================================================
-    depth                f32[H, W]    camera z in metres; NaN = no depth there (missing, or sky)
+    depth                f32[H, W]    camera z in metres; NaN = no depth there (not measured, or sky). ``mudg annotate``
+                                      writes it dense: a value everywhere, the sky at 100 m
     semantics            u8[H, W]     Cityscapes train id 0..18, 255 = unlabelled
     sky, ego, dynamic    bool[H, W]   sky; own vehicle; object that moves
     instance             i32[H, W]    id of an object, 0 = none

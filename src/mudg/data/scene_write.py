@@ -8,6 +8,7 @@ import os
 import shutil
 import threading
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -25,7 +26,7 @@ from mudg.base.geometry import rigid_problem
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
 from mudg.data import scene_schema as schema
 from mudg.data.scene_files import open_files
-from mudg.data.scene_read import MASK_LABELS, all_refs, checked_points, decode_image, label_ref, read_scene
+from mudg.data.scene_read import MASK_LABELS, all_refs, check_image, checked_points, label_ref, read_scene
 
 _MAX_PENDING_WRITES: Final = 8
 
@@ -71,6 +72,7 @@ class SceneWriter:
         self._ego: EgoPath | None = None
         self._split: dict[str, Literal["train", "test"]] = {}
         self._hashes: dict[str, dict[str, Any]] = {}
+        self._grey: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._slots = threading.Semaphore(_MAX_PENDING_WRITES)
         self._pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="scene-writer")
@@ -117,7 +119,8 @@ class SceneWriter:
         Args:
             frame_id: ``<camera>/<digits>``, e.g. ``front/000012``.
             view: its camera (equal to the one added) and pose.
-            image: u8[H, W, 3] RGB; or the path or the bytes of a PNG or JPEG file, kept as they are.
+            image: u8[H, W, 3] RGB; or the path or the bytes of a PNG or JPEG file, kept as they are after a check that
+                they can be decoded. Grey ones are counted in the scene's notes.
             labels: see ``add_label``.
         """
         camera = self._cameras.get(view.camera.name)
@@ -143,15 +146,17 @@ class SceneWriter:
             )
         if content is not None:
             source = str(image) if isinstance(image, Path) else where
-            decode_image(content, source, camera)
+            grey = check_image(content, source, camera)
             suffix = "png" if content[:4] == b"\x89PNG" else "jpg"
         else:
+            grey = False
             suffix = "png" if self._jpeg_quality is None else "jpg"
         ref = f"images/{frame_id}.{suffix}"
         with self._lock:
             if frame_id in self._frames:
                 raise InputError("frame was added twice", where=where)
             self._frames[frame_id] = Frame(frame_id, view, Ref(ref), {})
+            self._grey[camera.name] += grey
         if content is not None:
             self._submit(ref, lambda: content)
         else:
@@ -222,6 +227,8 @@ class SceneWriter:
         where = f"SceneWriter: {self.root}"
         if self._ego is None:
             raise InputError("ego path was not set", where=where, remedy="call set_ego")
+        grey = [f"{count} images of camera {name} are grey" for name, count in self._grey.items() if count]
+        self.add_notes(note for note in grey if note not in self._source.notes)
         order = {name: index for index, name in enumerate(self._cameras)}
         frames = sorted(self._frames.values(), key=lambda f: (f.view.time_s, order[f.view.camera.name]))
         split: dict[str, Literal["train", "test"]] = {f.id: self._split.get(f.id, "train") for f in frames}

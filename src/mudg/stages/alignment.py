@@ -9,7 +9,7 @@ import numpy as np
 
 from mudg.base import log
 from mudg.base.types import Scene, View
-from mudg.core.edge_alignment import EdgeAlignment, edge_alignment
+from mudg.core.edge_alignment import MIN_CONTRAST, MIN_JUMPS, TURNS_DEG, EdgeAlignment, edge_alignment
 from mudg.data.scenefile import read_image, read_points
 from mudg.stages.contact_sheet import sweeps_beside
 
@@ -40,7 +40,14 @@ def _shots(scene: Scene, name: str) -> Iterator[tuple[View, Any, Any, Any]]:
 def words(name: str, found: EdgeAlignment) -> str:
     """One sentence about a camera."""
     if found.verdict == "unknown":
-        return f"camera {name}: too few depth edges to compare with its images ({found.jumps})"
+        if found.jumps < MIN_JUMPS:
+            return f"camera {name}: too few depth edges to compare with its images ({found.jumps})"
+        why = "other turns fit about as well"
+        if found.contrast < MIN_CONTRAST:
+            why = f"no turn of up to {TURNS_DEG[-1]:g} degrees stands out"
+        elif max(abs(angle) for angle in found.best_turn_deg) == TURNS_DEG[-1]:
+            why = "the best turn is at the end of the range tried"
+        return f"camera {name}: {found.jumps} depth edges do not tell whether LiDAR and images agree ({why}); look at the contact sheet"
     score = f"score {found.score:.2f}, {found.jumps} depth edges"
     if found.verdict == "right":
         return f"camera {name}: LiDAR and image edges agree ({score})"
@@ -55,5 +62,5 @@ def record(found: EdgeAlignment) -> dict[str, Any]:
     """Plain values for JSON."""
     return {
         "verdict": found.verdict, "score": round(found.score, 3), "best_turn_deg": list(found.best_turn_deg),
-        "contrast": round(found.contrast, 3), "depth_edges": found.jumps,
+        "contrast": round(found.contrast, 3), "sigmas": round(found.sigmas, 2), "depth_edges": found.jumps,
     }  # fmt: skip

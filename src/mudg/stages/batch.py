@@ -246,7 +246,8 @@ def _child(connection: Connection, work: Work, entry: Entry, folder: Path, overw
         reused = before != "" and before == _finished(folder)
         connection.send(("reused" if reused else "done", _contents(folder), ""))
     except MudgError as error:
-        words = "; ".join(part for part in (error.what, error.where, error.got and f"got {error.got}") if part)
+        parts = (error.what, error.where, error.expected and f"expected {error.expected}", error.got and f"got {error.got}")
+        words = "; ".join(part for part in parts if part)
         connection.send(("failed", words, type(error).__name__))
     finally:
         connection.close()

@@ -28,13 +28,13 @@ class IngestConfig:
     test_every: int = Field(default=4, ge=0)
     """Hold out every n-th frame of all cameras for scoring (0 = hold out none)."""
     format: str = "auto"
-    """Format of the log (auto = look)."""
+    """Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp or custom (auto = look)."""
     frames: str = ""
-    """Source frames to take, FIRST:END with END left out (empty = all)."""
+    """Frames to take, FIRST:END with END left out, e.g. 0:40 (empty = all). KITTI: numbers of its files; else counted from 0."""
     cameras: tuple[str, ...] = ()
-    """Cameras to take, by their names in the scene (empty = the format's usual ones)."""
+    """Cameras to take, by their names in the scene or in the data set (empty = the format's usual ones)."""
     sequence: str = ""
-    """Which sequence or frame, where a folder holds several."""
+    """Which log, sequence, scene or frame, where a folder holds several."""
     poses: str = ""
     """File (or folder of GPS/IMU packets) with vehicle poses, instead of the one found by looking."""
     boxes: str = ""

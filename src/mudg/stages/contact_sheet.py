@@ -1,7 +1,8 @@
 """A picture of a whole scene for a first look: some frames of each camera with LiDAR and boxes drawn in, and a view from above.
 
 What to look for: points lie on the surfaces they belong to (edges of posts and cars), boxes sit on their objects, and
-standing things stay single lines from above. Near points are warm, far ones cold.
+standing things stay single lines from above. Near points are warm, far ones cold; boxes of vehicles are green, of people violet, of
+all else light blue, and the edges of their fronts red.
 """
 
 from __future__ import annotations
@@ -15,18 +16,27 @@ from PIL import Image, ImageDraw
 
 from mudg.base import geometry, store
 from mudg.base.types import Frame, Scene, Sweep, Track, View
+from mudg.data.scene_check import VEHICLES
 from mudg.data.scenefile import read_image, read_points
 
 NAME: Final = "contact_sheet.jpg"
 TILE_WIDTH_PX: Final = 480
 FRAMES_PER_CAMERA: Final = 3
+WIDTH_PX: Final = TILE_WIDTH_PX * FRAMES_PER_CAMERA
 TOP_HEIGHT_PX: Final = 720
 MAX_GAP_S: Final = 0.15
 NEAR_M: Final = 0.3
 _NEAREST_M, _FARTHEST_M = 3.0, 80.0
 _TOP_SWEEPS: Final = 24
 _TOP_POINTS: Final = 20_000
+_SPARSE: Final = 0.08
+"""Points on a smaller share of a tile's pixels are drawn as dots of 2x2."""
 _BOX_COLOUR: Final = (80, 255, 120)
+_PEOPLE_COLOUR: Final = (235, 130, 255)
+_OTHER_COLOUR: Final = (150, 205, 255)
+_SHADE: Final = (10, 10, 10)
+_SHADED_FROM_PX: Final = 24.0
+_THICKER_FROM_PX: Final = 700
 _FRONT_COLOUR: Final = (255, 80, 80)
 _PATH_COLOUR: Final = (60, 200, 255)
 _TEXT_COLOUR: Final = (235, 235, 235)
@@ -38,6 +48,11 @@ _COLD_TO_WARM: Final = np.array(
 
 _EDGES: Final = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """Pairs of corners; corner bits: 4 = front, 2 = left, 1 = top."""
+
+PEOPLE: Final = frozenset(
+    ("pedestrian", "person", "person_sitting", "person (sitting)", "cyclist", "rider", "motorcyclist", "bicyclist", "stroller",
+     "wheelchair")
+)  # fmt: skip
 
 Floats = NDArray[np.float64]
 
@@ -51,17 +66,23 @@ def write_contact_sheet(scene: Scene, path: Path) -> Path:
 
 
 def contact_sheet(scene: Scene) -> Image.Image:
-    """One row per camera, the view from above below."""
-    rows = []
+    """The cameras, the view from above below.
+
+    A camera has a row of its first, middle and last image. Where no camera has more than one, they share rows.
+    """
+    chosen = []
     for name in scene.cameras:
         frames = scene.frames_of(name)
         at = np.unique(np.linspace(0, len(frames) - 1, FRAMES_PER_CAMERA).astype(int)) if frames else []
-        tiles = [frame_tile(scene, frames[index]) for index in at]
-        if tiles:
-            rows.append(_beside(tiles))
-    width = max([FRAMES_PER_CAMERA * TILE_WIDTH_PX, *(row.width for row in rows)])
-    rows.append(top_view(scene, width, TOP_HEIGHT_PX))
-    sheet = Image.new("RGB", (width, sum(row.height for row in rows)), _GROUND)
+        chosen.append([frames[index] for index in at])
+    columns = max([1, *(len(frames) for frames in chosen)])
+    if columns == 1:
+        single = [frame for frames in chosen for frame in frames]
+        columns = max(1, min(FRAMES_PER_CAMERA, len(single)))
+        chosen = [single[first : first + columns] for first in range(0, len(single), columns)]
+    rows = [_beside([frame_tile(scene, f, WIDTH_PX // columns) for f in frames]) for frames in chosen if frames]
+    rows.append(top_view(scene, WIDTH_PX, TOP_HEIGHT_PX))
+    sheet = Image.new("RGB", (WIDTH_PX, sum(row.height for row in rows)), _GROUND)
     top = 0
     for row in rows:
         sheet.paste(row, (0, top))
@@ -81,12 +102,12 @@ def _beside(tiles: list[Image.Image]) -> Image.Image:
 # --- from the cameras -------------------------------------------------------------------------------------------------
 
 
-def frame_tile(scene: Scene, frame: Frame) -> Image.Image:
+def frame_tile(scene: Scene, frame: Frame, width: int = TILE_WIDTH_PX) -> Image.Image:
     """One image with the points of the sweeps of its moment and the boxes of its time."""
     camera = frame.view.camera
-    height = max(1, round(camera.height * TILE_WIDTH_PX / camera.width))
-    tile = Image.fromarray(read_image(scene, frame)).resize((TILE_WIDTH_PX, height), Image.Resampling.BOX)
-    view = frame.view.resized(TILE_WIDTH_PX, height)
+    height = max(1, round(camera.height * width / camera.width))
+    tile = Image.fromarray(read_image(scene, frame)).resize((width, height), Image.Resampling.BOX)
+    view = frame.view.resized(width, height)
     pixels = np.array(tile)
     sweeps = sweeps_beside(scene, frame)
     points = [
@@ -126,13 +147,18 @@ def depth_colours(depth_m: Floats) -> NDArray[np.uint8]:
 
 
 def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> None:
-    """Colour the pixels u8[H, W, 3] that points fall on, nearer ones over farther ones."""
+    """Colour the pixels u8[H, W, 3] that points fall on, nearer ones over farther ones; few points become dots of 2x2."""
     uv, z = geometry.project(view, xyz_world)
     with np.errstate(invalid="ignore"):
         inside = (z > NEAR_M) & (uv >= 0).all(1) & (uv[:, 0] < view.camera.width) & (uv[:, 1] < view.camera.height)
     uv, z = uv[inside].astype(int), z[inside]
     order = np.argsort(-z, kind="stable")
-    pixels[uv[order, 1], uv[order, 0]] = depth_colours(z[order])
+    height, width = pixels.shape[:2]
+    reach = 2 if len(z) < _SPARSE * height * width and width >= TILE_WIDTH_PX else 1
+    down, right = (grid.ravel() for grid in np.mgrid[:reach, :reach])
+    rows = np.minimum(uv[order, 1, None] + down, height - 1)
+    columns = np.minimum(uv[order, 0, None] + right, width - 1)
+    pixels[rows, columns] = depth_colours(z[order])[:, None]
 
 
 def box_corners(size_m: Floats, world_from_object: Floats) -> Floats:
@@ -174,10 +200,24 @@ def cut_near(ends: Floats) -> Floats | None:
 
 
 def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, track: Track) -> None:
-    """A box as lines; the edges of its front are red."""
-    for number, uv in visible_edges(view, box_corners(track.size_m, world_from_object)):
+    """A box as lines in its class' colour, those of its front red; on a dark edge where it is large enough, so that points do not
+    hide it."""
+    edges = visible_edges(view, box_corners(track.size_m, world_from_object))
+    if not edges:
+        return
+    line = 1 + view.camera.width // _THICKER_FROM_PX
+    ends = np.concatenate([uv for _, uv in edges])
+    if np.ptp(ends, axis=0).max() > _SHADED_FROM_PX:
+        for _, uv in edges:
+            draw.line(_pairs(uv), fill=_SHADE, width=line + 2)
+    for number, uv in edges:
         front = all(corner & 4 for corner in _EDGES[number])
-        draw.line([tuple(map(float, end)) for end in uv], fill=_FRONT_COLOUR if front else _BOX_COLOUR)
+        draw.line(_pairs(uv), fill=_FRONT_COLOUR if front else box_colour(track.label), width=line)
+
+
+def box_colour(label: str) -> tuple[int, int, int]:
+    """Colour of a class of boxes."""
+    return _BOX_COLOUR if label in VEHICLES else _PEOPLE_COLOUR if label in PEOPLE else _OTHER_COLOUR
 
 
 def _caption(draw: ImageDraw.ImageDraw, text: str) -> None:
@@ -193,7 +233,9 @@ def top_view(scene: Scene, width: int, height: int) -> Image.Image:
     """Points of up to 24 sweeps by height above the vehicle's path, the path, boxes at the middle of the log and their courses."""
     path = scene.ego.world_from_ego[:, :3, 3]
     xyz = _sample(scene)
-    around = np.concatenate([path[:, :2], xyz[:, :2]]) if len(xyz) else path[:, :2]
+    boxes = np.concatenate([np.zeros((0, 3)), *(track.world_from_object[:, :3, 3] for track in scene.tracks)])
+    seen = xyz if len(xyz) else boxes
+    around = np.concatenate([path[:, :2], seen[:, :2]])
     low, high = np.percentile(around, 4, axis=0), np.percentile(around, 96, axis=0)
     low, high = np.minimum(low, path[:, :2].min(0)) - 8, np.maximum(high, path[:, :2].max(0)) + 8
     scale = float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
@@ -217,7 +259,7 @@ def top_view(scene: Scene, width: int, height: int) -> Image.Image:
         pose = track.pose_at(middle_s)
         if pose is not None:
             corners = at(box_corners(track.size_m, pose)[[0, 2, 6, 4]])
-            draw.polygon(_pairs(corners), outline=_BOX_COLOUR)
+            draw.polygon(_pairs(corners), outline=box_colour(track.label))
             draw.line(_pairs(corners[[2, 3]]), fill=_FRONT_COLOUR, width=2)
     if len(path) > 1:
         draw.line(_pairs(at(path)), fill=_PATH_COLOUR, width=2)
@@ -225,8 +267,22 @@ def top_view(scene: Scene, width: int, height: int) -> Image.Image:
     draw.ellipse((start[0] - 4, start[1] - 4, start[0] + 4, start[1] + 4), outline=_PATH_COLOUR)
     draw.line((10, height - 12, 10 + 10 * scale, height - 12), fill=_TEXT_COLOUR, width=2)
     draw.text((10, height - 28), "10 m", fill=_TEXT_COLOUR)
+    _legend(draw, width, height)
     _caption(draw, f"{scene.id}: {len(scene.sweeps)} sweeps, {len(scene.tracks)} tracked boxes (at {middle_s:.1f} s)")
     return image
+
+
+def _legend(draw: ImageDraw.ImageDraw, width: int, height: int) -> None:
+    """What the colours mean, at the lower right."""
+    words = (
+        ("vehicles", _BOX_COLOUR), ("people", _PEOPLE_COLOUR), ("other boxes", _OTHER_COLOUR), ("fronts", _FRONT_COLOUR),
+        ("path", _PATH_COLOUR),
+    )  # fmt: skip
+    left = width - 12 - sum(draw.textlength(word) + 14 for word, _ in words)
+    draw.rectangle((left - 6, height - 32, width - 6, height - 8), fill=_GROUND)
+    for word, colour in words:
+        draw.text((left, height - 28), word, fill=colour)
+        left += draw.textlength(word) + 14
 
 
 def _pairs(points: Floats) -> list[tuple[float, float]]:

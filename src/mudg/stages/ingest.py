@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+import shutil
+import socket
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,8 @@ from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Frame, Scene
-from mudg.data.importers import IMPORTERS, RECOGNISERS
+from mudg.data import scene_check
+from mudg.data.importers import IMPORTERS, RECOGNISERS, files_of
 from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
 from mudg.data.scene_files import open_files
@@ -33,23 +37,61 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
         config: see ``IngestConfig``.
         source: the word ``city``, the folder of a dataset log (its format is recognised), or a scene (directory or
             stored zip), which is checked and copied.
-        out: output folder; a finished result of the same configuration and source is verified and reused.
+        out: output folder; a finished result of the same configuration and source is verified and reused. What an import that
+            failed or was killed left there is replaced; one that fails in a new or empty folder leaves nothing.
 
     Raises:
         InputError: the log is missing, malformed or contradictory. UsageError: ``out`` holds something else.
     """
     source = str(source)
-    make = _city if source == CITY else _maker(config, Path(source))
-    inputs = {} if source == CITY else {"source": source_digest(Path(source))}
+    kind = CITY if source == CITY else _kind(config, Path(source))
+    inputs = {} if kind == CITY else {"source": source_digest(Path(source), kind, config)}
     idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
     settings = {name: value for name, value in to_dict(config).items() if name not in idle}
-    folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite)
+    existed = out.exists()
+    fresh = not existed or (out.is_dir() and not any(out.iterdir()))
+    folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite or _abandoned(out))
     if folder.complete:
         return folder.reused()
+    try:
+        return _fill(folder, kind, config, Path(source))
+    except BaseException:
+        if (
+            fresh and not (folder.path / "scene.json").is_file()
+        ):  # nothing was made: the next try may ask for something else
+            _empty(folder.path, remove=not existed)
+        raise
+
+
+def _empty(folder: Path, *, remove: bool) -> None:
+    """Take everything out of a folder, and the folder away."""
+    with contextlib.suppress(OSError):  # the error that brought us here is the one to tell
+        for entry in folder.iterdir():
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        if remove:
+            folder.rmdir()
+
+
+def _abandoned(out: Path) -> bool:
+    """Whether an import that failed or was killed left nothing at ``out`` but its bookkeeping."""
+    try:
+        state = store.read_json(out / "run.json")
+        owner = store.read_json(out / "lock") if (out / "lock").is_file() else {}
+        made = state["verb"] != "ingest" or state["state"] == "complete" or (out / "scene.json").is_file()
+        here = owner.get("host") == socket.gethostname() and owner.get("pid") != os.getpid()
+        return not made and not (here and store.process_alive(int(owner["pid"])))
+    except (InputError, KeyError, TypeError, ValueError, AttributeError):
+        return False
+
+
+def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -> Path:
+    """Make the scene in its folder, draw its contact sheet and finish the run."""
     if (folder.path / "scene.json").is_file():
         scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
     else:
-        scene = make(config, Path(source), folder.path)
+        scene = _make(kind, config, source, folder.path)
+        if kind not in (CITY, _SCENE):
+            scene_check.check_records(scene, _say)
     held_out = sum(split == "test" for split in scene.split.values())
     log.info(
         f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "
@@ -64,8 +106,13 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
         log.info(f"ingest: look at {sheet}")
-    folder.finish({**summary, **({} if source == CITY else _alignment(scene))})
+    folder.finish({**summary, **({} if kind == CITY else _alignment(scene))})
     return folder.path
+
+
+def _say(level: scene_check.Level, where: str, words: str) -> None:
+    if level == "warning":
+        log.warn(f"ingest: {where}: {words}")
 
 
 def _alignment(scene: Scene) -> dict[str, Any]:
@@ -106,9 +153,9 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
     if left and out is None:
         out = Path(left.pop(0))
     if left:
-        unknown = not many and not Path(source).exists() and source != CITY
-        got = f"{source!r}, which is no format ({', '.join(formats)})" if unknown else " ".join([source, *left])
-        raise UsageError("there are too many words", expected=usage, got=got)
+        if not many and not Path(source).exists() and source != CITY:
+            raise UsageError("there is neither such a format nor such a log", expected=", ".join(formats), got=source)
+        raise UsageError("there are too many words", expected=usage, got=" ".join([source, *left]))
     if out is None:
         raise UsageError("no folder to write was given", expected=usage)
     return Asked(config, source, out)
@@ -134,24 +181,27 @@ def _one_of_many(config: IngestConfig, entry: batch.Entry, out: Path, overwrite:
     return run(replace(config, **own), entry.source, out, overwrite=overwrite)
 
 
-Maker = Callable[[IngestConfig, Path, Path], Scene]
+_SCENE = "scene"
 
 
-def _maker(config: IngestConfig, source: Path) -> Maker:
-    """Who can read ``source``."""
-    named = None if config.format == "auto" else _importer(config.format)
+def _kind(config: IngestConfig, source: Path) -> str:
+    """Which format ``source`` has, or ``scene``."""
+    if config.format not in ("auto", *IMPORTERS):
+        raise UsageError(
+            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format
+        )
     if not source.exists():
         raise InputError(
             "driving log does not exist", where=str(source), expected=f"a folder, a scene zip, or the word {CITY}"
         )
-    if named is not None:
-        return named
+    if config.format != "auto":
+        return config.format
     if is_scene(source):
-        return _copy_scene
+        return _SCENE
     for name, looks_like in RECOGNISERS.items():
         if looks_like(source):
             log.info(f"ingest: {source} looks like {name}")
-            return _importer(name)
+            return name
     inside = "a file"
     if source.is_dir():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
@@ -164,21 +214,18 @@ def _maker(config: IngestConfig, source: Path) -> Maker:
     )
 
 
+def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:
+    """Make the scene at ``out``."""
+    if kind == CITY:
+        return _city(config, out)
+    if kind == _SCENE:
+        return _copy_scene(config, source, out)
+    return IMPORTERS[kind](source, out, import_options(config))
+
+
 def is_scene(source: Path) -> bool:
     """Whether ``source`` is a scene directory, or a zip, which can be nothing else."""
     return (source.is_file() and source.suffix == ".zip") or (source / "scene.json").is_file()
-
-
-def _importer(name: str) -> Maker:
-    if name not in IMPORTERS:
-        raise UsageError(
-            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=name
-        )
-
-    def make(config: IngestConfig, source: Path, out: Path) -> Scene:
-        return IMPORTERS[name](source, out, import_options(config))
-
-    return make
 
 
 def import_options(config: IngestConfig) -> ImportOptions:
@@ -197,24 +244,44 @@ def import_options(config: IngestConfig) -> ImportOptions:
     )
 
 
-def source_digest(source: Path) -> str:
-    """What identifies a log without reading all of it: names, sizes and modification times of its files; a scene's own digest."""
-    if is_scene(source):
+def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
+    """What identifies a log without reading all of it: names, sizes and modification times of the files that belong to the chosen
+    one; a scene's own digest.
+
+    Args:
+        kind: format, or ``scene``.
+        config: chooses the log, where a folder holds many; files it names count, too.
+
+    Raises:
+        UsageError: several logs and none was chosen. InputError: none is there.
+    """
+    if kind == _SCENE:
         return store.digest(source)
+    options = import_options(config)
+    files = files_of(kind, source, options)
+    named = [path for path in (options.poses, options.boxes) if path is not None and path.exists()]
     total = hashlib.sha256()
-    if source.is_file():
-        state = source.stat()
-        total.update(f"{source.name}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
-    for folder, names, files in os.walk(source):
-        names.sort()
-        for name in sorted(files):
-            path = Path(folder) / name
-            state = path.stat()
-            total.update(f"{path.relative_to(source).as_posix()}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
+    base = source if source.is_dir() else source.parent
+    for path in (*files.whole, *named):
+        for name in _walk(path):
+            state = name.stat() if name.exists() else name.lstat()  # a link may lead nowhere
+            place = Path(os.path.relpath(name, base)).as_posix()
+            total.update(f"{place}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
+    for path in files.entries:
+        total.update(f"{path.name}\0{path.stat().st_mtime_ns}\n".encode())
     return total.hexdigest()
 
 
-def _city(config: IngestConfig, _source: Path, out: Path) -> Scene:
+def _walk(path: Path) -> Iterator[Path]:
+    """A file, or all files below a folder in the order of their names."""
+    if path.is_file():
+        yield path
+    for folder, names, files in os.walk(path):
+        names.sort()
+        yield from (Path(folder) / name for name in sorted(files))
+
+
+def _city(config: IngestConfig, out: Path) -> Scene:
     from mudg.data.city import write_city
 
     _refuse(

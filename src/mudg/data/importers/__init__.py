@@ -1,7 +1,8 @@
 """Importers: dataset logs in their own formats -> scene directories. This is the only place that lists them.
 
-A format is one module ``<format>.py`` with ``import_<format>(source, out, options) -> Scene`` and
-``looks_like_<format>(source) -> bool``, its name in ``FORMATS`` and a case in ``_functions``. Modules are loaded when they are asked.
+A format is one module ``<format>.py`` with ``import_<format>(source, out, options) -> Scene``, ``looks_like_<format>(source) -> bool``
+and, where folders hold many logs, ``files_of_<format>(source, options) -> LogFiles``; its name in ``FORMATS`` and a case in
+``_functions``. Modules are loaded when they are asked.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ from functools import partial
 from pathlib import Path
 
 from mudg.base.types import Scene
+from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
 
 Importer = Callable[[Path, Path, ImportOptions], Scene]
 Recogniser = Callable[[Path], bool]
+Finder = Callable[[Path, ImportOptions], LogFiles]
 
 FORMATS = (
     "kitti360",  # before kitti: a drive's folder has image_00 in both
@@ -23,45 +26,49 @@ FORMATS = (
 """Names of the formats, in the order in which a folder is asked whether it looks like one."""
 
 
-def _functions(name: str) -> tuple[Recogniser, Importer]:
-    """``looks_like_<name>`` and ``import_<name>``."""
+def _whole_source(source: Path, _options: ImportOptions) -> LogFiles:
+    return LogFiles((source,))
+
+
+def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
+    """``looks_like_<name>``, ``import_<name>`` and ``files_of_<name>``."""
     match name:
         case "kitti360":
-            from mudg.data.importers.kitti360 import import_kitti360, looks_like_kitti360
+            from mudg.data.importers.kitti360 import files_of_kitti360, import_kitti360, looks_like_kitti360
 
-            return looks_like_kitti360, import_kitti360
+            return looks_like_kitti360, import_kitti360, files_of_kitti360
         case "waymo":
-            from mudg.data.importers.waymo import import_waymo, looks_like_waymo
+            from mudg.data.importers.waymo import files_of_waymo, import_waymo, looks_like_waymo
 
-            return looks_like_waymo, import_waymo
+            return looks_like_waymo, import_waymo, files_of_waymo
         case "nuscenes":
-            from mudg.data.importers.nuscenes import import_nuscenes, looks_like_nuscenes
+            from mudg.data.importers.nuscenes import files_of_nuscenes, import_nuscenes, looks_like_nuscenes
 
-            return looks_like_nuscenes, import_nuscenes
+            return looks_like_nuscenes, import_nuscenes, files_of_nuscenes
         case "argoverse2":
-            from mudg.data.importers.argoverse2 import import_argoverse2, looks_like_argoverse2
+            from mudg.data.importers.argoverse2 import files_of_argoverse2, import_argoverse2, looks_like_argoverse2
 
-            return looks_like_argoverse2, import_argoverse2
+            return looks_like_argoverse2, import_argoverse2, files_of_argoverse2
         case "pandaset":
-            from mudg.data.importers.pandaset import import_pandaset, looks_like_pandaset
+            from mudg.data.importers.pandaset import files_of_pandaset, import_pandaset, looks_like_pandaset
 
-            return looks_like_pandaset, import_pandaset
+            return looks_like_pandaset, import_pandaset, files_of_pandaset
         case "nuplan":
-            from mudg.data.importers.nuplan import import_nuplan, looks_like_nuplan
+            from mudg.data.importers.nuplan import files_of_nuplan, import_nuplan, looks_like_nuplan
 
-            return looks_like_nuplan, import_nuplan
+            return looks_like_nuplan, import_nuplan, files_of_nuplan
         case "dgp":
-            from mudg.data.importers.dgp import import_dgp, looks_like_dgp
+            from mudg.data.importers.dgp import files_of_dgp, import_dgp, looks_like_dgp
 
-            return looks_like_dgp, import_dgp
+            return looks_like_dgp, import_dgp, files_of_dgp
         case "custom":
             from mudg.data.importers.custom import import_custom, looks_like_custom
 
-            return looks_like_custom, import_custom
+            return looks_like_custom, import_custom, _whole_source
         case "kitti":
-            from mudg.data.importers.kitti import import_kitti, looks_like_kitti
+            from mudg.data.importers.kitti import files_of_kitti, import_kitti, looks_like_kitti
 
-            return looks_like_kitti, import_kitti
+            return looks_like_kitti, import_kitti, files_of_kitti
         case _:
             raise KeyError(name)
 
@@ -72,6 +79,15 @@ def _import(name: str, source: Path, out: Path, options: ImportOptions) -> Scene
 
 def _looks_like(name: str, source: Path) -> bool:
     return _functions(name)[0](source)
+
+
+def files_of(name: str, source: Path, options: ImportOptions) -> LogFiles:
+    """What identifies the log that format ``name`` would import from ``source``; nothing large is read.
+
+    Raises:
+        UsageError: several logs and none was chosen. InputError: none is there.
+    """
+    return _functions(name)[2](source, options)
 
 
 IMPORTERS: Mapping[str, Importer] = {name: partial(_import, name) for name in FORMATS}

@@ -31,7 +31,7 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -155,6 +155,11 @@ def _choose_log(source: Path, options: ImportOptions) -> Path:
             got=options.sequence or "none chosen",
         )
     return matching[0]
+
+
+def files_of_argoverse2(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen log's folder."""
+    return LogFiles((_choose_log(source, options),))
 
 
 def read_log(folder: Path, options: ImportOptions) -> DriveLog:

@@ -18,7 +18,7 @@ Matrix = NDArray[np.float64]
 MAX_GAP_S: Final = 0.55
 """A moving object that is not seen for longer than this is split: interpolating across would invent its path."""
 MAX_SIDE_M: Final = 100.0
-LONGER_THAN_WIDE: Final = frozenset(("car", "van", "bus"))
+LONGER_THAN_WIDE: Final = frozenset(("car", "van", "bus", "vehicle"))
 """Labels whose boxes are longer than wide in every data set (a truck's cab may be a box of its own)."""
 _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
@@ -153,9 +153,14 @@ class BoxTracks:
         if split:
             notes.append(f"{split} tracks are not seen for more than {self._max_gap_s:g} s and were split there")
         if self._unknown:
-            some = ", ".join(f"{label!r} ({count} boxes)" for label, count in sorted(self._unknown.items())[:8])
-            notes.append(f"classes that are not known here keep their names: {some}")
+            notes.append(unknown_words(self._unknown))
         return notes
+
+
+def unknown_words(counts: Mapping[str, int]) -> str:
+    """A note about classes of boxes that the format does not document, by their number of boxes."""
+    some = ", ".join(f"{label!r} ({count} boxes)" for label, count in sorted(counts.items())[:8])
+    return f"classes that are not known here keep their names: {some}"
 
 
 def check_sides(tracks: Sequence[Track], where: str) -> None:

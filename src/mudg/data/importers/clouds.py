@@ -336,6 +336,31 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
 # --- BIN and NPZ ------------------------------------------------------------------------------------------------------
 
 
+def read_float_rows(path: Path, columns: int, what: str = "scan") -> NDArray[np.float32]:
+    """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns].
+
+    Args:
+        what: word for one file's content, for messages.
+
+    Raises:
+        InputError: missing, cut off, or values that are not finite.
+    """
+    content = store.read_bytes(path)
+    if len(content) % (4 * columns):
+        raise InputError(
+            f"{what} is cut off", where=str(path), got=f"{len(content)} bytes",
+            expected=f"a multiple of {4 * columns} bytes ({columns} float32 a row)", remedy="copy the file again",
+        )  # fmt: skip
+    rows = np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
+    bad = ~np.isfinite(rows).all(1)
+    if bad.any():
+        raise InputError(
+            f"{what} holds values that are not finite", where=str(path), got=f"{int(bad.sum())} of {len(rows)} rows",
+            remedy="copy the file again",
+        )  # fmt: skip
+    return rows
+
+
 def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
     """KITTI's form: little-endian float32 rows x, y, z, intensity, nothing else."""
     if len(content) % 16:
@@ -354,7 +379,7 @@ def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for entry in archive.infolist():
                 with archive.open(entry) as handle:
-                    columns[entry.filename.removesuffix(".npy")] = _npy(
+                    columns[entry.filename.removesuffix(".npy")] = read_npy(
                         handle, entry.file_size, f"{where}: {entry.filename}"
                     )
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as error:
@@ -374,8 +399,14 @@ def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
     return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **columns}
 
 
-def _npy(handle: IO[bytes], size: int, where: str) -> NDArray:
-    """One array of an archive. Its header is compared with its bytes first; arrays of objects (pickles) are refused."""
+def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
+    """One array of an archive, from its member of ``size`` bytes.
+
+    Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused.
+
+    Raises:
+        InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array, or damaged.
+    """
     version = np.lib.format.read_magic(handle)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
@@ -392,7 +423,9 @@ def _npy(handle: IO[bytes], size: int, where: str) -> NDArray:
             "array is not plain numbers of the declared size", where=where, got=f"{dtype} {shape} in {size} bytes",
             remedy="save it with numpy.savez from an array of numbers",
         )  # fmt: skip
-    return np.frombuffer(handle.read(length), dtype).reshape(shape, order="F" if fortran else "C")
+    content = handle.read(length)
+    handle.read(1)  # at its end an archive's member compares its checksum
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 READERS: Final[dict[str, Callable[[bytes, str], dict[str, NDArray]]]] = {

@@ -20,6 +20,7 @@ from mudg.data.importers.clouds import Cloud, read_cloud
 from mudg.data.importers.common import deskew, for_each, moments, pose_near
 from mudg.data.importers.custom_schema import INDEX, CustomLog, LogImage, LogLidar, LogSweep, read_log
 from mudg.data.importers.images import fit_images
+from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import Finding, SceneWriter, decode_image
 
@@ -45,7 +46,7 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
         UsageError: an option that this format does not have, or a camera that the log does not have.
         InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
-    _refuse_options(options)
+    refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     content = _chosen(read_log(source), options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
     images, sweeps = _numbered(content.images), _numbered(content.sweeps)
@@ -53,11 +54,7 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     for note in notes:
         log.info(f"custom: {note}")
 
-    def warn(level: scene_check.Level, where: str, words: str) -> None:
-        if level == "warning":
-            log.warn(f"custom: {where}: {words}")
-
-    scene_check.check_records(as_scene(content, _raise)[0], warn)
+    as_scene(content, _raise)  # records without a pose are refused before anything is read
 
     def add_image(item: tuple[str, LogImage]) -> None:
         frame_id, image = item
@@ -88,20 +85,10 @@ def _raise(problem: MudgError) -> None:
     raise problem
 
 
-def _refuse_options(options: ImportOptions) -> None:
-    for name, value in (("--sequence", options.sequence), ("--poses", options.poses), ("--boxes", options.boxes)):
-        if value:
-            raise UsageError("a log in the neutral layout has no such choice", where=name, remedy="leave it out")
-
-
 def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
-    """The cameras, frames and files asked for. ``frames`` counts images of the first camera; the rest goes by time."""
-    unknown = [name for name in options.cameras if name not in content.cameras]
-    if unknown:
-        raise UsageError(
-            "the log has no such camera", where="--cameras", expected=", ".join(content.cameras), got=", ".join(unknown)
-        )
-    names = options.cameras or tuple(content.cameras)
+    """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the rest goes by time."""
+    there = {name: name for name in content.cameras}
+    names = chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
     images = [image for image in content.images if image.camera in names]
     sweeps = list(content.sweeps)
     if options.frames is not None:
@@ -177,7 +164,7 @@ def refuse_grey(path: Path) -> None:
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as image:
             mode = image.mode
-    except (OSError, SyntaxError, ValueError):
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return  # decode_image says better what is wrong
     if mode in ("1", "L", "LA"):
         raise InputError(

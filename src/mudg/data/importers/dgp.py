@@ -36,8 +36,9 @@ from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.clouds import read_npy
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -47,7 +48,10 @@ MICROSECONDS: Final = 10**6
 _YEAR_2100_US: Final = 4_102_444_800 * MICROSECONDS
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _BOXES_3D: Final = "1"
-_MAX_CLOUD_BYTES: Final = 1 << 30
+_UNREADABLE: Final = (
+    zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError,
+)  # fmt: skip
+"""What a damaged archive raises."""
 
 LABELS: Final[Mapping[str, str]] = {
     "Car": "car",
@@ -118,6 +122,11 @@ def _choose_scene(source: Path, options: ImportOptions) -> Path:
             got=options.sequence or "none chosen",
         )
     return matching[0]
+
+
+def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen scene's folder."""
+    return LogFiles((_choose_scene(source, options).parent,))
 
 
 # --- one scene ------------------------------------------------------------------------------------------------------
@@ -323,17 +332,15 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     """A cloud: array ``data`` of an npz file, columns named by ``point_format`` (empty = X, Y, Z, INTENSITY).
 
     Raises:
-        InputError: cut off, larger than 1 GiB, without coordinates, or not finite.
+        InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite.
     """
     where = str(path)
-    content = store.read_bytes(path)
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            size = archive.getinfo("data.npy").file_size
-            if size > _MAX_CLOUD_BYTES:
-                raise InputError("cloud is too large", where=where, got=f"{size} bytes unpacked")
-            data = np.lib.format.read_array(io.BytesIO(archive.read("data.npy")), allow_pickle=False)
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError) as error:
+        with zipfile.ZipFile(io.BytesIO(store.read_bytes(path))) as archive:
+            entry = archive.getinfo("data.npy")
+            with archive.open(entry) as handle:
+                data = read_npy(handle, entry.file_size, f"{where}: data.npy")
+    except _UNREADABLE as error:
         raise InputError(
             "cloud is no npz file with an array 'data', or is cut off",
             where=where,

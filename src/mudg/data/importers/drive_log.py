@@ -25,6 +25,7 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, 
 from mudg.data.importers.box_times import REACH_S, BoxTimes, clip_track, reach_images
 from mudg.data.importers.common import for_each
 from mudg.data.importers.images import fit_images
+from mudg.data.importers.layout import refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scene_schema import ref_problem
 from mudg.data.scenefile import SceneWriter
@@ -96,7 +97,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep
     counts as one moment, without point times, and boxes stay as drawn.
 
-    Images whose size is kept are copied byte for byte, after a check that they decode to their camera's size. At most two
+    Images whose size is kept are copied byte for byte, after a check that they are whole and of their camera's size. At most two
     images or sweeps per worker are in memory, beside the few that wait for the disk.
 
     Raises:
@@ -251,10 +252,7 @@ def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
             got="--untwist yes",
             remedy="leave --untwist out",
         )
-    if options.poses is not None or options.boxes is not None:
-        raise UsageError(
-            f"poses and boxes of {dataset} come with the log", where=where, remedy="leave --poses and --boxes out"
-        )
+    refuse_options(options, dataset, "poses", "boxes")
 
 
 def path_inside(root: Path, name: Any, where: str) -> Path:

@@ -111,7 +111,7 @@ class ImageFit:
 
         Returns:
             ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95 for a
-            JPEG, PNG for a PNG) for a file.
+            JPEG, PNG for a PNG, grey for grey) for a file.
 
         Raises:
             InputError: damaged, or not of the recorded size.
@@ -121,12 +121,16 @@ class ImageFit:
         if isinstance(image, np.ndarray):
             return self.pixels(image)
         content = store.read_bytes(image) if isinstance(image, Path) else image
-        pixels = self.pixels(decode_image(content, where or str(image)[:200], self.recorded))
+        rgb = decode_image(content, where or str(image)[:200], self.recorded)
+        fitted = Image.fromarray(self.pixels(rgb))
+        with Image.open(io.BytesIO(content)) as recorded:
+            if recorded.mode == "L":
+                fitted = fitted.getchannel(0)
         buffer = io.BytesIO()
         if content[:4] == b"\x89PNG":
-            Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
+            fitted.save(buffer, "PNG", compress_level=1)
         else:
-            Image.fromarray(pixels).save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+            fitted.save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=0)
         return buffer.getvalue()
 
     def pixels(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

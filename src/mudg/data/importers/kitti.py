@@ -35,9 +35,11 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers import kitti_boxes, kitti_poses
-from mudg.data.importers.common import for_each, pose_near
+from mudg.data.importers.clouds import read_float_rows
+from mudg.data.importers.common import for_each, pose_near, seconds
 from mudg.data.importers.images import ImageFit, fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, read_calibration_day, read_calibration_text
+from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import SceneWriter, decode_image
 
@@ -138,6 +140,23 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
         return writer.finish()
 
 
+def files_of_kitti(source: Path, options: ImportOptions) -> LogFiles:
+    """The folder, with the calibration and poses beside it; of a folder with many sequences or frames only what is chosen."""
+    beside = [*source.parent.glob("calib_*.txt"), *_odometry_poses(source)]
+    beside = [path for path in beside if path.is_file()]
+    wanted = options.sequence
+    number = int(wanted) if wanted.isdigit() else -1
+    chosen = [
+        path
+        for path in (sorted(source.glob("*/*")) if wanted else ())
+        if path.stem == wanted or (path.stem.isdigit() and int(path.stem) == number)
+    ]
+    if not chosen:
+        return LogFiles((source, *sorted(beside)))
+    here = [path for path in sorted(source.iterdir()) if path.is_file() or path.name == "derived"]
+    return LogFiles((*chosen, *here, *sorted(beside)))
+
+
 # --- finding files --------------------------------------------------------------------------------------------------
 
 
@@ -150,37 +169,23 @@ def find_files(source: Path, options: ImportOptions) -> KittiFiles:
     for folder, name in CAMERA_NAMES.items():
         short = folder.replace("_0", "_")
         for candidate in (source / folder / "data", source / folder / sequence, source / short / sequence):
-            found = _numbered(candidate, ("png", "jpg", "jpeg"))
+            found = numbered_files(candidate, (".png", ".jpg", ".jpeg"))
             if found:
                 images[name], numbers[name] = found, int(folder[-1])
                 break
     if not images:
         _refuse_without_images(source, sequence)
-    wanted = options.cameras or (("front",) if "front" in images else tuple(images)[:1])
-    unknown = [name for name in wanted if name not in images]
-    if unknown:
-        raise UsageError(
-            "the recording has no such camera", where=str(source), expected=", ".join(images), got=", ".join(unknown)
-        )
+    folder_of = {name: f"image_0{number}" for name, number in numbers.items()}
+    usual = folder_of.get("front", next(iter(folder_of.values())))
+    chosen = chosen_cameras({folder: name for name, folder in folder_of.items()}, options, str(source), (usual,))
+    wanted = [CAMERA_NAMES[folder] for folder in chosen]
     scans: dict[int, Path] = {}
     for candidate in (source / "velodyne_points" / "data", source / "velodyne" / sequence):
-        scans = scans or _numbered(candidate, ("bin",))
+        scans = scans or numbered_files(candidate, (".bin",))
     folders = (source, source / "derived")
     return KittiFiles(
         {name: images[name] for name in wanted}, {name: numbers[name] for name in wanted}, scans, folders, single
     )
-
-
-def _numbered(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Files called by a frame number, in order."""
-    if not folder.is_dir():
-        return {}
-    found = {
-        int(path.stem): path
-        for path in folder.iterdir()
-        if path.stem.isdigit() and path.suffix.lower().lstrip(".") in suffixes
-    }
-    return dict(sorted(found.items()))
 
 
 def _refuse_without_images(source: Path, sequence: str) -> None:
@@ -212,37 +217,11 @@ def _choose_frames(files: KittiFiles, options: ImportOptions, source: Path) -> l
     """Frame numbers to import: those of all chosen cameras and scans."""
     if files.single:
         return [_single_frame(files, options, source)]
-    streams: dict[str, set[int]] = {name: set(found) for name, found in files.images.items()}
-    if files.scans:
-        streams[SENSOR] = set(files.scans)
-    everything = set().union(*streams.values())
-    if options.frames is not None:
-        everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
-    missing = {name: sorted(everything - found) for name, found in streams.items() if everything - found}
-    if missing and not options.skip_missing:
-        words = "; ".join(f"{name} lacks {_some_numbers(numbers)}" for name, numbers in missing.items())
-        raise InputError(
-            "images and scans do not pair up",
-            where=str(source),
-            expected="one image per camera and one scan for every frame",
-            got=words,
-            remedy="copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
-    for numbers in missing.values():
-        everything -= set(numbers)
-    if missing:
-        log.warn(
-            f"kitti: left out incomplete frames: {', '.join(f'{n}: {_some_numbers(m)}' for n, m in missing.items())}"
-        )
-    if not everything:
-        raise InputError(
-            "no frames to import",
-            where=str(source),
-            expected="numbered images" + (f" in {options.frames}" if options.frames else ""),
-        )
+    streams = {**files.images, **({SENSOR: files.scans} if files.scans else {})}
+    frames = whole_frames(streams, options, str(source), "kitti")
     if not files.scans:
         log.warn("kitti: no scans found: the scene has images only, and there is nothing to fuse")
-    return sorted(everything)
+    return frames
 
 
 def _single_frame(files: KittiFiles, options: ImportOptions, source: Path) -> int:
@@ -256,15 +235,11 @@ def _single_frame(files: KittiFiles, options: ImportOptions, source: Path) -> in
             "an object-benchmark folder holds unrelated frames; a scene is one of them",
             where=str(source),
             expected="--sequence with one frame number, e.g. 000008",
-            got=f"{len(numbers)} frames: {_some_numbers(numbers)}",
+            got=f"{len(numbers)} frames: {some_numbers(numbers)}",
         )
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(source / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
-
-
-def _some_numbers(numbers: Sequence[int]) -> str:
-    return ", ".join(str(n) for n in numbers[:8]) + (f", ... ({len(numbers)} in all)" if len(numbers) > 8 else "")
 
 
 def _find_calibration(
@@ -332,6 +307,7 @@ class _Clock:
                     expected="seconds, increasing",
                     remedy="is the file of another recording, or in another unit?",
                 )
+            seconds(values, "s", f"{source}: {stream}")
         return cls(
             {name: {n: t - start for n, t in times.items()} for name, times in image_s.items()},
             {n: t - start for n, t in scan_s.items()},
@@ -411,7 +387,7 @@ def _poses_from_file(
     """World-from-velodyne f64[n, 4, 4]; the world is the velodyne of the first frame."""
     names = ("poses_velo.txt", "poses.txt", "poses_cam0.txt")
     found = [folder / name for folder in files.folders for name in names]
-    path = options.poses or _first_file(*found, *_odometry_poses(files))
+    path = options.poses or _first_file(*found, *_odometry_poses(files.folders[0]))
     if path is None and len(frames) == 1:
         return np.eye(4)[None]
     if path is None:
@@ -429,7 +405,7 @@ def _poses_from_file(
         raise InputError(
             "pose file lacks frames",
             where=str(path),
-            got=f"no pose for frames {_some_numbers(missing)}",
+            got=f"no pose for frames {some_numbers(missing)}",
             remedy="choose frames with --frames FIRST:END, or give another file with --poses",
         )
     stacked = np.stack([poses[n] for n in frames])
@@ -448,9 +424,8 @@ def _find_packets(files: KittiFiles, options: ImportOptions) -> Path | None:
     return _first_file(files.folders[0] / "oxts" / f"{options.sequence}.txt") if options.sequence else None
 
 
-def _odometry_poses(files: KittiFiles) -> tuple[Path, ...]:
+def _odometry_poses(source: Path) -> tuple[Path, ...]:
     """``poses/07.txt`` beside ``sequences/07``."""
-    source = files.folders[0]
     return (source.parent.parent / "poses" / f"{source.name}.txt",) if source.parent.name == "sequences" else ()
 
 
@@ -513,23 +488,7 @@ def read_scan(path: Path) -> SweepPoints:
     Raises:
         InputError: cut off, or values that are not finite.
     """
-    content = store.read_bytes(path)
-    if len(content) % 16:
-        raise InputError(
-            "scan is cut off",
-            where=str(path),
-            expected="a multiple of 16 bytes (4 float32 a point)",
-            got=f"{len(content)} bytes",
-            remedy="copy the file again",
-        )
-    rows = np.frombuffer(content, "<f4").reshape(-1, 4).astype(np.float32)
-    if not np.isfinite(rows).all():
-        raise InputError(
-            "scan holds values that are not finite",
-            where=str(path),
-            got=f"{int((~np.isfinite(rows).all(1)).sum())} of {len(rows)} points",
-            remedy="copy the file again",
-        )
+    rows = read_float_rows(path, 4)
     if len(rows) == 0:
         log.warn(f"kitti: {path} has no points")
     rows = rows[np.any(rows[:, :3] != 0, axis=1)]

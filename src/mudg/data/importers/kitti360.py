@@ -41,12 +41,13 @@ from mudg.base.palette import UNLABELLED
 from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers import kitti_poses
 from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.common import deskew, for_each, pose_near, rigid_pose, seconds
 from mudg.data.importers.images import ImageFit
 from mudg.data.importers.kitti import read_scan
 from mudg.data.importers.kitti360_boxes import WORDS, read_boxes
 from mudg.data.importers.kitti360_calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
-from mudg.data.importers.layout import chosen_cameras, numbered_files, some_numbers, whole_frames
+from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import SceneWriter, decode_image
 
@@ -188,6 +189,16 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
             expected="--sequence with one of " + ", ".join(drives[:12]), got=wanted or "none chosen",
         )  # fmt: skip
     return _Folders(source, matching[0])
+
+
+def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
+    """The calibration and the parts of the chosen drive."""
+    folders = _find(source, options)
+    root, drive = folders.root, folders.drive
+    parts = [root / "calibration", *(root / name / drive for name in ("data_2d_raw", "data_3d_raw", "data_poses"))]
+    parts += [root / "data_2d_semantics" / "train" / drive]
+    parts += [root / "data_3d_bboxes" / part / f"{drive}.xml" for part in ("train_full", "train")]
+    return LogFiles(tuple(part for part in parts if part.exists()))
 
 
 def _fit(calibration: Kitti360Calibration, camera: str, first: Path, options: ImportOptions) -> ImageFit:
@@ -378,14 +389,7 @@ class _Sick:
 
 def _read_line(path: Path) -> NDArray[np.float32]:
     """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane; source: the data set's reader."""
-    content = store.read_bytes(path)
-    if len(content) % 8:
-        raise InputError(
-            "SICK line is cut off", where=str(path), expected="a multiple of 8 bytes", got=f"{len(content)} bytes"
-        )
-    pairs = np.frombuffer(content, "<f4").reshape(-1, 2)
-    if not np.isfinite(pairs).all():
-        raise InputError("SICK line holds values that are not finite", where=str(path))
+    pairs = read_float_rows(path, 2, "SICK line")
     pairs = pairs[np.any(pairs != 0, axis=1)]
     return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,16 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix
 from mudg.base.types import Track
+from mudg.data.importers.box_tracks import check_sides, unknown_words
 from mudg.data.importers.kitti_poses import read_lines
 
 Matrix = NDArray[np.float64]
 MAX_TRACKLET_BYTES = 256 * 1024 * 1024
 TURN_PERIOD_S = 0.1
+LABELS = frozenset(
+    ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
+)
+"""Classes of the benchmarks, in lower case."""
 MAX_GAP_S = 0.55
 """A track that is not seen for longer than this is split: interpolating across would invent its path."""
 
@@ -195,6 +201,10 @@ def build_tracks(
             tracks.append(
                 Track(f"{number}.{part}" if part else str(number), members[chosen[0]].label, size, times[piece], poses)
             )
+    check_sides(tracks, where)
+    unknown = Counter(box.label for box in boxes if box.frame in world_from_velo and box.label not in LABELS)
+    if unknown:
+        notes.append(unknown_words(unknown))
     return tracks, notes
 
 

@@ -16,8 +16,10 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import EgoPath, Scene, Source, View
 from mudg.data.importers import kitti_boxes
+from mudg.data.importers.drive_log import path_inside
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.kitti_calib import KittiCalibration, nearest_rotation
+from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scenefile import SceneWriter, decode_image
 
@@ -29,18 +31,21 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import the one frame that ``source/info.json`` describes.
 
     Raises:
+        UsageError: an option that a single frame has no use for.
         InputError: the record is incomplete, or image or scan is missing or damaged.
     """
     from mudg.data.importers.kitti import LICENCE, SENSOR, read_scan
 
     where = str(source / "info.json")
+    refuse_options(options, "single-frame KITTI", "frames", "sequence", "poses", "boxes")
+    chosen_cameras({_CAMERA: "front"}, options, where, (_CAMERA,))
     record = store.read_json(source / "info.json")
     try:
         sample = record["data_list"][0]
         image_record, lidar = sample["images"][_CAMERA], sample["lidar_points"]
         image_path, scan_path = (
-            _plain(source, image_record["img_path"], where),
-            _plain(source, lidar["lidar_path"], where),
+            path_inside(source, image_record["img_path"], f"{where}: img_path"),
+            path_inside(source, lidar["lidar_path"], f"{where}: lidar_path"),
         )
         projection = np.array(image_record["cam2img"], np.float64)[:3]
         rect0_from_velo = np.array(image_record["lidar2cam"], np.float64)
@@ -73,15 +78,6 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
         return writer.finish()
 
 
-def _plain(source: Path, name: Any, where: str) -> Path:
-    """A file beside the record; names that lead elsewhere are refused."""
-    if not isinstance(name, str) or name != Path(name).name or not name or name in (".", ".."):
-        raise InputError(
-            "record names a file outside its folder", where=where, got=repr(name)[:80], expected="a plain file name"
-        )
-    return source / name
-
-
 def _boxes(instances: list[dict[str, Any]], rect0_from_velo: np.ndarray, where: str) -> list[kitti_boxes.KittiBox]:
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
@@ -91,7 +87,13 @@ def _boxes(instances: list[dict[str, Any]], rect0_from_velo: np.ndarray, where: 
         x, y, z, length, height, width, turn = (float(value) for value in item["bbox_3d"])
         if min(length, height, width) <= 0 or not np.isfinite([x, y, z, turn]).all():
             raise InputError("box makes no sense", where=f"{where}: instances[{index}]", got=str(item["bbox_3d"]))
-        label = LABELS[int(item["bbox_label_3d"])]
+        number = int(item["bbox_label_3d"])
+        if number >= len(LABELS):
+            raise InputError(
+                "box has a class that does not exist", where=f"{where}: instances[{index}]", got=str(number),
+                expected=f"0 to {len(LABELS) - 1}, or -1 for none",
+            )  # fmt: skip
+        label = LABELS[number]
         pose = velo_from_rect0 @ kitti_boxes.rect0_from_box((x, y, z), height, turn)
         left, top, right, bottom = (float(value) for value in item["bbox"])
         boxes.append(kitti_boxes.KittiBox(0, index, label, (length, width, height), pose, (left, top, right, bottom)))

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.data.importers.options import ImportOptions
+
+
+@dataclass(frozen=True, slots=True)
+class LogFiles:
+    """What identifies the log that was chosen from a folder of many.
+
+    Args:
+        whole: files, and folders that count with everything in them.
+        entries: folders too large for that, of which only their own times count: these change when a file comes or goes.
+    """
+
+    whole: tuple[Path, ...]
+    entries: tuple[Path, ...] = ()
 
 
 def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
@@ -69,10 +83,17 @@ def whole_frames(
 
 
 def some_numbers(numbers: Sequence[int]) -> str:
-    """Frame numbers in words, a long list cut short."""
+    """Growing frame numbers in words: three or more in a row as first and last, a long list cut short."""
     if not numbers:
         return "none"
-    return ", ".join(str(n) for n in numbers[:8]) + (f", ... ({len(numbers)} in all)" if len(numbers) > 8 else "")
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    words = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
+    return ", ".join(words[:8]) + (f", ... ({len(numbers)} in all)" if len(words) > 8 else "")
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
@@ -88,7 +109,7 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
         UsageError: no such camera. InputError: none of the usual ones is there.
     """
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
-    words = ", ".join(f"{ours} ({theirs})" for theirs, ours in available.items()) or "no cameras"
+    words = ", ".join(o if o == t else f"{o} ({t})" for t, o in available.items()) or "no cameras"
     if not options.cameras:
         chosen = [name for name in available if name in usual]
         if not chosen:

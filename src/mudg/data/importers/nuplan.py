@@ -34,7 +34,7 @@ from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_cloud
 from mudg.data.importers.common import for_each, seconds
 from mudg.data.importers.images import ImageFit, brown_conrady, fit_images
-from mudg.data.importers.layout import chosen_cameras, refuse_options
+from mudg.data.importers.layout import LogFiles, chosen_cameras, refuse_options
 from mudg.data.importers.nuplan_log import NuplanCamera, NuplanCloud, NuplanLog, open_log
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scenefile import SceneWriter
@@ -121,6 +121,14 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
         "the folder holds several logs" if not log_name else "there is no such log", where=str(source),
         expected="--sequence with one of " + ", ".join(list(databases)[:8]), got=log_name or "none chosen",
     )  # fmt: skip
+
+
+def files_of_nuplan(source: Path, options: ImportOptions) -> LogFiles:
+    """The log's database, and which sensor blobs there are."""
+    path, _ = _find(source, options)
+    found = (folder / "sensor_blobs" / path.stem for folder in path.resolve().parents[:5])
+    blobs = next((folder for folder in found if folder.is_dir()), None)
+    return LogFiles((path,), tuple(sorted(blobs.iterdir())) if blobs is not None else ())
 
 
 def _blobs(path: Path, name: str) -> Path:
@@ -365,6 +373,8 @@ def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
 
 def _read_points(path: Path) -> SweepPoints:
     cloud = read_cloud(path)
+    if not len(cloud.xyz):
+        log.warn(f"nuplan: {path} has no points")
     intensity = cloud.fields.get("intensity")
     grey = np.zeros(len(cloud.xyz)) if intensity is None else np.clip(intensity.astype(np.float64) / 255, 0, 1)
     return SweepPoints(cloud.xyz.astype(np.float32), grey.astype(np.float32), np.zeros(len(cloud.xyz), np.float32))

@@ -29,14 +29,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log, store
+from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers import nuscenes_tables as tables
 from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -128,6 +129,16 @@ def _releases(source: Path) -> list[Path]:
     folders = [source, *sorted(source.glob("v1.0-*"))] if source.is_dir() else []
     found = [f for f in folders if (f / "scene.json").is_file() and (f / "sample_data.json").is_file()]
     return sorted(found, key=lambda folder: (folder / "scene.json").stat().st_size)
+
+
+def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
+    """The tables, and which files there are beside them: which of those belong to a scene only the large tables know."""
+    tables_of = tuple(table for folder in _releases(source) for table in sorted(folder.glob("*.json")))
+    if not tables_of:
+        return LogFiles((source,))
+    root = tables_of[0].parent.parent
+    sensors = [path for name in ("samples", "sweeps") for path in sorted(root.glob(f"{name}/*")) if path.is_dir()]
+    return LogFiles(tables_of, tuple(sensors))
 
 
 # --- one scene ------------------------------------------------------------------------------------------------------
@@ -377,23 +388,7 @@ def read_scan(path: Path) -> SweepPoints:
     Raises:
         InputError: cut off, not finite, or rings that no 32-beam sensor has.
     """
-    content = store.read_bytes(path)
-    if len(content) % 20:
-        raise InputError(
-            "sweep is cut off",
-            where=str(path),
-            expected="a multiple of 20 bytes (5 float32 a point)",
-            got=f"{len(content)} bytes",
-            remedy="copy the file again",
-        )
-    rows = np.frombuffer(content, "<f4").reshape(-1, 5).astype(np.float32)
-    if not np.isfinite(rows).all():
-        raise InputError(
-            "sweep holds values that are not finite",
-            where=str(path),
-            got=f"{int((~np.isfinite(rows).all(1)).sum())} of {len(rows)} points",
-            remedy="copy the file again",
-        )
+    rows = read_float_rows(path, 5, "sweep")
     rings = rows[:, 4]
     if len(rows) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
         raise InputError(

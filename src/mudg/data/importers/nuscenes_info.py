@@ -21,7 +21,7 @@ from mudg.base.types import EgoPath, Scene, Source, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import box_size, check_sides
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras
+from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.nuscenes import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scenefile import decode_image
@@ -46,6 +46,7 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import the one frame that ``source/info.json`` describes.
 
     Raises:
+        UsageError: a sequence was named: there is none.
         InputError: the record is incomplete, or an image or the sweep is missing or damaged.
     """
     path = source / "info.json"
@@ -59,6 +60,7 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
             remedy="give the folder that holds v1.0-*, samples and sweeps",
         )
     where = str(path)
+    refuse_options(options, "single-frame nuScenes", "sequence")
     try:
         record = json.loads(
             store.read_bytes(path)
@@ -109,6 +111,11 @@ def _tracks(meta: dict[str, Any], instances: list[dict[str, Any]], map_from_lida
         if int(item["bbox_label_3d"]) < 0:
             continue
         here = f"{where}: instances[{index}]"
+        if int(item["bbox_label_3d"]) not in names:
+            raise InputError(
+                "box has a class that metainfo.categories lacks", where=here, got=str(item["bbox_label_3d"]),
+                expected=", ".join(f"{number} ({name})" for number, name in names.items())[:200],
+            )  # fmt: skip
         x, y, z, length, width, height, yaw = (float(value) for value in item["bbox_3d"])
         size = box_size(length, width, height, here)
         if not np.isfinite([x, y, z, yaw]).all():

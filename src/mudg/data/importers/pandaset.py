@@ -38,7 +38,7 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, View
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.common import for_each, pose_from_quaternion, seconds
 from mudg.data.importers.images import ImageFit, fit_images
-from mudg.data.importers.layout import chosen_cameras, numbered_files, refuse_options, whole_frames
+from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, refuse_options, whole_frames
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.importers.pandas_frame import read_frame
 from mudg.data.scenefile import SceneWriter, decode_image
@@ -213,6 +213,11 @@ def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
     )  # fmt: skip
 
 
+def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen sequence's folder."""
+    return LogFiles((_chosen_sequence(source, options),))
+
+
 # --- poses and times ------------------------------------------------------------------------------------------------
 
 
@@ -370,6 +375,8 @@ def _numbers(frame: Mapping[str, NDArray[Any]], name: str, path: Path) -> NDArra
 def _read_points(path: Path, frame_s: float) -> dict[str, NDArray[np.float64]]:
     """Columns of one cloud: ``xyz`` f64[N, 3] in the data set's world, ``i`` 0..1, ``dt`` seconds, ``d`` 0 or 1."""
     frame = _columns(path, _POINT_COLUMNS)
+    if not len(frame["x"]):
+        log.warn(f"pandaset: {path} has no points")
     columns = {name: _numbers(frame, name, path) for name in _POINT_COLUMNS}
     dt_s = columns["t"] - frame_s
     if len(dt_s) and np.abs(dt_s).max() > MAX_POINT_DELAY_S:

@@ -33,8 +33,9 @@ from mudg.base.types import EgoPath, Scene, Source, View
 from mudg.data.importers import waymo_camera, waymo_lidar
 from mudg.data.importers.common import for_each, seconds
 from mudg.data.importers.images import ImageFit, fit_images
+from mudg.data.importers.layout import LogFiles, chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.importers.waymo_log import TOP, FrameContent, FrameRecord, LaserScan, Matrix, WaymoLog
+from mudg.data.importers.waymo_log import CAMERAS, TOP, FrameContent, FrameRecord, LaserScan, Matrix, WaymoLog
 from mudg.data.importers.waymo_tracks import (
     FAST_M_S,
     MOMENTS,
@@ -47,7 +48,7 @@ from mudg.data.importers.waymo_tracks import (
 )
 from mudg.data.importers.waymo_v1 import TfrecordLog
 from mudg.data.importers.waymo_v2 import REQUIRED, ParquetLog
-from mudg.data.scenefile import SceneWriter, decode_image
+from mudg.data.scenefile import SceneWriter
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
@@ -121,16 +122,26 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
 
 
 def _refuse_options(options: ImportOptions) -> None:
-    for name, given in (("--poses", options.poses), ("--boxes", options.boxes)):
-        if given is not None:
-            raise UsageError(
-                "Waymo logs hold their own poses and boxes", where=name, got=str(given), remedy="leave it out"
-            )
+    refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
         raise UsageError(
             "Waymo scans cannot be left twisted", where="--untwist", got="no", remedy="leave it out",
             expected="auto or yes: points carry the pose they were measured at",
         )  # fmt: skip
+
+
+def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen log's record file, or its tables."""
+    if source.is_file() or not source.is_dir():
+        return LogFiles((source,))
+    records = {path.stem: path for path in sorted(source.glob(f"*{_SUFFIX}"))}
+    if records:
+        return LogFiles((records[_choose(list(records), options.sequence, source)],))
+    segments = sorted({path.stem for path in source.glob("*/*.parquet")})
+    if not segments:
+        return LogFiles((source,))
+    segment = _choose(segments, options.sequence, source)
+    return LogFiles(tuple(sorted(source.glob(f"*/{segment}.parquet"))))
 
 
 # --- finding the log ------------------------------------------------------------------------------------------------
@@ -174,18 +185,13 @@ def _choose(names: Sequence[str], wanted: str, source: Path) -> str:
 
 def _chosen_cameras(waymo: WaymoLog, options: ImportOptions, source: Path) -> list[str]:
     recorded = {name for frame in waymo.frames for name in frame.shots}
-    there = [name for name in ("front", "front_left", "front_right", "side_left", "side_right") if name in recorded]
+    there = {name: name for name in CAMERAS.values() if name in recorded}
     if not there:
         raise InputError(
             "the log has no images", where=str(source), expected="images of the cameras",
             got=f"{len(waymo.frames)} frames with poses and boxes only", remedy="take the files with camera and LiDAR data",
         )  # fmt: skip
-    unknown = [name for name in options.cameras if name not in there]
-    if unknown:
-        raise UsageError(
-            "the log has no such camera", where=str(source), expected=", ".join(there), got=", ".join(unknown)
-        )
-    chosen = [name for name in there if name in options.cameras] or there
+    chosen = chosen_cameras(there, options, str(source), tuple(there))
     lacking = [name for name in chosen if name not in waymo.cameras]
     if lacking:
         raise InputError(
@@ -397,10 +403,8 @@ def _write_frame(writer: SceneWriter, plan: _Plan, frame: FrameRecord, content: 
             panoptic = content.panoptic[name]
             ids = waymo_camera.panoptic_ids(panoptic, fit.recorded, f"{where}: panoptic label")
             labels = waymo_camera.panoptic_labels(fit.ids(ids), panoptic.divisor)
-        image = content.images[name]
-        if fit.keeps_bytes:
-            decode_image(image, where, fit.recorded)  # refuses a damaged image with its place in the log
-        writer.add_frame(f"{name}/{index:06d}", plan.view(frame, name), fit.image(image, where), labels)
+        image = fit.image(content.images[name], where)
+        writer.add_frame(f"{name}/{index:06d}", plan.view(frame, name), image, labels)
     for name, scan in content.scans.items():
         points = _points(plan, frame, name, scan)
         sweep = waymo_lidar.sweep_points(

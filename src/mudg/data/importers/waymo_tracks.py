@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Track
+from mudg.data.importers.box_tracks import check_sides
 from mudg.data.importers.waymo_log import Matrix, WaymoBox
 
 Moment = Literal["seen", "start", "pose"]
@@ -63,7 +64,7 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
     second are added to either end with the object's velocity, or else images at the ends would lack the object.
 
     Raises:
-        InputError: a box without an id, two boxes of one id in a frame, or a class that changes.
+        InputError: a box without an id, two boxes of one id in a frame, a class that changes, or length and width are swapped.
     """
     members: dict[str, list[tuple[float, float, Matrix, WaymoBox]]] = {}
     images_s = {frame.time_s: frame.images_s or (frame.time_s, frame.time_s) for frame in frames}
@@ -99,6 +100,7 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
             name = f"{names[box_id]}.{part}" if part else names[box_id]
             ends = (images_s[float(times[piece[0]])][0], images_s[float(times[piece[-1]])][1])
             tracks.append(Track(name, labels[0], size, *_widened(times[piece], poses[piece], velocity[piece], ends)))
+    check_sides(tracks, frames[0].where if frames else "")
     notes = [f"{split} tracks are not seen for more than {MAX_GAP_S} s and were split"] if split else []
     unknown = sum(track.label == "unknown" for track in tracks)
     if unknown:

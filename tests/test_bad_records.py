@@ -1,0 +1,320 @@
+"""Clouds, boxes, poses, times, classes and file names that contradict a data set's rules, format by format.
+
+Cases that a format's own test has are not repeated; docs/ingest.md lists them all. What is refused leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import shutil
+import sqlite3
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bad_logs
+import kitti_folders
+import numpy as np
+import pytest
+import write_av2
+import write_dgp
+import write_nuscenes
+import write_waymo
+from bad_logs import NEEDS_PYARROW, Change
+from PIL import Image
+from roundtrip import needs_native
+
+from mudg.data.importers.options import ImportOptions
+
+pytestmark = needs_native
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bad_logs.shared(tmp_path_factory)
+
+
+def written(kind: str, folder: Path) -> bad_logs.Files | write_waymo.Log:
+    if kind in NEEDS_PYARROW:
+        pytest.importorskip("pyarrow")
+    return bad_logs.written(kind, folder)
+
+
+# --- clouds ---------------------------------------------------------------------------------------------------------------
+
+
+def npz(change: Callable[[bytes], bytes], member: str) -> Change:
+    """An archive with one member changed, its checksum made anew."""
+
+    def spoil(content: bytes) -> bytes:
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(buffer, "w") as new:
+            for name in old.namelist():
+                new.writestr(name, change(old.read(name)) if name == member else old.read(name))
+        return buffer.getvalue()
+
+    return spoil
+
+
+def tall(content: bytes) -> bytes:
+    """An array that says it has 10^12 rows; its header keeps its length."""
+    start, end = content.index(b"(") + 1, content.index(b",", content.index(b"("))
+    rows = b"1000000000000"
+    return (
+        content[:start]
+        + rows
+        + content[end : content.index(b"}") + 1]
+        + content[content.index(b"}") + 1 + len(rows) - (end - start) :]
+    )
+
+
+def flipped(at: float) -> Change:
+    """One bit changed, at a share of the length."""
+
+    def change(content: bytes) -> bytes:
+        place = int(len(content) * at)
+        return content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :]
+
+    return change
+
+
+CLOUDS: dict[tuple[str, str], tuple[Change, str]] = {
+    ("dgp", "declares 10^12 points"): (npz(tall, "data.npy"), "declared size"),
+    ("custom", "declares 10^12 points"): (npz(tall, "xyz.npy"), "declared size"),
+    ("dgp", "wrong checksum"): (flipped(0.5), "cut off"),
+    ("custom", "wrong checksum"): (flipped(0.5), "not a readable NPZ"),
+    ("pandaset", "wrong checksum"): (lambda c: c[:-8] + bytes([c[-8] ^ 1]) + c[-7:], "damaged"),
+    ("argoverse2", "no table"): (lambda c: b"FEA1" + c[4:], "no Feather table"),
+}
+
+
+@pytest.mark.parametrize(("kind", "case"), CLOUDS)
+def test_a_bad_cloud_is_refused_by_name(kind: str, case: str, folder: Path, tmp_path: Path) -> None:
+    log = written(kind, folder)
+    change, words = CLOUDS[kind, case]
+    with bad_logs.damaged(log, kind, "cloud", change, tmp_path) as (source, where):
+        bad_logs.assert_refused(kind, source, tmp_path, bad_logs.options_of(log), words, where)
+
+
+def test_a_missing_cloud_is_refused_where_the_log_names_it(folder: Path, tmp_path: Path) -> None:
+    log = written("dgp", folder)
+    assert isinstance(log, bad_logs.Files)
+    content = log.cloud.read_bytes()
+    log.cloud.unlink()
+    try:
+        error = bad_logs.assert_refused("dgp", log.source, tmp_path, ImportOptions(), "missing", "1.npz")
+    finally:
+        log.cloud.write_bytes(content)
+    assert "lidar lacks 1" in error.got
+
+
+# --- Waymo, both forms -------------------------------------------------------------------------------------------------------
+
+
+def swap_sides(log: write_waymo.Log) -> None:
+    """What a reader makes of boxes if it takes the field of the width for that of the length."""
+    for frame in log.frames:
+        for box in frame["boxes"]:
+            length, width, height = box["size"]
+            box["size"] = (width, length, height)
+
+
+def lying_shape(log: write_waymo.Log) -> None:
+    log.frames[1]["lasers"][0]["returns"][0] = Lying(log.frames[1]["lasers"][0]["returns"][0])
+
+
+class Lying(np.ndarray):
+    """A range image that tells of more rows than it has."""
+
+    def __new__(cls, image: np.ndarray) -> Lying:
+        return np.asarray(image).view(cls)
+
+    @property
+    def shape(self) -> tuple[int, ...]:  # type: ignore[override]
+        return (1 << 20, *super().shape[1:])
+
+
+WAYMO: dict[str, tuple[Callable[[write_waymo.Log], None], str]] = {
+    "width and length swapped": (swap_sides, "length and width of boxes are swapped"),
+    "range image declares more than it holds": (lying_shape, "wrong shape"),
+}
+
+
+@pytest.mark.parametrize("form", ["waymo v1", "waymo v2"])
+@pytest.mark.parametrize("case", WAYMO)
+def test_a_bad_waymo_record_is_refused(form: str, case: str, folder: Path, tmp_path: Path) -> None:
+    log = copy.deepcopy(written(form, folder))
+    assert isinstance(log, write_waymo.Log)
+    spoil, words = WAYMO[case]
+    spoil(log)
+    source = bad_logs.write_waymo_log(log, form, tmp_path / "log")
+    bad_logs.assert_refused(form, source, tmp_path, ImportOptions(), words, str(tmp_path))
+
+
+def test_a_page_of_a_waymo_table_that_does_not_fit_its_checksum_is_refused(folder: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    log = written("waymo v2", folder)
+    assert isinstance(log, write_waymo.Log)
+    source = bad_logs.write_waymo_log(log, "waymo v2", tmp_path / "log")
+    table = next((source / "camera_image").iterdir())
+    parquet.write_table(
+        parquet.read_table(table), table, compression="none", use_dictionary=False, write_page_checksum=True
+    )
+    content = table.read_bytes()
+    at = content.index(b"IDAT") + 20
+    table.write_bytes(content[:at] + bytes([content[at] ^ 8]) + content[at + 1 :])
+    bad_logs.assert_refused("waymo v2", source, tmp_path, ImportOptions(), "cannot be read", table.name)
+
+
+# --- records of the others ------------------------------------------------------------------------------------------------
+
+
+def label(change: Callable[[list[str]], None]) -> Callable[[Path], None]:
+    """Change the words of every KITTI label."""
+
+    def spoil(root: Path) -> None:
+        path = root / "derived" / "label_02.txt"
+        rows = [line.split() for line in path.read_text().splitlines()]
+        for row in rows:
+            change(row)
+        path.write_text("\n".join(" ".join(row) for row in rows) + "\n")
+
+    return spoil
+
+
+def swap_label(row: list[str]) -> None:
+    row[11], row[12] = row[12], row[11]  # width and length
+
+
+def times(factor: float) -> Callable[[Path], None]:
+    return lambda root: (
+        (root / "times.txt").write_text("\n".join(str(0.1 * n * factor) for n in range(6)) + "\n") and None
+    )
+
+
+def nuplan(question: str) -> Callable[[Path], None]:
+    def spoil(root: Path) -> None:
+        connection = sqlite3.connect(next(root.rglob("*.db")))
+        connection.execute(question)
+        connection.commit()
+        connection.close()
+
+    return spoil
+
+
+def nuscenes(table: str, change: Callable[[list[dict[str, Any]]], None]) -> Callable[[Path], None]:
+    return lambda root: write_nuscenes.edit(root, table, change)
+
+
+def backslashes(rows: list[dict[str, Any]]) -> None:
+    for row in rows:
+        row["filename"] = row["filename"].replace("/", "\\")
+
+
+def dgp(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    return lambda root: write_dgp.edit(root / file, lambda record: [change(record), None][1])
+
+
+def kitti_frame(root: Path, name: str = "000008.png", label_number: int = 2) -> None:
+    """A KITTI frame described by info.json."""
+    Image.fromarray(kitti_folders.image(1)).save(root / "000008.png")
+    np.array([[10.0, 0, 0, 0.5]], "<f4").tofile(root / "000008.bin")
+    box = {"bbox_3d": [0, 1.6, 10, 4, 1.5, 1.8, 0], "bbox_label_3d": label_number, "bbox": [1, 2, 3, 4]}
+    images = {"CAM2": {"img_path": name, "cam2img": kitti_folders.projection(2).tolist(),
+                       "lidar2cam": kitti_folders.RECT0_FROM_VELO.tolist()}}  # fmt: skip
+    sample = {"images": images, "lidar_points": {"lidar_path": "000008.bin"}, "instances": [box]}
+    (root / "info.json").write_text(json.dumps({"data_list": [sample]}))
+
+
+def only(spoil: Callable[[Path], None]) -> Callable[[Path], None]:
+    """A folder made anew instead of a damaged copy."""
+
+    def fresh(root: Path) -> None:
+        shutil.rmtree(root)
+        root.mkdir()
+        spoil(root)
+
+    return fresh
+
+
+RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
+    # format and what is wrong: (how the log is damaged, words of the error, the place it names)
+    ("kitti", "times in milliseconds"): (times(1000), "another unit", "drive|kitti"),
+    ("kitti", "times in microseconds"): (times(1e6), "another unit", "kitti"),
+    ("kitti", "width and length swapped"): (label(swap_label), "swapped", "label_02.txt"),
+    ("kitti", "Windows path"): (only(lambda r: kitti_frame(r, "images\\000008.png")), "backslash", "info.json: img_path"),
+    ("kitti", "class that does not exist"): (
+        only(lambda r: kitti_frame(r, label_number=11)), "class that does not exist", r"instances\[0\]"),
+    ("nuscenes", "Windows path"): (nuscenes("sample_data", backslashes), "backslash", "sample_data.json: record"),
+    ("nuplan", "Windows path"): (
+        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"), "leads out of", "image at"),
+    ("nuplan", "width and length swapped"): (nuplan("UPDATE lidar_box SET width = length, length = width"), "swapped", "lidar_box"),
+    ("dgp", "Windows path"): (
+        dgp("scene_abc.json", lambda r: [
+            d["datum"]["point_cloud"].update(filename=d["datum"]["point_cloud"]["filename"].replace("/", "\\"))
+            for d in r["data"] if "point_cloud" in d["datum"]
+        ]), "backslash", "datum LIDAR"),
+    ("dgp", "times of another century"): (
+        dgp("scene_abc.json", lambda r: [d["id"].update(timestamp="1970-01-18T20:00:00.123456Z") for d in r["data"]]),
+        "another unit", "scene_abc.json"),
+    ("dgp", "missing image"): (lambda r: (r / "rgb/FRONT/1.png").unlink(), "missing", "1.png"),
+    ("nuscenes", "missing image"): (lambda r: bad_logs.second(r / "samples/CAM_FRONT").unlink(), "missing", "CAM_FRONT"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "case"), RECORDS)
+def test_a_bad_record_is_refused_by_name(kind: str, case: str, folder: Path, tmp_path: Path) -> None:
+    log = written(kind, folder)
+    assert isinstance(log, bad_logs.Files)
+    spoil, words, where = RECORDS[kind, case]
+    whole = folder / kind
+    root = shutil.copytree(whole, tmp_path / kind)
+    spoil(root)
+    bad_logs.assert_refused(
+        kind, root / log.source.relative_to(whole), tmp_path, bad_logs.options_of(log), words, where
+    )
+
+
+# --- taken, and said ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_class_of_kitti_keeps_its_name_and_is_noted(folder: Path, tmp_path: Path) -> None:
+    log = written("kitti", folder)
+    assert isinstance(log, bad_logs.Files)
+    root = shutil.copytree(log.source, tmp_path / "kitti")
+    label(lambda row: row.__setitem__(2, "Hoverboard"))(root)
+    scene = bad_logs.ingest("kitti", root, tmp_path / "out", ImportOptions())
+    assert scene.tracks[0].label == "hoverboard"
+    assert any("not known here" in note and "'hoverboard' (6 boxes)" in note for note in scene.source.notes)
+
+
+def test_rows_in_any_order_give_the_same_scene(folder: Path, tmp_path: Path) -> None:
+    """Tables and lists whose order means nothing: poses and boxes of Argoverse 2, samples of DGP."""
+    pytest.importorskip("pyarrow")
+    for kind, spoil in (
+        ("argoverse2", reversed_tables),
+        ("dgp", dgp("scene_abc.json", lambda r: r["samples"].reverse())),
+    ):
+        log = written(kind, folder)
+        assert isinstance(log, bad_logs.Files)
+        options = bad_logs.options_of(log)
+        plain = bad_logs.ingest(kind, log.source, tmp_path / f"{kind} plain", options)
+        root = shutil.copytree(log.source, tmp_path / kind)
+        spoil(root)
+        other = bad_logs.ingest(kind, root, tmp_path / f"{kind} other", options)
+        assert [frame.id for frame in other.frames] == [frame.id for frame in plain.frames]
+        for one, two in zip(plain.frames, other.frames, strict=True):
+            assert np.array_equal(one.view.world_from_cam, two.view.world_from_cam)
+        places = [
+            {track.id: track.world_from_object[:, :3, 3].round(9).tolist() for track in scene.tracks}
+            for scene in (plain, other)
+        ]
+        assert places[0] == places[1]
+
+
+def reversed_tables(root: Path) -> None:
+    for name in ("city_SE3_egovehicle.feather", "annotations.feather"):
+        write_av2.edit(root / name, lambda c: c.update({key: values[::-1] for key, values in c.items()}))

@@ -1,0 +1,296 @@
+"""Waymo importer: damaged, contradictory and incomplete logs of both formats."""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import roundtrip
+import waymo_logs
+import write_waymo as made
+from waymo_logs import ingest, write
+
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.data.importers import (
+    RECOGNISERS,
+    waymo_log,
+    waymo_tfrecord,
+)
+from mudg.data.importers.waymo_v2 import Table
+from mudg.data.scenefile import read_points
+
+
+@pytest.fixture
+def bare(tmp_path_factory: pytest.TempPathFactory) -> made.Log:
+    return waymo_logs.bare(tmp_path_factory)
+
+
+def spoil_scale(log: made.Log) -> None:
+    log.cameras[0]["extrinsic"] = log.cameras[0]["extrinsic"] * [[2.0], [2], [2], [1]]
+
+
+def spoil_hand(log: made.Log) -> None:
+    log.lasers[0]["extrinsic"] = log.lasers[0]["extrinsic"] @ np.diag([1, -1, 1, 1.0])
+
+
+def spoil_order(log: made.Log) -> None:
+    log.frames[1], log.frames[2] = log.frames[2], log.frames[1]
+
+
+def spoil_unit(log: made.Log) -> None:
+    for frame in log.frames:
+        frame["timestamp_us"] //= 1000
+
+
+def spoil_image_clock(log: made.Log) -> None:
+    log.frames[2]["images"][1]["pose_time"] *= 1e3
+
+
+def spoil_box(log: made.Log) -> None:
+    log.frames[1]["boxes"][0]["size"] = (4.0, -2.0, 1.5)
+
+
+def spoil_rows(log: made.Log) -> None:
+    log.lasers[0]["inclinations"] = log.lasers[0]["inclinations"][:-1]
+
+
+def spoil_numbers(log: made.Log) -> None:
+    log.frames[3]["lasers"][0]["returns"][0][0, 0, 0] = np.inf
+
+
+def spoil_image(log: made.Log) -> None:
+    log.frames[1]["images"][0]["image"] = log.frames[1]["images"][0]["image"][:300]
+
+
+def spoil_camera(log: made.Log) -> None:
+    del log.frames[2]["images"][1]
+
+
+def spoil_laser(log: made.Log) -> None:
+    del log.frames[2]["lasers"][0]
+
+
+def spoil_calibration(log: made.Log) -> None:
+    del log.cameras[1]
+
+
+def spoil_laser_calibration(log: made.Log) -> None:
+    log.lasers[0]["number"] = 9
+
+
+def spoil_pixel_poses(log: made.Log) -> None:
+    log.frames[2]["lasers"][0]["poses"] = log.frames[2]["lasers"][0]["poses"][:, ::2]
+
+
+def spoil_exposure(log: made.Log) -> None:
+    log.frames[0]["images"][0]["shutter"] = 0.5
+
+
+def spoil_twice(log: made.Log) -> None:
+    log.frames[1]["lasers"].append(log.frames[1]["lasers"][0])
+
+
+def spoil_two_images(log: made.Log) -> None:
+    log.frames[1]["images"][1]["number"] = 1
+
+
+def spoil_intrinsics(log: made.Log) -> None:
+    log.cameras[0]["intrinsic"][2] = np.nan
+
+
+BOTH = {
+    spoil_scale: "pose is scaled", spoil_hand: "left-handed", spoil_unit: "not of one time", spoil_image_clock: "not of one time",
+    spoil_box: "box makes no sense", spoil_rows: "row for every beam", spoil_numbers: "not finite", spoil_image: "cannot be decoded",
+    spoil_camera: "frame lacks images or scans", spoil_laser: "frame lacks images or scans", spoil_calibration: "no calibration",
+    spoil_laser_calibration: "no calibration", spoil_pixel_poses: "differ in size", spoil_exposure: "exposure times contradict",
+    spoil_intrinsics: "intrinsics", spoil_twice: "two scans of one LiDAR", spoil_two_images: "two images of one camera",
+}  # fmt: skip
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+@pytest.mark.parametrize("spoil", BOTH, ids=lambda function: function.__name__)
+def test_what_makes_no_sense_is_refused(
+    spoil: Callable[[made.Log], None], form: str, bare: made.Log, tmp_path: Path
+) -> None:
+    spoil(bare)
+    with pytest.raises(InputError, match=BOTH[spoil]) as caught:
+        ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene")
+    assert str(tmp_path) in caught.value.where
+    assert list(tmp_path.iterdir()) == [tmp_path / "log"]
+
+
+@roundtrip.needs_native
+def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(bare: made.Log, tmp_path: Path) -> None:
+    spoil_order(bare)
+    with pytest.raises(InputError, match="timestamps do not increase"):
+        ingest(write(bare, "v1", tmp_path / "one"), tmp_path / "a")
+    scene = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b")
+    assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx(0.05 + np.arange(5) * 0.1, abs=1e-6)
+    bare.frames[3]["timestamp_us"] = bare.frames[2]["timestamp_us"]
+    with pytest.raises(InputError, match="a frame twice"):
+        ingest(write(bare, "v2", tmp_path / "three"), tmp_path / "c")
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_incomplete_frames_are_left_out_when_asked(form: str, bare: made.Log, tmp_path: Path) -> None:
+    spoil_camera(bare)
+    bare.frames[4]["lasers"] = []
+    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene", skip_missing=True)
+    assert len(scene.sweeps) == 3
+    assert any("frames 2, 4 lack" in note for note in scene.source.notes)
+    only = ingest(write(bare, form, tmp_path / "log"), tmp_path / "other", cameras=("front",), frames=(0, 4))
+    assert len(only.frames) == 4  # the missing image is of a camera that was not asked for
+
+
+@roundtrip.needs_native
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
+    form: str, bare: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for image in bare.frames[1]["lasers"][0]["returns"]:
+        image[..., 0] = -1
+    bare.frames[0]["boxes"][0]["id"] = "_odd"
+    bare.frames[0]["boxes"][0]["type"] = 9
+    odd = dict(bare.frames[0]["images"][0], number=7)
+    bare.frames[0]["images"].append(odd)
+    bare.frames[0]["lasers"].append({"number": 8, "returns": bare.frames[0]["lasers"][0]["returns"], "poses": None})
+    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene")
+    assert len(read_points(scene, scene.sweeps[1]).xyz) == 0
+    assert "has no points" in capsys.readouterr().err
+    assert scene.track("t_odd").label == "unknown"
+    assert len(scene.frames) == 10
+    assert len(scene.sweeps) == 5
+
+
+def tfrecord(log: made.Log, tmp_path: Path) -> tuple[Path, bytearray]:
+    path = write(log, "v1", tmp_path / "log")
+    return path, bytearray(path.read_bytes())
+
+
+@roundtrip.needs_native
+def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: Path) -> None:
+    path, content = tfrecord(bare, tmp_path)
+    places = list(waymo_tfrecord.record_places(path))
+    third = places[2].offset
+    cases: list[tuple[bytes, str]] = [
+        (bytes(content[: third + 500]), "cut off"),
+        (bytes(content[: third + 5]), "cut off"),
+        (
+            bytes(content[: third + 100]) + bytes([content[third + 100] ^ 1]) + bytes(content[third + 101 :]),
+            "do not fit their checksum",
+        ),
+        (bytes(content[:third]) + bytes([content[third] ^ 1]) + bytes(content[third + 1 :]), "header is damaged"),
+    ]
+    huge = struct.pack("<Q", 1 << 50)
+    cases.append(
+        (
+            bytes(content[:third]) + huge + struct.pack("<I", made.masked(huge)) + bytes(content[third + 12 :]),
+            "no frame has",
+        )
+    )
+    for spoilt, word in cases:
+        path.write_bytes(spoilt)
+        with pytest.raises(InputError, match=word) as caught:
+            ingest(path, tmp_path / "scene")
+        assert f"record 2 at byte {third}" in caught.value.where
+    path.write_bytes(cases[2][0])
+    assert len(ingest(path, tmp_path / "scene", frames=(0, 2)).sweeps) == 2  # what is not asked for need not be whole
+
+
+@roundtrip.needs_native
+def test_files_of_another_kind_are_refused(bare: made.Log, tmp_path: Path) -> None:
+    path = tmp_path / "a.tfrecord"
+    for content, word in ((b"<html>not here</html>", "not a TFRecord"), (b"\x1f\x8b" + bytes(40), "compressed"), (b"", "no frames"),
+                          (made.record(b"\x0a\x05ab"), "cannot be decoded"), (made.record(b""), "transform is incomplete")):  # fmt: skip
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=word):
+            ingest(path, tmp_path / "scene")
+    path.write_bytes(
+        b"".join(made.record(made.frame_message(one, bare.frames[n])) for n, one in enumerate((bare, bare)))
+    )
+    bare.name = "another"
+    path.write_bytes(path.read_bytes() + made.record(made.frame_message(bare, bare.frames[2])))
+    with pytest.raises(InputError, match="mixes two logs"):
+        ingest(path, tmp_path / "scene")
+    with pytest.raises(InputError, match="no frames"):
+        ingest(path, tmp_path / "scene", frames=(7, 9))
+
+
+def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    float_image = waymo_log.float_image
+    whole = made.matrix_float(np.ones((2, 3, 4), np.float32))
+    assert float_image(whole, 4, "x").shape == (2, 3, 4)
+    with pytest.raises(InputError, match="wrong shape"):
+        float_image(whole, 6, "x")
+    with pytest.raises(InputError, match="cut off"):
+        float_image(whole[:-6], 4, "x")
+    with pytest.raises(InputError, match="cannot be unpacked"):
+        float_image(b"nonsense", 4, "x")
+    monkeypatch.setattr(waymo_log, "MAX_UNPACKED_BYTES", 1 << 20)
+    bomb = zlib.compress(bytes(2 << 20), 1)
+    with pytest.raises(InputError, match="unpacks to more"):
+        float_image(bomb, 4, "x")
+    lying = made.text(1, bytes(16)) + made.text(2, b"".join(made.number(1, n) for n in (1 << 20, 1 << 20, 4)))
+    with pytest.raises(InputError, match="wrong shape"):
+        float_image(zlib.compress(lying), 4, "x")
+
+
+@roundtrip.needs_native
+def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write(bare, "v2", tmp_path / "log")
+    table = root / "lidar" / f"{bare.name}.parquet"
+    whole = table.read_bytes()
+    table.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="Parquet file cannot be read"):
+        ingest(root, tmp_path / "scene")
+    (root / "lidar_box" / f"{bare.name}.parquet").rename(table)
+    with pytest.raises(InputError, match="lacks columns"):
+        ingest(root, tmp_path / "scene")
+    table.write_bytes(whole)
+    pose = root / "lidar_pose" / f"{bare.name}.parquet"
+    pose.rename(root / "away")
+    with pytest.raises(InputError, match="pixel poses are missing"):
+        ingest(root, tmp_path / "scene")
+    (root / "away").rename(pose)
+    (root / "camera_calibration" / f"{bare.name}.parquet").unlink()
+    with pytest.raises(InputError, match="a component of the log is missing"):
+        ingest(root, tmp_path / "scene")
+    pyarrow = pytest.importorskip("pyarrow")
+    holes = pyarrow.table({"a": [1, None, 3]})
+    pytest.importorskip("pyarrow.parquet").write_table(holes, tmp_path / "holes.parquet")
+    with pytest.raises(InputError, match="empty value") as hole:
+        Table(tmp_path / "holes.parquet").columns(("a",))
+    assert hole.value.where.endswith("row 1")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ResourceError, match="pyarrow") as caught:
+        Table(pose)
+    assert "mudg[data]" in caught.value.remedy
+
+
+@roundtrip.needs_native
+def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    names = [f"segment-{n}_with_camera_labels" for n in ("111_2", "222_3")]
+    for name in names:
+        made.write_tfrecord(bare, folder / f"{name}.tfrecord")
+    with pytest.raises(UsageError, match="several logs") as caught:
+        ingest(folder, tmp_path / "scene")
+    assert all(name in caught.value.expected for name in names)
+    with pytest.raises(UsageError, match="no logs have such a name"):
+        ingest(folder, tmp_path / "scene", sequence="333")
+    assert len(ingest(folder, tmp_path / "scene", sequence="222", frames=(0, 1)).frames) == 2
+    assert RECOGNISERS["waymo"](folder)
+    assert RECOGNISERS["waymo"](folder / f"{names[0]}.tfrecord")
+    assert not RECOGNISERS["waymo"](tmp_path)
+    for options in ({"poses": tmp_path}, {"boxes": tmp_path}, {"untwist": "no"}):
+        with pytest.raises(UsageError):
+            ingest(folder, tmp_path / "other", **options)
+    with pytest.raises(InputError, match="no Waymo log found"):
+        ingest(tmp_path / "scene", tmp_path / "other")
