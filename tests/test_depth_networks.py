@@ -25,6 +25,7 @@ from mudg.models.depth_networks import (
     load_depth_network,
     residual_confidence,
 )
+from mudg.models.folders import Place
 from mudg.models.marigold import Marigold
 
 RULES = CompletionRules()
@@ -219,6 +220,25 @@ def test_guidance_brings_marigold_nearer_to_the_returns(tmp_path: Path) -> None:
         return fit.residual if np.isfinite(fit.residual) else 1.0
 
     assert error(True) < 0.7 * error(False)
+
+
+@real_packages
+def test_bfloat16_gives_nearly_the_same(tmp_path: Path) -> None:
+    tiny_networks.depth_anything(tmp_path / "a", with_lidar=True)
+    tiny_networks.marigold(tmp_path / "b", longest_px=24)
+    given, _ = street(16, 24)
+    for folder, options in (("a", DepthOptions()), ("b", DepthOptions(guided=True, steps=2))):
+        exact = load_depth_network(tmp_path / folder, Place("cpu"), options)(given).values
+        rounded = load_depth_network(tmp_path / folder, Place("cpu", bf16=True), options)(given).values
+        assert rounded.dtype == np.float32
+        assert 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
+
+
+def test_a_missing_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ResourceError, match="CUDA"):
+        Place("cuda").ready()
+    assert Place().ready() == torch.device("cpu")
 
 
 @real_packages

@@ -84,7 +84,7 @@ class Marigold:
         index = folders.read_settings(path / "model_index.json")
         diffusers, transformers = folders.diffusers_package(), folders.transformers_package()
         text = folders.load_network(folders.member(transformers, "CLIPTextModel"), path, place, "text_encoder")
-        with torch.inference_mode():
+        with torch.no_grad():
             empty_text = text(_empty_tokens(path).to(place.device))[0].float()
         parts = Parts(
             folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet"),
