@@ -18,6 +18,7 @@ from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import EgoPath, Ref, Source, Sweep, View
 from mudg.core.complete import ray_elevation
 from mudg.data.scenefile import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
+from mudg.models.depth_networks import Prediction
 from mudg.models.labellers import (
     LABELLERS,
     TRAIN_ID_OF,
@@ -29,7 +30,7 @@ from mudg.models.labellers import (
     label_by_geometry,
     labeller,
 )  # fmt: skip
-from mudg.stages import annotate
+from mudg.stages import annotate, annotate_depth
 from mudg.stages.annotate_ego import steady_bottom
 from mudg.stages.annotate_points import nearest_sweeps
 from mudg.stages.config import AnnotateConfig
@@ -304,6 +305,51 @@ def test_sweeps_nearest_in_time_are_chosen() -> None:
     assert [s.time_s for s in nearest_sweeps(sweeps, 0.96, 4)] == pytest.approx([0.8, 0.9, 1.0, 1.1])
     assert [s.time_s for s in nearest_sweeps(sweeps, 3.85, 6)] == pytest.approx([1.9])
     assert nearest_sweeps(sweeps, 9.0, 6) == []
+
+
+def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One frame's network answers an affine map of the true depth, the other's nonsense: the one is used, the other counted."""
+    street = replace(STREET, times=(0.0, 0.1))
+    street.write(tmp_path / "plain", labels=False, width=96, height=48)
+    plain = read_scene(tmp_path / "plain")
+    truth = {f.id: np.minimum(street.image(f.view)[2], 100).astype(np.float32) for f in plain.frames}
+    answers = iter([0.02 * truth[plain.frames[0].id] + 3, np.full((48, 96), 7, np.float32)])
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "config.json").write_text('{"model_type": "depth_anything"}')
+    network = lambda given: Prediction(next(answers), "depth")  # noqa: E731
+    monkeypatch.setattr(annotate_depth, "load", lambda config: network if config.depth_network else None)
+    config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
+    scene = read_scene(annotate.run(config, tmp_path / "plain", tmp_path / "out"))
+    by_points = read_scene(annotate.run(AnnotateConfig(processes=1), tmp_path / "plain", tmp_path / "filled"))
+    first, second = (read_label(scene, frame, "depth") for frame in scene.frames)
+    seen = ~read_label(scene, scene.frames[0], "sky").astype(bool) & np.isfinite(street.image(plain.frames[0].view)[2])
+    assert np.median(np.abs(first / truth[plain.frames[0].id] - 1)[seen]) < 1e-2
+    assert (first[read_label(scene, scene.frames[0], "sky").astype(bool)] == 100).all()
+    assert np.array_equal(second, read_label(by_points, by_points.frames[1], "depth"))
+    (note,) = [note for note in scene.source.notes if note.startswith("depth of 2 frames")]
+    assert "network 'depth_anything' in folder 'weights' (sha256 " in note
+    assert "1 of them, where it did not fit" in note
+    assert not list((tmp_path / "out").rglob("*.filled.json"))
+    (tmp_path / "weights" / "model.safetensors").write_bytes(b"other weights")
+    with pytest.raises(UsageError, match="depth_network"):
+        annotate.run(config, tmp_path / "plain", tmp_path / "out")
+
+
+def test_a_frame_without_lidar_keeps_its_depth(tmp_path: Path) -> None:
+    given = replace(given_at(STREET)[0], xyz_world=np.zeros((0, 3), np.float32))
+    labels = label_by_geometry(given)
+    assert (
+        annotate_depth.with_network(lambda _: pytest.fail("asked"), given, labels, "front/000000", tmp_path) is labels
+    )
+    assert (tmp_path / "front" / "000000.filled.json").is_file()
+
+
+def test_a_depth_network_needs_depth_and_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no depth is asked for"):
+        annotate_depth.digests(AnnotateConfig(depth=False, depth_network="x"))
+    with pytest.raises(ResourceError, match="weights"):
+        annotate_depth.digests(AnnotateConfig(depth_network=str(tmp_path)))
+    assert annotate_depth.digests(AnnotateConfig()) == {}
 
 
 def test_bonnet_is_what_stays_the_same() -> None:

@@ -1,25 +1,31 @@
 """Segmentation networks from a folder: what is asked of the transformers package, and what is made of its answers.
 
-A stand-in with the package's names and output fields takes the place of the package, which is an extra.
+Networks whose answer is known, under the package's names and output fields, show that classes arrive where they belong. Tiny random
+networks of the package itself show that it is asked as it wants to be; they need the extra ``models``.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from tiny_networks import NAMES as TINY_NAMES
+from tiny_networks import eomt, mask2former, segformer
 
 from mudg.base.errors import InputError, ResourceError
-from mudg.base.palette import ID, UNLABELLED
+from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.models import segmenters
 from mudg.models.segmenters import KINDS, Segmenter, match_classes, tile_starts
 
 NAMES = {"0": "Road", "1": "traffic light", "2": "sky", "3": "unicorn"}
+SQUARE_PX = 64
 MEAN, DEVIATION = [0.5, 0.5, 0.5], [0.25, 0.25, 0.25]
 
 
@@ -29,16 +35,15 @@ def scores(pixels: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.avg_pool2d(torch.cat([rgb, torch.zeros_like(rgb[:, :1])], 1) * 12, 4)
 
 
-class Network:
+class Network(torch.nn.Module):
     """The parts of a network of transformers that are used."""
 
     def __init__(self, masks: bool) -> None:
+        super().__init__()
         self.masks, self.seen = masks, []
+        self.config = SimpleNamespace(image_size=SQUARE_PX)
 
-    def eval(self) -> Network:
-        return self
-
-    def __call__(self, pixel_values: torch.Tensor) -> SimpleNamespace:
+    def forward(self, pixel_values: torch.Tensor) -> SimpleNamespace:
         self.seen.append(tuple(pixel_values.shape))
         logits = scores(pixel_values)
         if not self.masks:
@@ -62,11 +67,11 @@ def package(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, dict[str, b
     module = ModuleType("transformers")
     for kind, row in KINDS.items():
 
-        def from_pretrained(path: str, _kind: str = kind, **named: bool) -> Network:
+        def from_pretrained(path: str, _kind: str = kind, **named: bool) -> tuple[Network, dict[str, list[str]]]:
             loaded.append((_kind, path, named))
-            return Network(masks=_kind != "segformer")
+            return Network(masks=_kind != "segformer"), {"missing_keys": []}
 
-        setattr(module, row.class_name, SimpleNamespace(from_pretrained=from_pretrained))
+        setattr(module, row.class_name, type(row.class_name, (), {"from_pretrained": staticmethod(from_pretrained)}))
     monkeypatch.setitem(sys.modules, "transformers", module)
     return loaded
 
@@ -87,7 +92,8 @@ def test_classes_come_out_by_name_whole_and_in_tiles(
     monkeypatch.setattr(segmenters, "TILE_PX", tile_px)
     folder = folder_of(tmp_path, kind)
     ids, confidence = Segmenter.load(folder).classes(flag())
-    assert package == [(kind, str(folder), {"local_files_only": True, "use_safetensors": True})]
+    asked = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
+    assert package == [(kind, str(folder), asked)]
     for stripe, name in enumerate(("road", "traffic light", "sky")):
         inner = np.s_[:, 32 * stripe + 6 : 32 * stripe + 26]
         assert (ids[inner] == ID[name]).all()
@@ -96,6 +102,73 @@ def test_classes_come_out_by_name_whole_and_in_tiles(
     assert confidence.dtype == np.float32
     assert ((confidence >= 0) & (confidence <= 1)).all()
     assert confidence[:, 31].max() < confidence[:, 10].min()  # less sure at the edge of a stripe
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("make", "size"), [(segformer, (64, 96)), (segformer, (45, 70)), (mask2former, (64, 96)),
+                                            (mask2former, (45, 70)), (eomt, (64, 64))])  # fmt: skip
+def test_real_networks_answer_as_the_package_says(
+    make: Callable[[Path], Any], size: tuple[int, int], tmp_path: Path
+) -> None:
+    """One tile, against the package's own reading of its outputs, its post-processing."""
+    network = make(tmp_path)
+    rgb = np.random.default_rng(4).integers(0, 255, (*size, 3), np.uint8)
+    ids, confidence = Segmenter.load(tmp_path).classes(rgb)
+    pixels = torch.from_numpy(rgb).permute(2, 0, 1)[None] / 255
+    mean, deviation = (torch.tensor(v)[None, :, None, None] for v in ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]))
+    with torch.inference_mode():
+        output = network(pixel_values=(pixels - mean) / deviation)
+    if make is segformer:
+        logits = torch.nn.functional.interpolate(output.logits, size=size, mode="bilinear")
+        expected = logits.softmax(1)[0]
+    else:
+        shares = output.class_queries_logits.softmax(-1)[0, :, : len(TINY_NAMES)]
+        masks = torch.nn.functional.interpolate(output.masks_queries_logits, size=size, mode="bilinear").sigmoid()[0]
+        expected = torch.einsum("qc,qhw->chw", shares, masks)
+        expected = expected / expected.sum(0)
+    best, which = expected[:3].max(0)  # the fourth is no class of ours
+    ours = np.array([ID[TINY_NAMES[n].lower()] for n in range(3)])[which.numpy()]
+    clear = (expected[:3].sort(0).values.diff(dim=0)[-1] > 1e-4).numpy()
+    assert clear.mean() > 0.9
+    assert (ids == ours)[clear].all()
+    np.testing.assert_allclose(confidence, best.numpy(), atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("make", [segformer, mask2former, eomt])
+def test_real_networks_read_images_of_any_size_in_tiles(
+    make: Callable[[Path], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(segmenters, "TILE_PX", 64)
+    make(tmp_path)
+    segmenter = Segmenter.load(tmp_path)
+    for size in ((50, 77), (100, 150)):
+        ids, confidence = segmenter.classes(np.random.default_rng(5).integers(0, 255, (*size, 3), np.uint8))
+        assert ids.shape == confidence.shape == size
+        assert np.isfinite(confidence).all()
+        assert set(np.unique(ids)) <= {ID[TINY_NAMES[n].lower()] for n in range(3)}
+        assert int(ids.max()) < len(CLASSES)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_network_without_its_head_is_refused(tmp_path: Path) -> None:
+    """As pretrained backbones are published: the package would leave the head random."""
+    segformer(tmp_path).segformer.save_pretrained(str(tmp_path))
+    settings = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps({**settings, "id2label": NAMES}))
+    with pytest.raises(InputError, match="decode_head"):
+        Segmenter.load(tmp_path)
+
+
+def test_squares_are_scaled_to_the_network(package: list, tmp_path: Path) -> None:
+    """EoMT reads squares of one size: an image of other size is scaled, and its classes come back at its own size."""
+    segmenter = Segmenter.load(folder_of(tmp_path, "eomt"))
+    large = flag().repeat(3, 0).repeat(3, 1)
+    ids, _ = segmenter.classes(large)
+    assert ids.shape == (192, 288)
+    assert set(segmenter._network.seen) == {(2, 3, SQUARE_PX, SQUARE_PX)}
+    for stripe, name in enumerate(("road", "traffic light", "sky")):
+        assert (ids[:, 96 * stripe + 20 : 96 * stripe + 76] == ID[name]).all()
 
 
 def test_tiles_cover_everything_and_overlap() -> None:

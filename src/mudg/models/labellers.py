@@ -30,6 +30,7 @@ from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Track, View
 from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation, visible_depth
 from mudg.core.fusion import points_in_box
+from mudg.models.folders import CPU, Place
 
 TRAIN_ID_OF: Final[Mapping[str, int]] = {
     "car": ID["car"], "van": ID["car"], "vehicle": ID["car"], "misc": ID["car"], "truck": ID["truck"], "bus": ID["bus"],
@@ -155,18 +156,22 @@ def _with_surface(
 Labeller = Callable[[LabelInput], Labels]
 
 
-def _network(weights: str) -> Labeller:
+def _network(weights: str, place: Place) -> Labeller:
     from mudg.models.segmenters import Segmenter
 
-    segmenter = Segmenter.load(weights)
+    segmenter = Segmenter.load(weights, place)
     return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
 
 
-LABELLERS: Mapping[str, Callable[[str], Labeller]] = {"geometry": lambda _: label_by_geometry, "network": _network}
-"""Name -> what makes a labeller of one image from a folder of weights (unused by those that hold no parameters)."""
+LABELLERS: Mapping[str, Callable[[str, Place], Labeller]] = {
+    "geometry": lambda *_: label_by_geometry,
+    "network": _network,
+}
+"""Name -> what makes a labeller of one image from a folder of weights and a place to compute (unused by those that hold no
+parameters)."""
 
 
-def labeller(name: str, weights: str = "") -> Labeller:
+def labeller(name: str, weights: str = "", place: Place = CPU) -> Labeller:
     """A labeller of the table, ready for use.
 
     Raises:
@@ -174,7 +179,7 @@ def labeller(name: str, weights: str = "") -> Labeller:
     """
     if name not in LABELLERS:
         raise UsageError("there is no such labeller", expected=", ".join(LABELLERS), got=name)
-    return LABELLERS[name](weights)
+    return LABELLERS[name](weights, place)
 
 
 # --- ground and returns ---------------------------------------------------------------------------------------------

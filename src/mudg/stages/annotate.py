@@ -16,7 +16,7 @@ import functools
 import multiprocessing
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from mudg.base.config import to_dict
 from mudg.base.types import Frame, Scene
 from mudg.data.scenefile import SceneWriter, read_image, read_scene
 from mudg.models.labellers import LabelInput, Labels, labeller
-from mudg.stages import batch
+from mudg.stages import annotate_depth, batch
 from mudg.stages.annotate_ego import find_ego
 from mudg.stages.annotate_page import write_page
 from mudg.stages.annotate_points import NearbyReturns
@@ -55,7 +55,10 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     """
     settings = to_dict(config)
     settings.pop("processes")  # changes no result
-    folder = store.RunDir.open(out, "annotate", settings, {"scene": store.digest(scene)}, _VERSION, overwrite)
+    networks = annotate_depth.digests(config)
+    folder = store.RunDir.open(
+        out, "annotate", settings, {"scene": store.digest(scene), **networks}, _VERSION, overwrite
+    )
     if folder.complete:
         return folder.reused()
     loaded = read_scene(scene)
@@ -66,7 +69,9 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     if not (folder.path / "scene.json").is_file():
         aside = folder.path / _ASIDE
         _label_frames(config, Path(scene), loaded, missing, aside)
-        source = dataclasses.replace(loaded.source, notes=(*loaded.source.notes, *_notes(config, loaded, missing)))
+        source = dataclasses.replace(
+            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, networks, aside))
+        )
         with SceneWriter(folder.path, loaded.id, source) as writer:
             add_rest(writer, loaded)
             _add_frames(config, loaded, missing, aside, writer)
@@ -98,10 +103,14 @@ def wanted_labels(config: AnnotateConfig) -> set[str]:
     )  # fmt: skip
 
 
-def _notes(config: AnnotateConfig, scene: Scene, missing: Sequence[Frame]) -> Iterator[str]:
+def _notes(config: AnnotateConfig, missing: Sequence[Frame], networks: Mapping[str, str], aside: Path) -> Iterator[str]:
     """A sentence for each label that was made: for how many frames, and from what."""
     made_by = f"labeller '{config.labeller}'"
-    depth = f"points of {config.sweeps} sweeps, filled along the image, sky at a fixed distance"
+    if "weights" in networks:
+        made_by += annotate_depth.folder_words(config.weights, networks["weights"])
+    depth = annotate_depth.origin(
+        config, networks, [frame.id for frame in missing if "depth" not in frame.labels], aside
+    )
     origins = {"semantics": made_by, "sky": made_by, "depth": depth, "dynamic": "tracked boxes that move and dense depth",
                "ego": "pixels that stay the same while the vehicle moves"}  # fmt: skip
     for name, origin in origins.items():
@@ -118,7 +127,8 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
     todo = [frame.id for frame in missing if not aside_file(aside, frame.id).is_file()]
     if len(todo) < len(missing):
         log.info(f"annotate: {len(missing) - len(todo)} frames were labelled before")
-    processes = min(config.processes or os.cpu_count() or 1, len(todo) // _FRAMES_PER_PROCESS)
+    most = config.processes or (1 if config.device == "cuda" else os.cpu_count()) or 1
+    processes = min(most, len(todo) // _FRAMES_PER_PROCESS)
     with log.task("labelling frames", len(missing), len(missing) - len(todo)) as bar:
         if processes <= 1:
             for _ in label_and_put_aside(config, scene, todo, aside):
@@ -145,17 +155,19 @@ def label_and_put_aside(config: AnnotateConfig, scene: Scene, ids: Sequence[str]
     """Label these frames one after the other, write each to ``aside``, and name it when it is there."""
     if not ids:
         return
-    label = labeller(config.labeller, config.weights)
+    label = labeller(config.labeller, config.weights, annotate_depth.place(config))
+    network = annotate_depth.load(config)
     returns = NearbyReturns(scene, config.sweeps)
     place = scene.ego.world_from_ego[:, :3, 3]
     frames = {frame.id: frame for frame in scene.frames}
     for frame_id in ids:
         frame = frames[frame_id]
         near = returns.of(frame)
-        labels = label(
-            LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, place, near.beam_gap_deg,
-                       near.highest_rad, returns.moving)
-        )  # fmt: skip
+        given = LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, place, near.beam_gap_deg,
+                           near.highest_rad, returns.moving)  # fmt: skip
+        labels = label(given)
+        if network is not None and "depth" not in frame.labels:
+            labels = annotate_depth.with_network(network, given, labels, frame_id, aside)
         store.write_safetensors(aside_file(aside, frame_id), label_arrays(config, labels))
         yield frame_id
 

@@ -56,6 +56,17 @@ class AnnotateConfig:
     """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it."""
     depth: bool = True
     """Write dense depth: LiDAR of several sweeps, filled along the image."""
+    depth_network: str = ""
+    """Take dense depth from a network, aligned to LiDAR: folder of a PromptDepthAnything, Depth Anything (transformers) or Marigold
+    (diffusers)."""
+    depth_guided: bool = True
+    """Marigold: LiDAR steers every denoising step (slower); else the result is only aligned to it."""
+    depth_steps: int = Field(default=0, ge=0)
+    """Marigold: denoising steps (0 = what the folder says, or 50 with LiDAR steering)."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where networks of `weights` and `depth_network` compute."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Of these networks. auto is float32: bfloat16 is faster on some devices, and rounds depth to 0.4 percent."""
     sweeps: int = Field(default=6, ge=1, le=100)
     """Sweeps of each LiDAR, the nearest in time, whose points are put together."""
     dynamic: bool = True

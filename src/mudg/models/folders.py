@@ -1,0 +1,129 @@
+"""Pretrained networks in folders, as the packages transformers and diffusers write them: read from disk alone, whole or not at all.
+
+The packages are extras and imported when a network is asked for. Which class reads a folder is decided by our tables: no name in a
+file becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the network
+has and the folder lacks is an error, where the packages would leave it random and say so in a log.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, Literal
+
+import torch
+from torch import nn
+
+from mudg.base import store
+from mudg.base.errors import InputError, ResourceError
+
+_REMEDY: Final = "pip install 'mudg[models]'"
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a network computes, and whether its convolutions and matrix products are made in bfloat16."""
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    bf16: bool = False
+
+    def ready(self) -> torch.device:
+        """The device; ResourceError where there is none of the kind."""
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ResourceError("no CUDA device here", where="--device cuda", remedy="leave the flag out")
+        return torch.device(self.device)
+
+    def autocast(self) -> torch.autocast:
+        """Context in which a network shall run."""
+        return torch.autocast(self.device, torch.bfloat16, enabled=self.bf16)
+
+
+CPU: Final = Place()
+
+
+def transformers_package() -> ModuleType:
+    """The transformers package; ResourceError naming the extra where it is missing."""
+    try:
+        package = importlib.import_module("transformers")
+    except ImportError as error:
+        raise ResourceError(
+            "the transformers package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
+        ) from error
+    return _quiet(package)
+
+
+def diffusers_package() -> ModuleType:
+    """The diffusers package; ResourceError naming the extra where it is missing."""
+    try:
+        package = importlib.import_module("diffusers")
+    except ImportError as error:
+        raise ResourceError(
+            "the diffusers package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
+        ) from error
+    return _quiet(package)
+
+
+def _quiet(package: ModuleType) -> ModuleType:
+    """Progress bars of the package would run through ours."""
+    logging = getattr(getattr(package, "utils", None), "logging", None)
+    if logging is not None:
+        logging.disable_progress_bar()
+    return package
+
+
+def member(package: ModuleType, class_name: str) -> Any:
+    """A class of a package; ResourceError where the installed version is too old to have it."""
+    found = getattr(package, class_name, None)
+    if found is None:
+        raise ResourceError(
+            f"the installed {package.__name__} package has no {class_name}", where="pretrained network", expected="a newer version",
+            got=str(getattr(package, "__version__", "")), remedy=f"pip install --upgrade {package.__name__}",
+        )  # fmt: skip
+    return found
+
+
+def read_settings(file: Path) -> dict[str, Any]:
+    """A JSON object of a folder; InputError where there is none."""
+    content = store.read_json(file)
+    if not isinstance(content, dict):
+        raise InputError("the description of a network is no JSON object", where=str(file), got=type(content).__name__)
+    return content
+
+
+def load_network(network_class: Any, folder: Path, place: Place = CPU, subfolder: str = "") -> nn.Module:
+    """A network with all its weights, in float32 on its device, ready to be asked; its parameters want no gradient.
+
+    Args:
+        network_class: class of transformers or diffusers. folder: as ``save_pretrained`` writes it.
+        place: where it shall compute. subfolder: part of the folder that holds this network.
+
+    Raises:
+        InputError: the folder does not hold this network, or not all of it. ResourceError: no such device.
+    """
+    device = place.ready()
+    where = str(folder / subfolder)
+    options: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
+    if subfolder:
+        options["subfolder"] = subfolder
+    if network_class.__module__.split(".")[0] == "diffusers":
+        options["low_cpu_mem_usage"] = False  # what saves memory there needs one more package
+    try:
+        network, report = network_class.from_pretrained(str(folder), **options)
+    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(
+            f"the folder cannot be read as {network_class.__name__}", where=where, got=lines[0][:300],
+            expected="the configuration and the safetensors file that save_pretrained writes",
+        ) from error  # fmt: skip
+    lacking = sorted(str(name) for key in ("missing_keys", "mismatched_keys") for name in report.get(key) or ())
+    if lacking:
+        raise InputError(
+            f"weights of the {network_class.__name__} are missing, or have another shape", where=where,
+            expected="a value for every parameter", got=", ".join(lacking[:4]) + (" ..." if len(lacking) > 4 else ""),
+            remedy="take the folder of the whole network, with its task's head",
+        )  # fmt: skip
+    if any(value.dtype != torch.float32 for value in network.parameters()):
+        network = network.float()
+    return network.to(device).eval().requires_grad_(False)

@@ -1,0 +1,255 @@
+"""Depth by networks from folders: the alignment to LiDAR with known answers, and each kind against the package that it comes from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_networks
+import torch
+from PIL import Image
+from tiny_networks import package
+
+from mudg.base.errors import InputError, ResourceError
+from mudg.core.complete import CompletionRules
+from mudg.models.depth_networks import (
+    KINDS,
+    DepthInput,
+    DepthOptions,
+    Prediction,
+    align_to_lidar,
+    kind_of,
+    lidar_cue,
+    load_depth_network,
+    residual_confidence,
+)
+from mudg.models.folders import Place
+from mudg.models.marigold import Marigold
+
+RULES = CompletionRules()
+real_packages = pytest.mark.filterwarnings("ignore")
+"""What the packages warn about among themselves is theirs."""
+
+
+def street(height: int = 48, width: int = 72, measured: float = 0.2, seed: int = 0) -> tuple[DepthInput, np.ndarray]:
+    """A road, two walls and sky, a share of the pixels measured; and the true depth f32[H, W], the sky at 100 m."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    depth = np.minimum(1.5 * width / np.maximum(v - height / 2, 0.5), 6 + 0.9 * np.abs(u - width / 2)).clip(2, 80)
+    sky = (v < height / 4) & (np.abs(u - width / 2) < width / 4)
+    depth[sky] = RULES.sky_m
+    depth = depth.astype(np.float32)
+    seen = (rng.uniform(size=depth.shape) < measured) & ~sky
+    rgb = np.stack([255 * (depth % 7) / 7, 3 * u, 2 * v], 2).clip(0, 255).astype(np.uint8)
+    return DepthInput(rgb, np.where(seen, depth, np.float32(np.nan)), depth.copy(), sky), depth
+
+
+# --- alignment --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("space", "scale", "shift"), [("depth", 0.0123, -0.4), ("disparity", 21.0, 3.5), ("depth", 1.0, 0.0)]
+)
+@pytest.mark.parametrize("wrong", [0.0, 0.3])
+def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
+    space: str, scale: float, shift: float, wrong: float
+) -> None:
+    given, truth = street()
+    goal = truth if space == "depth" else 1 / truth
+    rng = np.random.default_rng(1)
+    measured = given.measured.copy()
+    bad = np.isfinite(measured) & (rng.uniform(size=truth.shape) < wrong)
+    measured[bad] = rng.uniform(1, 90, int(bad.sum()))
+    given = DepthInput(given.rgb, measured, given.filled, given.sky)
+    prediction = Prediction((scale * goal + shift).astype(np.float32), space)  # type: ignore[arg-type]
+    found = align_to_lidar(prediction, given, RULES)
+    assert found.fit.used
+    assert found.dense is not None
+    assert np.abs(found.dense.depth / truth - 1).max() < 1e-3
+    assert (found.dense.depth[given.sky] == RULES.sky_m).all()
+    assert found.fit.residual < 1e-3
+
+
+def test_wrong_returns_from_behind_do_not_pull() -> None:
+    """Two fifths of the returns lie 40 % behind the surface, as what shows through gaps does: noise that has one sign."""
+    given, truth = street()
+    measured = given.measured.copy()
+    bad = np.isfinite(measured) & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
+    measured[bad] *= 1.4
+    found = align_to_lidar(
+        Prediction(truth / 80 - 0.1, "depth"), DepthInput(given.rgb, measured, given.filled, given.sky), RULES
+    )
+    assert found.dense is not None
+    assert np.abs(found.dense.depth / truth - 1).max() < 1e-3
+
+
+def test_depth_that_does_not_fit_the_returns_is_not_used() -> None:
+    given, truth = street()
+    rng = np.random.default_rng(3)
+    noise = rng.uniform(1, 2, truth.shape).astype(np.float32)
+    for values in (noise, -truth, np.full_like(truth, 3.0)):
+        assert align_to_lidar(Prediction(values, "depth"), given, RULES).dense is None
+    few = np.where(np.cumsum(np.isfinite(given.measured)).reshape(truth.shape) <= 20, given.measured, np.nan)
+    assert (
+        align_to_lidar(Prediction(truth, "depth"), DepthInput(given.rgb, few, given.filled, given.sky), RULES).dense
+        is None
+    )
+    with pytest.raises(InputError, match="size"):
+        align_to_lidar(Prediction(truth[1:], "depth"), given, RULES)
+
+
+def test_confidence_is_low_where_the_depth_is_off() -> None:
+    given, truth = street()
+    off = truth.copy()
+    off[:, :24] *= 1.3
+    confidence = residual_confidence(off, given.measured, given.sky, RULES.sky_m)
+    right, wrong = np.median(confidence[30:, 40:]), np.median(confidence[30:, :16])
+    assert right > 0.5 > 0.1 > wrong
+    assert confidence.dtype == np.float32
+    assert ((confidence >= 0) & (confidence <= 1)).all()
+
+
+def test_the_map_for_the_network_has_no_holes_and_no_sky() -> None:
+    given, truth = street()
+    cue = lidar_cue(given, 36)
+    assert tuple(cue.shape) == (1, 1, 24, 36)
+    assert bool(torch.isfinite(cue).all())
+    assert float(cue.max()) <= float(truth[~given.sky].max())
+    flat = DepthInput(given.rgb, given.measured, np.full_like(truth, 5.0), given.sky)
+    assert float(lidar_cue(flat).max() - lidar_cue(flat).min()) > 0
+    with pytest.raises(InputError, match="LiDAR"):
+        lidar_cue(DepthInput(given.rgb, given.measured, np.full_like(truth, np.nan), given.sky))
+
+
+# --- folders ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_missing_or_wrong_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ResourceError, match="weights are missing"):
+        kind_of("")
+    with pytest.raises(ResourceError, match="weights are missing"):
+        kind_of(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
+    with pytest.raises(InputError, match="another kind"):
+        load_depth_network(tmp_path)
+    (tmp_path / "config.json").write_text("[1]")
+    with pytest.raises(InputError, match="JSON object"):
+        kind_of(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "depth_anything"}))
+    tiny_networks.hide(monkeypatch, "transformers")
+    with pytest.raises(ResourceError, match=r"mudg\[models\]"):
+        load_depth_network(tmp_path)
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m" / "model_index.json").write_text(json.dumps({"_class_name": "MarigoldPipeline"}))
+    assert kind_of(tmp_path / "m") == "MarigoldPipeline"
+    tiny_networks.hide(monkeypatch, "diffusers")
+    with pytest.raises(ResourceError, match=r"mudg\[models\]"):
+        load_depth_network(tmp_path / "m")
+    assert set(KINDS) == {"prompt_depth_anything", "depth_anything", "MarigoldDepthPipeline", "MarigoldPipeline"}
+
+
+@real_packages
+def test_a_folder_without_all_its_weights_is_refused(tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    tiny_networks.depth_anything(tmp_path)
+    (tmp_path / "model.safetensors").rename(tmp_path / "aside")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_depth_network(tmp_path)
+    weights = load_file(tmp_path / "aside")
+    weights.pop("head.conv3.weight")
+    save_file(weights, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(InputError, match=r"head\.conv3\.weight"):
+        load_depth_network(tmp_path)
+
+
+@real_packages
+@pytest.mark.parametrize(("with_lidar", "metric"), [(True, False), (False, False), (False, True)])
+def test_networks_of_transformers_answer_as_in_their_package(with_lidar: bool, metric: bool, tmp_path: Path) -> None:
+    """Against the package's own preparation of images and its own sizing of the answer."""
+    transformers = package("transformers")
+    network = tiny_networks.depth_anything(tmp_path, with_lidar=with_lidar, metric=metric)
+    given, _ = street()
+    found = load_depth_network(tmp_path)(given)
+    name = "PromptDepthAnythingImageProcessor" if with_lidar else "DPTImageProcessor"
+    processor_class = getattr(transformers, f"{name}Pil", None) or getattr(transformers, name)
+    processor = processor_class.from_pretrained(str(tmp_path))
+    inputs = processor(images=Image.fromarray(given.rgb), return_tensors="pt")
+    assert tuple(inputs["pixel_values"].shape) == (1, 3, 42, 56)
+    if with_lidar:
+        inputs["prompt_depth"] = lidar_cue(given)
+    with torch.inference_mode():
+        output = network(**inputs).predicted_depth
+    expected = torch.nn.functional.interpolate(output[:, None], size=(48, 72), mode="bilinear")[0, 0].numpy()
+    assert found.space == ("depth" if with_lidar or metric else "disparity")
+    assert np.ptp(expected) > 1e-3  # not a constant
+    np.testing.assert_allclose(found.values, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+@real_packages
+@pytest.mark.parametrize("prediction_type", ["v_prediction", "epsilon"])
+def test_marigold_without_guidance_answers_as_the_package_does(prediction_type: str, tmp_path: Path) -> None:
+    pipeline = tiny_networks.marigold(tmp_path, prediction_type=prediction_type)
+    model = load_depth_network(tmp_path, options=DepthOptions(guided=False))
+    assert isinstance(model, Marigold)
+    given, _ = street(30, 50)  # 28 x 48 of processing, then padding: odd cells
+    image, size = model._prepared(given.rgb)
+    noise = torch.randn(1, 4, image.shape[2] // 2, image.shape[3] // 2, generator=torch.Generator().manual_seed(1))
+    pipeline.set_progress_bar_config(disable=True)
+    expected = pipeline(
+        Image.fromarray(given.rgb), latents=noise, match_input_resolution=False, output_type="pt"
+    ).prediction
+    found = model.predict(image, size, noise)
+    assert found.shape == expected.shape
+    assert float(expected.max() - expected.min()) > 1e-2
+    np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=2e-5)
+    assert np.array_equal(model(given).values, model(given).values)  # no chance
+
+
+@real_packages
+def test_guidance_brings_marigold_nearer_to_the_returns(tmp_path: Path) -> None:
+    """A random network knows nothing of depth: all the agreement that is gained comes from the returns."""
+    tiny_networks.marigold(tmp_path, longest_px=32)
+    given, _ = street(24, 32, measured=0.5)
+
+    def error(guided: bool) -> float:
+        prediction = load_depth_network(tmp_path, options=DepthOptions(guided=guided, steps=30))(given)
+        fit = align_to_lidar(prediction, given, RULES).fit
+        return fit.residual if np.isfinite(fit.residual) else 1.0
+
+    assert error(True) < 0.7 * error(False)
+
+
+@real_packages
+def test_bfloat16_gives_nearly_the_same(tmp_path: Path) -> None:
+    tiny_networks.depth_anything(tmp_path / "a", with_lidar=True)
+    tiny_networks.marigold(tmp_path / "b", longest_px=24)
+    given, _ = street(16, 24)
+    for folder, options in (("a", DepthOptions()), ("b", DepthOptions(guided=True, steps=2))):
+        exact = load_depth_network(tmp_path / folder, Place("cpu"), options)(given).values
+        rounded = load_depth_network(tmp_path / folder, Place("cpu", bf16=True), options)(given).values
+        assert rounded.dtype == np.float32
+        assert 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
+
+
+def test_a_missing_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ResourceError, match="CUDA"):
+        Place("cuda").ready()
+    assert Place().ready() == torch.device("cpu")
+
+
+@real_packages
+def test_parts_of_another_kind_are_refused(tmp_path: Path) -> None:
+    tiny_networks.marigold(tmp_path)
+    file = tmp_path / "scheduler" / "scheduler_config.json"
+    told = json.loads(file.read_text())
+    file.write_text(json.dumps({**told, "_class_name": "LCMScheduler"}))
+    with pytest.raises(InputError, match="LCMScheduler"):
+        load_depth_network(tmp_path)
+    file.write_text(json.dumps(told))
+    (tmp_path / "tokenizer" / "vocab.json").write_text(json.dumps({"a": 0}))
+    with pytest.raises(InputError, match="marks"):
+        load_depth_network(tmp_path)

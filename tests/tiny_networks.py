@@ -1,0 +1,148 @@
+"""Tiny random networks of transformers and diffusers, saved as those packages save the real ones. Without the packages: skip."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+NAMES = {0: "Road", 1: "traffic light", 2: "sky", 3: "unicorn"}
+
+
+def package(name: str) -> Any:
+    """A package of the extra ``models``, or a skip that says what is missing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = pytest.importorskip(name, reason=f"{name} is not installed (extra models)")
+    found.utils.logging.disable_progress_bar()
+    return found
+
+
+def seeded(network: torch.nn.Module, seed: int = 0, gain: float = 1.0) -> torch.nn.Module:
+    """The network with weights that depend on the seed alone; biases too, so that no output is constant."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, value in network.named_parameters():
+            if value.ndim > 1:
+                value.copy_(gain * torch.randn(value.shape, generator=generator) / value[0].numel() ** 0.5)
+            elif "norm" not in name:
+                value.copy_(0.1 * torch.randn(value.shape, generator=generator))
+    return network.eval()
+
+
+def segformer(folder: Path) -> Any:
+    """SegFormer of 24 thousand parameters."""
+    t = package("transformers")
+    config = t.SegformerConfig(
+        depths=[1] * 4, hidden_sizes=[8, 8, 16, 16], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=16,
+        id2label=NAMES, label2id={name: n for n, name in NAMES.items()},
+    )  # fmt: skip
+    return _saved(seeded(t.SegformerForSemanticSegmentation(config)), folder)
+
+
+def mask2former(folder: Path) -> Any:
+    """Mask2Former on a Swin backbone."""
+    t = package("transformers")
+    swin = t.SwinConfig(
+        image_size=64, embed_dim=8, depths=[1] * 4, num_heads=[1, 1, 2, 2], window_size=4,
+        out_features=["stage1", "stage2", "stage3", "stage4"],
+    )  # fmt: skip
+    config = t.Mask2FormerConfig(
+        backbone_config=swin, feature_size=32, mask_feature_size=32, hidden_dim=32, encoder_feedforward_dim=32, dim_feedforward=32,
+        encoder_layers=1, decoder_layers=2, num_attention_heads=2, num_queries=6, id2label=NAMES,
+        label2id={name: n for n, name in NAMES.items()},
+    )  # fmt: skip
+    return _saved(seeded(t.Mask2FormerForUniversalSegmentation(config)), folder)
+
+
+def eomt(folder: Path) -> Any:
+    """EoMT that reads squares of 64 px."""
+    t = package("transformers")
+    config = t.EomtConfig(
+        hidden_size=16, num_hidden_layers=2, num_attention_heads=2, image_size=64, patch_size=16, num_queries=6, num_blocks=1,
+        num_upscale_blocks=1, id2label=NAMES, label2id={name: n for n, name in NAMES.items()},
+    )  # fmt: skip
+    return _saved(seeded(t.EomtForUniversalSegmentation(config)), folder)
+
+
+def depth_anything(folder: Path, *, with_lidar: bool = False, metric: bool = False) -> Any:
+    """Depth Anything or PromptDepthAnything on a DINOv2 backbone, for images whose shorter side is 42 px."""
+    t = package("transformers")
+    backbone = t.Dinov2Config(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, intermediate_size=16, image_size=42, patch_size=14,
+        out_indices=[1, 2, 3, 4], reshape_hidden_states=False, apply_layernorm=True,
+    )  # fmt: skip
+    config_class = t.PromptDepthAnythingConfig if with_lidar else t.DepthAnythingConfig
+    config = config_class(
+        backbone_config=backbone, reassemble_hidden_size=16, patch_size=14, neck_hidden_sizes=[8] * 4, fusion_hidden_size=8,
+        head_hidden_size=8, depth_estimation_type="metric" if metric or with_lidar else "relative", max_depth=80 if metric else 1,
+    )  # fmt: skip
+    network_class = t.PromptDepthAnythingForDepthEstimation if with_lidar else t.DepthAnythingForDepthEstimation
+    network = _saved(seeded(network_class(config), gain=1.5), folder)
+    described = {
+        "size": {"height": 42, "width": 42}, "keep_aspect_ratio": True, "ensure_multiple_of": 14, "do_resize": True, "resample": 3,
+        "do_rescale": True, "rescale_factor": 1 / 255, "do_normalize": True, "image_mean": [0.485, 0.456, 0.406],
+        "image_std": [0.229, 0.224, 0.225], "do_pad": False,
+    }  # fmt: skip
+    (folder / "preprocessor_config.json").write_text(json.dumps(described))
+    return network
+
+
+def marigold(folder: Path, *, prediction_type: str = "v_prediction", longest_px: int = 48) -> Any:
+    """Folder of a Marigold pipeline: latents of half the size, two tokens of text."""
+    t, d = package("transformers"), package("diffusers")
+    unet = d.UNet2DConditionModel(
+        in_channels=8, out_channels=4, block_out_channels=(8, 16), layers_per_block=1, norm_num_groups=4, cross_attention_dim=8,
+        attention_head_dim=4, down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
+        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
+    )  # fmt: skip
+    vae = d.AutoencoderKL(
+        block_out_channels=(8, 16), norm_num_groups=4, latent_channels=4, down_block_types=("DownEncoderBlock2D",) * 2,
+        up_block_types=("UpDecoderBlock2D",) * 2, layers_per_block=1,
+    )  # fmt: skip
+    text = t.CLIPTextModel(
+        t.CLIPTextConfig(vocab_size=8, hidden_size=8, intermediate_size=8, num_hidden_layers=1, num_attention_heads=2,
+                         max_position_embeddings=8, bos_token_id=6, eos_token_id=7)
+    )  # fmt: skip
+    scheduler = d.DDIMScheduler(
+        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, set_alpha_to_one=False,
+        steps_offset=1, prediction_type=prediction_type, timestep_spacing="trailing",
+    )  # fmt: skip
+    for seed, (name, network) in enumerate({"unet": unet, "vae": vae, "text_encoder": text}.items()):
+        seeded(network, seed).save_pretrained(folder / name)
+    scheduler.save_pretrained(folder / "scheduler")
+    (folder / "tokenizer").mkdir()
+    words = {w: n for n, w in enumerate(["a", "b", "c", "a</w>", "b</w>", "c</w>", "<|startoftext|>", "<|endoftext|>"])}
+    (folder / "tokenizer" / "vocab.json").write_text(json.dumps(words))
+    (folder / "tokenizer" / "merges.txt").write_text("#version: 0.2\n")
+    (folder / "tokenizer" / "tokenizer_config.json").write_text(
+        json.dumps({"tokenizer_class": "CLIPTokenizer", "model_max_length": 8})
+    )
+    index = {
+        "_class_name": "MarigoldDepthPipeline", "_diffusers_version": d.__version__, "prediction_type": "depth",
+        "scale_invariant": True, "shift_invariant": True, "default_denoising_steps": 3,
+        "default_processing_resolution": longest_px, "unet": ["diffusers", "UNet2DConditionModel"],
+        "vae": ["diffusers", "AutoencoderKL"], "scheduler": ["diffusers", "DDIMScheduler"],
+        "text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "CLIPTokenizer"],
+    }  # fmt: skip
+    (folder / "model_index.json").write_text(json.dumps(index))
+    return d.MarigoldDepthPipeline(
+        unet, vae, scheduler, text, t.CLIPTokenizer.from_pretrained(str(folder / "tokenizer")), prediction_type="depth",
+        default_denoising_steps=3, default_processing_resolution=longest_px,
+    )  # fmt: skip
+
+
+def _saved(network: Any, folder: Path) -> Any:
+    folder.mkdir(parents=True, exist_ok=True)
+    network.save_pretrained(str(folder))
+    return network
+
+
+def hide(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """As if a package were not installed."""
+    monkeypatch.setitem(sys.modules, name, None)
