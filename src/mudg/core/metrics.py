@@ -343,10 +343,11 @@ class Flicker:
     def add(self, measured: Pair) -> None:
         """Add the next frame."""
         before, self._before = self._before, measured
-        if before is not None and _dense(before) and _dense(measured):
-            carried, truly = self._motion.between(before, measured)
-            made = [p.rgb.clamp(0, 1) for p in (before, measured) if p.rgb is not None]
-            self._made, self._true = self._made + flicker.change(*made, carried), self._true + truly
+        if before is None or before.rgb is None or measured.rgb is None or not (_exact(before) and _exact(measured)):
+            return
+        carried, truly = self._motion.between(before, measured)
+        self._made += flicker.change(before.rgb.clamp(0, 1), measured.rgb.clamp(0, 1), carried)
+        self._true += truly
 
     def value(self) -> float | None:
         """1 = as calm as the truth; None without two neighbouring frames or without static surfaces."""
@@ -357,8 +358,8 @@ def _whole(pair: Pair) -> Pair:
     return pair
 
 
-def _dense(pair: Pair) -> bool:
-    return all(x is not None for x in (pair.rgb, pair.truth_rgb, pair.truth_depth, pair.truth_semantics, pair.view))
+def _exact(pair: Pair) -> bool:
+    return all(x is not None for x in (pair.truth_rgb, pair.truth_depth, pair.truth_semantics, pair.view))
 
 
 def _depth_errors_of(pair: Pair) -> DepthErrors | None:
