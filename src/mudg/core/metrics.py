@@ -84,22 +84,22 @@ def perceptual_distance(
     Raises:
         InputError: the two have other shapes.
     """
-    return distance_of_units(unit_features(prediction), unit_features(truth), mask, weights)
+    return distance_to_units(prediction, unit_features(truth), mask, weights)
 
 
-def distance_of_units(
+def distance_to_units(
     prediction: Sequence[Tensor],
     truth: Sequence[Tensor],
     mask: Tensor | None = None,
     weights: Sequence[Tensor] | None = None,
 ) -> float:
-    """``perceptual_distance`` of features that ``unit_features`` has brought to length 1 already."""
+    """``perceptual_distance`` from a truth that ``unit_features`` has prepared, for several predictions."""
     total = 0.0
     for stage, (mine, theirs) in enumerate(zip(prediction, truth, strict=True)):
         if mine.shape != theirs.shape:
             raise InputError("features of two pictures differ in shape", where=f"stage {stage}",
                              expected=str(tuple(theirs.shape)), got=str(tuple(mine.shape)))  # fmt: skip
-        squared = (mine - theirs) ** 2
+        squared = (_unit(mine) - theirs) ** 2
         places = squared.sum(0) if weights is None else (squared * weights[stage].view(-1, 1, 1)).sum(0)
         if mask is None:
             total += float(places.double().mean())
@@ -111,7 +111,11 @@ def distance_of_units(
 
 def unit_features(stages: Sequence[Tensor]) -> list[Tensor]:
     """Feature vectors of every place brought to length 1; per stage ``[C_l, h_l, w_l]``."""
-    return [features / (features.square().sum(0, keepdim=True).sqrt() + 1e-6) for features in stages]
+    return [_unit(features) for features in stages]
+
+
+def _unit(features: Tensor) -> Tensor:
+    return features / (features.square().sum(0, keepdim=True).sqrt() + 1e-6)
 
 
 @dataclass(frozen=True)
@@ -343,10 +347,11 @@ class Flicker:
     def add(self, measured: Pair) -> None:
         """Add the next frame."""
         before, self._before = self._before, measured
-        if before is not None and _dense(before) and _dense(measured):
-            carried, truly = self._motion.between(before, measured)
-            made = [p.rgb.clamp(0, 1) for p in (before, measured) if p.rgb is not None]
-            self._made, self._true = self._made + flicker.change(*made, carried), self._true + truly
+        if before is None or before.rgb is None or measured.rgb is None or not (_exact(before) and _exact(measured)):
+            return
+        carried, truly = self._motion.between(before, measured)
+        self._made += flicker.change(before.rgb.clamp(0, 1), measured.rgb.clamp(0, 1), carried)
+        self._true += truly
 
     def value(self) -> float | None:
         """1 = as calm as the truth; None without two neighbouring frames or without static surfaces."""
@@ -357,8 +362,8 @@ def _whole(pair: Pair) -> Pair:
     return pair
 
 
-def _dense(pair: Pair) -> bool:
-    return all(x is not None for x in (pair.rgb, pair.truth_rgb, pair.truth_depth, pair.truth_semantics, pair.view))
+def _exact(pair: Pair) -> bool:
+    return all(x is not None for x in (pair.truth_rgb, pair.truth_depth, pair.truth_semantics, pair.view))
 
 
 def _depth_errors_of(pair: Pair) -> DepthErrors | None:
@@ -450,6 +455,6 @@ def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:
 
 __all__ = [
     "CLASS_COUNT", "METRICS", "UNLABELLED", "DepthError", "DepthErrors", "Flicker", "FrameMean", "Metric", "MetricRow", "Pair",
-    "Segmentation", "StaticMotion", "build_all", "confusion", "depth_errors", "distance_of_units", "iou_of", "measure",
+    "Segmentation", "StaticMotion", "build_all", "confusion", "depth_errors", "distance_to_units", "iou_of", "measure",
     "perceptual_distance", "psnr", "results", "ssim", "unit_features",
 ]  # fmt: skip

@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mudg.base.errors import InputError
-from mudg.core.metrics import Pair, distance_of_units, unit_features
+from mudg.core.metrics import Pair, distance_to_units, unit_features
 from mudg.models.vae import PatchCodec
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
@@ -184,5 +184,4 @@ class PerceptualDistance:
             if getattr(self._known, "picture", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb))
                 self._known.picture = pair.truth_rgb
-            seen = unit_features(self._features(pair.rgb))
-            return distance_of_units(seen, self._known.features, pair.mask, self._weights)
+            return distance_to_units(self._features(pair.rgb), self._known.features, pair.mask, self._weights)
