@@ -50,7 +50,7 @@ def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
     assert flicker.flicker(made, truth, depth, ids, poses, lens) == pytest.approx(3.0, rel=1e-3)
     cars = torch.full_like(ids, 13)
     assert math.isnan(flicker.flicker(made, truth, depth, cars, poses, lens))
-    assert math.isnan(flicker.flicker(made[:1], truth[:1], depth[:1], ids[:1], poses, lens))
+    assert math.isnan(flicker.flicker(made[:1], truth[:1], depth[:1], ids[:1], poses[:1], lens[:1]))
 
 
 @pytest.fixture(scope="module")
