@@ -144,7 +144,7 @@ def _turned_sums(edges: Floats, xyz_cam: Floats, view: View) -> tuple[Floats, in
     azimuth = np.rad2deg(np.arctan2(xyz_cam[inside, 0], xyz_cam[inside, 2]))
     first, cluster = np.unique(np.floor(azimuth / _CLUSTER_DEG), return_inverse=True)
     sums = [np.bincount(cluster, strength, len(first)) for strength in edges[v, u]]
-    return np.array(sums).reshape(len(places), len(first)), int(inside.sum())
+    return np.array(sums, np.float64).reshape(len(places), len(first)), int(inside.sum())
 
 
 def _turn(about_y_deg: float, about_x_deg: float) -> Floats:

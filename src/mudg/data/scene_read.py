@@ -139,7 +139,7 @@ def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image
                 got="16 bits a channel" if sixteen_bits else f"mode {image.mode}",
                 remedy="convert it to 8-bit RGB",
             )
-        if image.mode == "RGBA" and image.getextrema()[3] != (255, 255):
+        if image.mode == "RGBA" and image.getchannel("A").getextrema() != (255, 255):
             raise InputError("image has transparent pixels", where=where, expected="an opaque image")
         yield image
 
