@@ -109,7 +109,9 @@ class DensifyStats:
         return cls(tensors["gradient"].clone(), tensors["seen"].clone())
 
 
-def densify(model: SceneModel, stats: DensifyStats, step: int, settings: DensifySettings, run_seed: int) -> dict[str, Any]:
+def densify(
+    model: SceneModel, stats: DensifyStats, step: int, settings: DensifySettings, run_seed: int
+) -> dict[str, Any]:
     """Clone, split and prune rows of the model's table in place; the caller starts new statistics.
 
     Args:
@@ -179,7 +181,9 @@ def _clones(model: SceneModel, rows: Tensor) -> tuple[dict[str, Tensor], dict[st
     return _rows(model, rows)
 
 
-def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
+def _halves(
+    model: SceneModel, rows: Tensor, step: int, run_seed: int
+) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
     """Two smaller Gaussians drawn from each split one (centres sampled from its own density)."""
     halves = []
     for half in (0, 1):

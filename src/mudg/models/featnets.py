@@ -124,7 +124,13 @@ class LpipsFeatures(nn.Module):
         InputError: a tensor is missing or has another shape.
     """
 
-    LAYERS: Final = ((0, 64, 3, 11, 4, 2), (3, 192, 64, 5, 1, 2), (6, 384, 192, 3, 1, 1), (8, 256, 384, 3, 1, 1), (10, 256, 256, 3, 1, 1))
+    LAYERS: Final = (
+        (0, 64, 3, 11, 4, 2),
+        (3, 192, 64, 5, 1, 2),
+        (6, 384, 192, 3, 1, 1),
+        (8, 256, 384, 3, 1, 1),
+        (10, 256, 256, 3, 1, 1),
+    )
     """Place in the trunk, channels out and in, kernel, stride, padding."""
     POOLED: Final = (1, 2)
     """Layers before which 3x3 maxima are taken at every second place."""
@@ -160,7 +166,9 @@ def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], wher
     found = state.get(name)
     if found is None or tuple(found.shape) != shape:
         got = "missing" if found is None else str(tuple(found.shape))
-        raise InputError("LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got)
+        raise InputError(
+            "LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got
+        )
     return found.float()
 
 

@@ -226,7 +226,14 @@ class MDM(nn.Module):
             (2 if config.copy_condition else 0) + (1 if config.backdrop else 0) + (1 if config.given_classes else 0)
         )
         concatenated = 4 if config.reference == "concatenated" else 0
-        planes = noisy + 8 + (4 if config.backdrop else 0) + masks + concatenated + (CLASSES + 1 if config.given_classes else 0)
+        planes = (
+            noisy
+            + 8
+            + (4 if config.backdrop else 0)
+            + masks
+            + concatenated
+            + (CLASSES + 1 if config.given_classes else 0)
+        )
         self.net = UNet(config, planes, noisy + self.gates).to(memory_format=torch.channels_last)
         self.refiner: Refiner | None = None
         if config.refine_widths:
@@ -449,7 +456,11 @@ class MDM(nn.Module):
         """
         del which
         kinds = {name for name, module in self.trained_part().named_modules() if isinstance(module, TemporalAttention)}
-        return {f"{owner}.{name}" for owner in kinds for name, _ in self.trained_part().get_submodule(owner).named_parameters()}
+        return {
+            f"{owner}.{name}"
+            for owner in kinds
+            for name, _ in self.trained_part().get_submodule(owner).named_parameters()
+        }
 
     def _drawn_passes(self, generator: torch.Generator) -> Sequence[tuple[Modality, ...]]:
         """Joint: the one pass. Separate: one modality per batch, colour half of the time, as published."""
@@ -526,7 +537,9 @@ class MDM(nn.Module):
                 decoded, error = self._decode_refined(latents, encoded.pixels)
                 confidence = torch.exp(-error / TRUSTED_ERROR)
                 if n_samples > 1:
-                    confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
+                    confidence = confidence * functional.interpolate(
+                        torch.exp(-2.0 * change[0]), size=confidence.shape[-2:]
+                    )
         depth, ids = decoded.depth, decoded.semantics
         fits: list[DepthFit] = []
         if depth is not None:
@@ -536,7 +549,12 @@ class MDM(nn.Module):
             depth = settle_depth(depth, condition, self.config.codec.far_m)
         wanted = lambda m, x: x if m in modalities else None  # noqa: E731
         return Sample(
-            wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents, tuple(fits)
+            wanted("rgb", decoded.rgb),
+            wanted("depth", depth),
+            wanted("semantics", ids),
+            confidence,
+            latents,
+            tuple(fits),
         )
 
     def _decode_refined(self, latents: dict[Modality, Tensor], given: ConditionPixels) -> tuple[Decoded, Tensor]:

@@ -38,7 +38,18 @@ SH_C0: Final = 0.28209479177387814
 SKY_LOGIT: Final = 10.0
 """Logit of the sky class where nothing covers it; large beside what a Gaussian learns."""
 LIMBED_LABELS: Final = frozenset(
-    {"pedestrian", "person", "person_sitting", "child", "adult", "cyclist", "rider", "bicyclist", "motorcyclist", "animal"}
+    {
+        "pedestrian",
+        "person",
+        "person_sitting",
+        "child",
+        "adult",
+        "cyclist",
+        "rider",
+        "bicyclist",
+        "motorcyclist",
+        "animal",
+    }
 )
 """Labels of tracks that change their shape while they move."""
 SYMMETRIC_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "vehicle", "trailer", "motorcycle"})
@@ -119,16 +130,22 @@ class RigidNode:
         self.world_from_object = np.asarray(world_from_object, np.float64)
         self.learn_pose = learn_pose
         count = len(self.times_s)
-        self.offsets = offsets or Table({"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)})
+        self.offsets = offsets or Table(
+            {"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)}
+        )
         self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
-        self._quats = torch.from_numpy(np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])).float()
+        self._quats = torch.from_numpy(
+            np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])
+        ).float()
         self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
         self._positions = torch.from_numpy(self.world_from_object[:, :3, 3].copy()).float()
 
     @classmethod
     def from_track(cls, track: Track, learn_pose: bool = False) -> Self:
         """A node that follows ``track``."""
-        return cls(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object, learn_pose=learn_pose)
+        return cls(
+            track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object, learn_pose=learn_pose
+        )
 
     @property
     def symmetric(self) -> bool:
@@ -180,7 +197,9 @@ class RigidNode:
     @torch.no_grad()
     def _corrected(self, which: slice) -> NDArray[np.float64]:
         shift, yaw = self.offsets["shift"][which].double().numpy(), self.offsets["yaw"][which].double().numpy()
-        return self.world_from_object[which] @ np.stack([geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)])
+        return self.world_from_object[which] @ np.stack(
+            [geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)]
+        )
 
     def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
         """Corrected world_from_object f64[4, 4] at a time; None outside the span."""
@@ -214,7 +233,9 @@ class RigidNode:
         noise_m = max(float(np.sqrt((noise[:3] ** 2).mean())), LEAST_NOISE_M)
         noise_rad = max(float(noise[3]), LEAST_NOISE_RAD)
         path = motion.smoothed(self.times_s, positions, noise_m, motion.ACCELERATION_M_S2) - positions
-        turn = motion.smoothed(self.times_s, heading[:, None], noise_rad, motion.YAW_ACCELERATION_RAD_S2)[:, 0] - heading
+        turn = (
+            motion.smoothed(self.times_s, heading[:, None], noise_rad, motion.YAW_ACCELERATION_RAD_S2)[:, 0] - heading
+        )
         return (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0], turn
 
     def headings(self) -> NDArray[np.float64]:
@@ -314,7 +335,9 @@ class DeformableNode(RigidNode):
         if after != before:
             control = torch.lerp(control, self.offsets["deform"][after], u)
         place = 2 * means / means.new_tensor(self.size_m)
-        moved = F.grid_sample(control[None], place[None, None, None], mode="bilinear", padding_mode="border", align_corners=True)
+        moved = F.grid_sample(
+            control[None], place[None, None, None], mode="bilinear", padding_mode="border", align_corners=True
+        )
         return moved[0, :, 0, 0].T
 
     def parameters(self) -> Table:
@@ -378,7 +401,14 @@ class SkyNode:
         camera = view.camera.resized(width, height)
         x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
         y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
-        rays = np.stack([np.broadcast_to(x, (height, width)), np.broadcast_to(y[:, None], (height, width)), np.ones((height, width))], -1)
+        rays = np.stack(
+            [
+                np.broadcast_to(x, (height, width)),
+                np.broadcast_to(y[:, None], (height, width)),
+                np.ones((height, width)),
+            ],
+            -1,
+        )
         return self.panorama_grid(rays @ view.world_from_cam[:3, :3].T, padding=1)
 
     def panorama_grid(self, directions_world: NDArray[np.float64], padding: int = 0) -> NDArray[np.float32]:
@@ -488,12 +518,15 @@ class SceneModel:
             {key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]},
             {key: value.detach()[part] for key, value in self.table.partial.items()},
         )  # fmt: skip
-        return SceneModel(table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts))
+        return SceneModel(
+            table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts)
+        )
 
     def with_node_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:
         """A copy with one object displaced in its own frame (it shares the table of Gaussians)."""
         nodes = tuple(
-            node.moved(object_from_new) if isinstance(node, RigidNode) and node.name == name else node for node in self.nodes
+            node.moved(object_from_new) if isinstance(node, RigidNode) and node.name == name else node
+            for node in self.nodes
         )
         return SceneModel(self.table, nodes, self.sky, self.classes, self.sh_degree, dict(self.facts))
 
@@ -522,7 +555,9 @@ class SceneModel:
         for index, facts in enumerate(values["nodes"]):
             if facts["kind"] not in NODES:
                 raise InputError("unknown kind of scene node", expected=", ".join(NODES), got=str(facts["kind"]))
-            own = {key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")}
+            own = {
+                key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")
+            }
             node = NODES[facts["kind"]].from_state(facts, own)
             if isinstance(node, SkyNode):
                 sky = node
@@ -531,7 +566,9 @@ class SceneModel:
         table = Table.from_state(groups["gaussians"])
         owner = table.labels["node"]
         if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
-            raise InputError("a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}")
+            raise InputError(
+                "a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}"
+            )
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
@@ -585,7 +622,9 @@ def _colors_at(model: SceneModel, time_s: float, counts: Sequence[int]) -> Tenso
         return table["sh_dc"]
     coefficients = table.partial["sh_time"]
     terms = coefficients.shape[1]
-    weights = torch.stack([node.color_weights(time_s, terms) for node in model.nodes[1:]]) if len(model.nodes) > 1 else None
+    weights = (
+        torch.stack([node.color_weights(time_s, terms) for node in model.nodes[1:]]) if len(model.nodes) > 1 else None
+    )
     if weights is None:
         return table["sh_dc"]
     rows = weights.to(coefficients.dtype).repeat_interleave(torch.tensor(counts[1:]), 0)
@@ -676,7 +715,9 @@ def columns_from_points(
     return columns
 
 
-def box_grid(size_m: Sequence[float], rgb: Sequence[float], per_axis: int = 12) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def box_grid(
+    size_m: Sequence[float], rgb: Sequence[float], per_axis: int = 12
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one colour."""
     axis = np.linspace(-0.5, 0.5, per_axis)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)

@@ -361,7 +361,9 @@ class PublishedMDM(nn.Module):
             everywhere = torch.ones_like(x0[0, :, :1])
             squares = squares * torch.stack([known[m][n] if m in known else everywhere for n, m in enumerate(names)])
         errors = squares.flatten(1).mean(1)
-        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in shown}
+        sums = {
+            m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in shown
+        }
         return Losses(errors.mean(), {m: total * whole / (batch * shown.count(m)) for m, total in sums.items()})
 
     def _seed_dropout(self, seed: int, clips: range) -> None:
@@ -450,7 +452,10 @@ class PublishedMDM(nn.Module):
     def condition_latents(self, condition: Condition) -> dict[Modality, Tensor]:
         """The condition's colour and depth as latents [T,4,h,w] of all modalities, to `start` from; its colour stands in for
         classes, which it does not have."""
-        rgb, depth = self.codec.encode_rgb(condition.color.to(self.device)), self.codec.encode_depth(condition.depth.to(self.device))
+        rgb, depth = (
+            self.codec.encode_rgb(condition.color.to(self.device)),
+            self.codec.encode_depth(condition.depth.to(self.device)),
+        )
         return {"rgb": rgb, "depth": depth, "semantics": rgb}
 
     def _denoise(
