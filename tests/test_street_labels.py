@@ -21,7 +21,7 @@ from mudg.core.complete import ray_elevation, visible_depth
 from mudg.models import street_net
 from mudg.models.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
 from mudg.models.labellers import TRAIN_ID_OF, labeller
-from mudg.models.street_labels import at_size, reduced, settled
+from mudg.models.street_labels import at_size, guess, reduced, settled, with_guess
 from mudg.models.street_net import StreetNet, StreetNetConfig
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
@@ -128,6 +128,37 @@ def test_roads_are_low_and_boxes_hold_their_own_classes() -> None:
     classes = [ID[name] for name in ("rider", "motorcycle", "bicycle")]
     assert found[classes][:, 2, 3:].sum(0) == pytest.approx(1)
     assert found[classes][:, 3].sum(0) == pytest.approx(3 / len(CLASSES), abs=0.05)
+
+
+def test_no_people_beside_or_behind_what_fills_their_box() -> None:
+    box = np.zeros((4, 6), np.uint8)
+    box[2:] = 1
+    found = settled(even(), made_up(box=box, box_labels=np.array([ID["person"]])))
+    assert (found[ID["person"], 2:] < 1e-3).all()
+    assert (found[ID["person"], :2] > 0.04).all()
+    far = settled(
+        even(), made_up(box=box, box_labels=np.array([ID["person"]]), away_deg=np.full((4, 6), 9, np.float32))
+    )
+    assert (far[ID["person"]] > 0.04).all()
+
+
+def test_a_guess_changes_probabilities_by_bayes_rule_and_a_new_one_not_at_all() -> None:
+    table = np.full((len(CLASSES), len(CLASSES) + 1), 0.05, np.float32)
+    table[:, ID["train"]] = 0
+    table[ID["road"], ID["road"]] = 0.8
+    ids = np.full((4, 6), ID["road"], np.uint8)
+    ids[2], ids[3] = ID["train"], 255
+    found = with_guess(even(), ids, table)
+    assert found[ID["road"], :2] == pytest.approx(0.8 / (0.8 + 18 * 0.05))
+    assert found[:, 2:] == pytest.approx(1 / len(CLASSES))
+    assert found.sum(0) == pytest.approx(1)
+
+
+def test_the_guess_knows_road_car_and_sky() -> None:
+    given, truth = given_at(STREET)
+    ids = guess(given.rgb, gather(given))
+    for name in ("road", "car", "sky"):
+        assert overlap(ids, truth, name) > 0.75
 
 
 def test_a_picture_is_looked_at_with_the_focal_length_of_training() -> None:

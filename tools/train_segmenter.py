@@ -15,6 +15,7 @@ import argparse
 import collections
 import concurrent.futures
 import dataclasses
+import itertools
 import multiprocessing
 import sys
 import time
@@ -66,7 +67,7 @@ out now and then.
 **Confidence**: the class's probability; scores are divided by {temperature}, fitted on varied crops of cities
 {held_first} to {held_last}, which were not trained on.
 
-**Scores** on three images of each of {logs} city logs (`{list}` list, 384x256 pixels, 6 sweeps, true boxes):
+**Scores** on {images_each} image(s) of each of {logs} city logs (`{list}` list, 384x256 pixels, 6 sweeps, true boxes):
 
 ```
 {scores}```
@@ -280,7 +281,7 @@ def score(options: argparse.Namespace) -> None:
     totals: dict[str, NDArray[np.int64]] = {}
     surer = np.zeros((10, 3))
     for seed in city_logs.LISTS[options.list][: options.logs]:
-        for given, truth in segmenter_data.log_shots(seed):
+        for given, truth in itertools.islice(segmenter_data.log_shots(seed), options.images):
             blind = dataclasses.replace(given, xyz_world=given.xyz_world[:0])
             cases = {"all": given, "no boxes": dataclasses.replace(given, tracks=()), "no LiDAR": blind}
             for name, case in cases.items():
@@ -369,7 +370,7 @@ def ship(options: argparse.Namespace) -> None:
         parameters=sum(p.numel() for p in net.parameters()) / 1e6, images=options.cities * segmenter_data.VIEWS, seed=options.seed,
         cities=options.cities, last=options.cities - 1, held_first=options.cities, held_last=options.cities + options.held_out - 1,
         steps=steps, batch=options.batch, minutes=seconds / 60, temperature=net.config.temperature, list=options.list,
-        logs=options.logs, scores=found, size=options.size,
+        logs=options.logs, images_each=options.images, scores=found, size=options.size,
     ), facts)  # fmt: skip
     say(f"temperature {net.config.temperature}, {options.model}")
 
@@ -395,6 +396,7 @@ def main() -> None:
     parser.add_argument("--checkpoint-every", type=int, default=100)
     parser.add_argument("--list", choices=tuple(city_logs.LISTS), default="development", help="score: city logs")
     parser.add_argument("--logs", type=int, default=6, help="score: how many of the list")
+    parser.add_argument("--images", type=int, default=3, help="score: images of each log, one by each camera")
     parser.add_argument("--model", default="", help="ship: folder to write; score: folder to read instead of the run")
     parser.add_argument("--held-out", type=int, default=6, help="ship: cities after the last one for calibration")
     options = parser.parse_args()

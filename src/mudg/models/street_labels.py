@@ -42,6 +42,8 @@ ROAD_M: Final = 0.8
 CORRIDOR_M: Final = 1.8
 """Flat ground this near to the driven path is road: the vehicle went there."""
 _FLAT: Final = (ID["road"], ID["sidewalk"])
+_THIN: Final = tuple(ID[name] for name in ("person", "rider", "motorcycle", "bicycle"))
+"""These fill little of their boxes: what a measured surface says counts, not the outline."""
 _SMALL: Final = 1e-3
 """What is left of the probability of a class that is ruled out."""
 
@@ -107,9 +109,10 @@ def with_guess(
     """Probabilities f32[19, H, W] by Bayes' rule after a guess u8[H, W] is known, with sum 1.
 
     Args:
-        guess_given_class: f32[19, 20], how likely each guess is in each class; the last column is "cannot tell".
+        guess_given_class: f32[19, 20], how likely each guess is in each class, taken as at least 0.001, so that a guess that training
+            never met says nothing; the last column is "cannot tell".
     """
-    found = probabilities * guess_given_class[:, np.minimum(ids, len(CLASSES))]
+    found = probabilities * np.maximum(guess_given_class, 1e-3)[:, np.minimum(ids, len(CLASSES))]
     return found / found.sum(0, keepdims=True)
 
 
@@ -117,7 +120,7 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence) -> NDArray[n
     """Probabilities f32[19, H, W] without what the evidence rules out, with sum 1.
 
     No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface
-    lies in a box, no classes but those of the box.
+    lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
     """
     found = probabilities.copy()
     measured = evidence.away_deg < RETURN_DEG
@@ -130,6 +133,9 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence) -> NDArray[n
     found[ID["terrain"], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
     label = np.full(256, -1)
     label[1 : 1 + len(evidence.box_labels)] = evidence.box_labels
+    around = near & (evidence.box > 0) & ~evidence.in_box & np.isin(label[evidence.box], _THIN)
+    for index in _THIN:
+        found[index, around] *= _SMALL
     inside = np.where(evidence.in_box, label[evidence.box], -1)
     for index in np.unique(inside[inside >= 0]):
         allowed = np.zeros(len(CLASSES), np.float32)

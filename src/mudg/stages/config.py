@@ -50,9 +50,9 @@ class IngestConfig:
 class AnnotateConfig:
     """Make the labels that a scene lacks: dense depth, classes, sky, movers, each with a confidence."""
 
-    labeller: Literal["embedded", "geometry", "network"] = "embedded"
-    """What tells classes and sky. embedded: the small network that comes with the package, from image, heights and boxes; geometry:
-    rules for heights, boxes and colour; network: a segmentation network from `weights`."""
+    labeller: Literal["geometry", "embedded", "network"] = "geometry"
+    """What tells classes and sky. geometry: rules for heights, boxes and colour; embedded: the small network that comes with the package,
+    from image, heights and boxes; network: a segmentation network from `weights`."""
     weights: str = ""
     """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it. labeller
     embedded: folder of a network trained with tools/train_segmenter.py (empty = the one that comes with the package)."""
