@@ -27,6 +27,7 @@ from mudg.models.labellers import (
     distance_to_path,
     find_sky,
     fit_ground,
+    ground_near,
     label_by_geometry,
     labeller,
 )  # fmt: skip
@@ -125,7 +126,7 @@ def test_all_black_and_all_white_images_do_not_break_it() -> None:
 
 
 def test_labels_of_boxes_are_train_ids() -> None:
-    assert set(LABELLERS) == {"geometry", "network"}
+    assert set(LABELLERS) == {"embedded", "geometry", "network"}
     assert TRAIN_ID_OF["van"] == ID["car"]
     assert TRAIN_ID_OF["cyclist"] == ID["rider"]
     unknown = replace(STREET.track(), label="shopping trolley")
@@ -152,6 +153,13 @@ def test_no_ground_is_no_plane() -> None:
     cliff = np.random.default_rng(0).uniform(0, 30, (4000, 3))
     cliff[:, 2] = 1.5 * cliff[:, 0]
     assert fit_ground(cliff, np.array([[15.0, 15, 0]])) is None
+
+
+def test_ground_is_found_at_the_end_of_a_long_drive() -> None:
+    given, _ = given_at(STREET)
+    behind = given.path_world[:1] - np.c_[np.arange(500.0, 0, -5), np.zeros((100, 2))]
+    long = replace(given, path_world=np.concatenate([behind, given.path_world]))
+    assert ground_near(given) == pytest.approx(ground_near(long))
 
 
 def test_distance_to_path_goes_on_beyond_its_ends() -> None:
@@ -265,12 +273,12 @@ def test_movers_are_carried_and_marked(tmp_path: Path) -> None:
 
 def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     replace(STREET, times=(0.0, 0.1, 0.2)).write(tmp_path / "plain", labels=False, width=96, height=48)
-    config = AnnotateConfig()
+    config = AnnotateConfig(labeller="geometry")
     whole = annotate.run(config, tmp_path / "plain", tmp_path / "whole")
     plain = read_scene(tmp_path / "plain")
     settings = to_dict(config)
     settings.pop("processes")
-    begun = store.RunDir.open(tmp_path / "begun", "annotate", settings, {"scene": store.digest(tmp_path / "plain")}, 2)
+    begun = store.RunDir.open(tmp_path / "begun", "annotate", settings, annotate.inputs_of(config, tmp_path / "plain"), 3)
     aside = tmp_path / "begun" / "labelled"
     first = [frame.id for frame in plain.frames[:2]]
     assert list(annotate.label_and_put_aside(config, plain, first, aside)) == first

@@ -10,7 +10,8 @@
 * **vegetation**: what rises from the ground, or stands above the horizon, and is green.
 * **building**: any other such thing. It means "something static that stands", not architecture.
 
-``network`` takes classes and sky from a segmentation network (``models.segmenters``), depth and movers as above.
+``embedded`` takes classes from the small network that comes with the package (``models.street_labels``), which reads the same evidence and
+the image; ``network`` takes them from a segmentation network (``models.segmenters``). Depth and movers are as above for both.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ GROWTH_M: Final = 0.15
 """Boxes begin this far above their floor and are grown by this on each side: annotations are not exact."""
 RULES: Final = CompletionRules()
 NEAR_ROAD_M: Final = 4.0
+NEAR_PATH_M: Final = 30.0
+"""The ground plane belongs to the part of the path within this distance of the camera."""
 _GRASS: Final = 6.0
 _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
 
@@ -123,7 +126,7 @@ def label_by_geometry(given: LabelInput) -> Labels:
     surface = _complete(given, measured, sky)
     semantics = np.full(sky.shape, UNLABELLED, np.uint8)
     confidence = np.zeros(sky.shape, np.float32)
-    greenness = _greenness(given.rgb)
+    greenness = greenness_of(given.rgb)
     if measured.any:
         _paint_surface(semantics, confidence, given, surface, greenness)
     standing = (semantics == UNLABELLED) & (elevation > 0) & ~sky
@@ -163,8 +166,16 @@ def _network(weights: str, place: Place) -> Labeller:
     return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
 
 
+def _embedded(weights: str, place: Place) -> Labeller:
+    del place  # the labels are part of a scene's identity: one device, one order of sums
+    from mudg.models.street_labels import StreetLabeller
+
+    return StreetLabeller.load(weights)
+
+
 LABELLERS: Mapping[str, Callable[[str, Place], Labeller]] = {
     "geometry": lambda *_: label_by_geometry,
+    "embedded": _embedded,
     "network": _network,
 }
 """Name -> what makes a labeller of one image from a folder of weights and a place to compute (unused by those that hold no
@@ -214,6 +225,15 @@ def fit_ground(
         design = np.c_[near[:, :2], np.ones(len(near))]
         plane = np.linalg.lstsq(design, near[:, 2], rcond=None)[0]
     return plane if np.hypot(plane[0], plane[1]) < 0.2 else None
+
+
+def ground_near(given: LabelInput) -> NDArray[np.float64] | None:
+    """``fit_ground`` for the part of the path near the camera: a log is longer than a plane is flat."""
+    path = given.path_world
+    if len(path) == 0:
+        return None
+    away = np.linalg.norm(path[:, :2] - given.view.center_world[:2], axis=1)
+    return fit_ground(given.xyz_world, path[away <= max(NEAR_PATH_M, float(away.min()))])
 
 
 def _plane_z(plane: NDArray[np.float64], xyz: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -271,7 +291,7 @@ def _paint_surface(
     greenness: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Each pixel of known depth by its height above the ground, its place beside the path, and its colour."""
-    ground = fit_ground(given.xyz_world, given.path_world)
+    ground = ground_near(given)
     known = np.isfinite(surface.depth)
     height = np.full(known.shape, np.inf, np.float32)
     if ground is not None:
@@ -415,7 +435,7 @@ def _clipped_corners(corners: NDArray[np.float64], near_m: float = 0.3) -> NDArr
 # --- colour ---------------------------------------------------------------------------------------------------------
 
 
-def _greenness(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def greenness_of(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Positive where a smoothed pixel is green rather than red or blue, or the dark mottled colour of leaves; f32[H, W]."""
     smooth = ndimage.uniform_filter(rgb.astype(np.float32), (5, 5, 1))
     red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]

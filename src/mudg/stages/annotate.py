@@ -11,6 +11,7 @@ stopped.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import multiprocessing
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from mudg.base import log, store
@@ -36,7 +38,7 @@ from mudg.stages.config import AnnotateConfig
 from mudg.stages.ingest import add_frame_copy, add_rest
 from mudg.stages.synthesize import quiet_openmp
 
-_VERSION = 2
+_VERSION = 3
 _ASIDE = "labelled"
 _FRAMES_PER_PROCESS = 8
 """Fewer frames than this are not worth the start of a process."""
@@ -56,9 +58,7 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     settings = to_dict(config)
     settings.pop("processes")  # changes no result
     networks = annotate_depth.digests(config)
-    folder = store.RunDir.open(
-        out, "annotate", settings, {"scene": store.digest(scene), **networks}, _VERSION, overwrite
-    )
+    folder = store.RunDir.open(out, "annotate", settings, inputs_of(config, scene), _VERSION, overwrite)
     if folder.complete:
         return folder.reused()
     loaded = read_scene(scene)
@@ -94,6 +94,11 @@ def run_many(
 
 def _one_of_many(config: AnnotateConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
     return run(config, Path(entry.source), out, overwrite=overwrite)
+
+
+def inputs_of(config: AnnotateConfig, scene: Path) -> dict[str, str]:
+    """Digests of what the labels are made from: the scene and the networks that are used."""
+    return {"scene": store.digest(scene), **annotate_depth.digests(config)}
 
 
 def wanted_labels(config: AnnotateConfig) -> set[str]:
@@ -165,11 +170,23 @@ def label_and_put_aside(config: AnnotateConfig, scene: Scene, ids: Sequence[str]
         near = returns.of(frame)
         given = LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, place, near.beam_gap_deg,
                            near.highest_rad, returns.moving)  # fmt: skip
-        labels = label(given)
-        if network is not None and "depth" not in frame.labels:
-            labels = annotate_depth.with_network(network, given, labels, frame_id, aside)
+        with _one_thread():
+            labels = label(given)
+            if network is not None and "depth" not in frame.labels:
+                labels = annotate_depth.with_network(network, given, labels, frame_id, aside)
         store.write_safetensors(aside_file(aside, frame_id), label_arrays(config, labels))
         yield frame_id
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """A network's sums depend on the number of threads; labels shall not depend on how many processes share the processors."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def aside_file(aside: Path, frame_id: str) -> Path:

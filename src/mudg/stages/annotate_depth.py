@@ -16,6 +16,7 @@ import numpy as np
 from mudg.base import log, store
 from mudg.base.errors import UsageError
 from mudg.core.complete import visible_depth
+from mudg.models import street_net
 from mudg.models.depth_networks import (
     DepthInput,
     DepthNetwork,
@@ -46,6 +47,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
     found: dict[str, str] = {}
     if config.labeller == "network" and config.weights and Path(config.weights).is_dir():
         found["weights"] = store.digest(Path(config.weights))
+    if config.labeller == "embedded":
+        found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
         if not config.depth:
             raise UsageError("a depth network is named, but no depth is asked for", where="--depth-network",
@@ -99,8 +102,9 @@ def origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequence[s
 
 
 def folder_words(folder: str, digest: str) -> str:
-    """Name and digest of a network's folder, in words for the scene's notes."""
-    return f" in folder '{Path(folder).name}' (sha256 {digest[:16]})"
+    """Name (of one that did not come with the package) and digest of a network's folder, in words for the scene's notes."""
+    where = f" in folder '{Path(folder).name}'" if folder else ""
+    return f"{where} (sha256 {digest[:16]})"
 
 
 def _mark(aside: Path, frame_id: str) -> Path:

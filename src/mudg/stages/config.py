@@ -50,10 +50,12 @@ class IngestConfig:
 class AnnotateConfig:
     """Make the labels that a scene lacks: dense depth, classes, sky, movers, each with a confidence."""
 
-    labeller: Literal["geometry", "network"] = "geometry"
-    """What tells classes and sky. geometry: boxes, heights, colour, needs no download; network: a segmentation network from `weights`."""
+    labeller: Literal["geometry", "embedded", "network"] = "geometry"
+    """What tells classes and sky. geometry: rules for heights, boxes and colour; embedded: the small network that comes with the package,
+    from image, heights and boxes; network: a segmentation network from `weights`."""
     weights: str = ""
-    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it."""
+    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it. labeller
+    embedded: folder of a network trained with tools/train_segmenter.py (empty = the one that comes with the package)."""
     depth: bool = True
     """Write dense depth: LiDAR of several sweeps, filled along the image."""
     depth_network: str = ""

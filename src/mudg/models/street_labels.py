@@ -1,0 +1,155 @@
+"""Labels by the network that comes with the package: ``mudg annotate --labeller embedded``.
+
+The network looks at a picture of at most its own focal length, so that things have the size on it that they had in training, with
+the measured evidence of ``models.evidence`` at the same size. What the evidence settles is then taken out of its hands (``settled``),
+and classes are brought to the image's size by their probabilities.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch.nn import functional
+
+from mudg.base.palette import CLASSES, ID, UNLABELLED
+from mudg.models import street_net
+from mudg.models.evidence import BOX_GROUPS, GROUP_OF, Evidence, encode, gather
+from mudg.models.labellers import (
+    GAP_DEG,
+    GROUND_M,
+    NEAR_ROAD_M,
+    PAVEMENT_M,
+    LabelInput,
+    Labels,
+    find_sky,
+    greenness_of,
+    label_by_network,
+)
+from mudg.models.street_net import StreetNet
+
+RETURN_DEG: Final = 0.12
+"""A pixel nearer than this to a return has a surface: it is no sky."""
+BELOW_RAD: Final = -0.02
+"""Rays that point lower than this do not meet the sky."""
+ROAD_M: Final = 0.8
+"""What surely lies this high above the ground is no road or sidewalk."""
+CORRIDOR_M: Final = 1.8
+"""Flat ground this near to the driven path is road: the vehicle went there."""
+_FLAT: Final = (ID["road"], ID["sidewalk"])
+_THIN: Final = tuple(ID[name] for name in ("person", "rider", "motorcycle", "bicycle"))
+"""These fill little of their boxes: what a measured surface says counts, not the outline."""
+_SMALL: Final = 1e-3
+"""What is left of the probability of a class that is ruled out."""
+
+
+class StreetLabeller:
+    """A network ready for labelling; called with a ``LabelInput`` it returns ``Labels``."""
+
+    def __init__(self, net: StreetNet) -> None:
+        self._net = net
+
+    @classmethod
+    def load(cls, folder: Path | str = "") -> StreetLabeller:
+        """From a folder, or, without one, from the package; errors as in ``street_net.load``."""
+        return cls(street_net.load(folder or street_net.EMBEDDED))
+
+    def __call__(self, given: LabelInput) -> Labels:
+        return label_by_network(given, *self.classes(given))
+
+    def classes(self, given: LabelInput) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Train ids u8[H, W] and the probability of each f32[H, W]."""
+        small = reduced(given, self._net.config.focal_px)
+        evidence = gather(small)
+        found = self._net.probabilities(small.rgb, encode(evidence))
+        found = settled(with_guess(found, guess(small.rgb, evidence), self._net.guess_given_class.numpy()), evidence)
+        return at_size(found, given.rgb.shape[0], given.rgb.shape[1])
+
+
+def reduced(given: LabelInput, focal_px: float) -> LabelInput:
+    """The same at a focal length of at most ``focal_px``; colours are averaged over areas."""
+    camera = given.view.camera
+    scale = focal_px / max(camera.fx, camera.fy)
+    if scale >= 1:
+        return given
+    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    rgb = np.asarray(Image.fromarray(given.rgb).resize((width, height), Image.Resampling.BOX))
+    return dataclasses.replace(given, view=given.view.resized(width, height), rgb=rgb)
+
+
+def guess(rgb: NDArray[np.uint8], evidence: Evidence) -> NDArray[np.uint8]:
+    """Classes u8[H, W] by the plain rules of the geometry labeller, at the size of the evidence, 255 = cannot tell."""
+    known, low = np.isfinite(evidence.depth_m), GROUND_M + 0.005 * np.nan_to_num(evidence.depth_m)
+    green, height = greenness_of(rgb), evidence.height_m
+    ids = np.full(known.shape, UNLABELLED, np.uint8)
+    flat = known & (np.abs(height) < low)
+    ids[flat] = np.where(green[flat] > 6, ID["terrain"], ID["road"])
+    ids[flat & (green <= 6) & (evidence.beside_m > NEAR_ROAD_M) & (height > PAVEMENT_M)] = ID["sidewalk"]
+    standing = ~flat & np.where(known, height > 0, evidence.elevation_rad > 0)
+    ids[standing] = np.where(green[standing] > 0, ID["vegetation"], ID["building"])
+    px_per_deg = 1 / max(1e-6, float(np.rad2deg(np.abs(np.diff(evidence.elevation_rad, axis=0)).max(initial=0))))
+    away_px = np.where(known, evidence.away_deg * px_per_deg, np.inf).astype(np.float32)
+    sky = find_sky(rgb, evidence.elevation_rad, away_px, max(1.5, GAP_DEG * px_per_deg))
+    ids[sky] = ID["sky"]
+    label = np.full(256, UNLABELLED)
+    label[1 : 1 + len(evidence.box_labels)] = evidence.box_labels
+    boxed = evidence.in_box | ((evidence.box > 0) & ~known)
+    ids[boxed] = label[evidence.box[boxed]]
+    return ids
+
+
+def with_guess(
+    probabilities: NDArray[np.float32], ids: NDArray[np.uint8], guess_given_class: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Probabilities f32[19, H, W] by Bayes' rule after a guess u8[H, W] is known, with sum 1.
+
+    Args:
+        guess_given_class: f32[19, 20], how likely each guess is in each class, taken as at least 0.001, so that a guess that training
+            never met says nothing; the last column is "cannot tell".
+    """
+    found = probabilities * np.maximum(guess_given_class, 1e-3)[:, np.minimum(ids, len(CLASSES))]
+    return found / found.sum(0, keepdims=True)
+
+
+def settled(probabilities: NDArray[np.float32], evidence: Evidence) -> NDArray[np.float32]:
+    """Probabilities f32[19, H, W] without what the evidence rules out, with sum 1.
+
+    No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface
+    lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
+    """
+    found = probabilities.copy()
+    measured = evidence.away_deg < RETURN_DEG
+    found[ID["sky"], measured | (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
+    near = evidence.away_deg < 1
+    for index in _FLAT:
+        found[index, near & (evidence.height_m > ROAD_M)] *= _SMALL
+    driven = near & (evidence.beside_m < CORRIDOR_M) & (np.abs(evidence.height_m) < GROUND_M) & (evidence.box == 0)
+    found[ID["sidewalk"], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
+    found[ID["terrain"], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
+    label = np.full(256, -1)
+    label[1 : 1 + len(evidence.box_labels)] = evidence.box_labels
+    around = near & (evidence.box > 0) & ~evidence.in_box & np.isin(label[evidence.box], _THIN)
+    for index in _THIN:
+        found[index, around] *= _SMALL
+    inside = np.where(evidence.in_box, label[evidence.box], -1)
+    for index in np.unique(inside[inside >= 0]):
+        allowed = np.zeros(len(CLASSES), np.float32)
+        allowed[[ID[name] for name in BOX_GROUPS[GROUP_OF[int(index)]]]] = 1
+        found[:, inside == index] = (found[:, inside == index] + _SMALL) * allowed[:, None]
+    return found / found.sum(0, keepdims=True)
+
+
+def at_size(
+    probabilities: NDArray[np.float32], height: int, width: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Most probable classes u8[height, width] and their probabilities f32[height, width]."""
+    maps = torch.from_numpy(probabilities)[None]
+    if maps.shape[2:] != (height, width):
+        maps = functional.interpolate(maps, size=(height, width), mode="bilinear", align_corners=False)
+    confidence, ids = maps[0].max(0)
+    return ids.numpy().astype(np.uint8), confidence.numpy()

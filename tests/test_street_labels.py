@@ -1,0 +1,344 @@
+"""The shipped segmentation network: exact evidence on a made-up street, rules that evidence settles, files, and training that resumes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_annotate import STREET, given_at, overlap
+from toy_scene import ToyStreet
+
+from mudg.base import checkpoint
+from mudg.base.errors import InputError, IntegrityError, ResourceError
+from mudg.base.palette import CLASSES, ID
+from mudg.core.complete import ray_elevation, visible_depth
+from mudg.models import street_net
+from mudg.models.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
+from mudg.models.labellers import TRAIN_ID_OF, labeller
+from mudg.models.street_labels import at_size, guess, reduced, settled, with_guess
+from mudg.models.street_net import StreetNet, StreetNetConfig
+
+TOOLS = Path(__file__).resolve().parent.parent / "tools"
+TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))
+
+
+def made_up(height: int = 4, width: int = 6, **given: np.ndarray) -> Evidence:
+    """Evidence of a road 10 m away, seen by every ray, without boxes."""
+    zero = np.zeros((height, width), np.float32)
+    plain = Evidence(zero, zero + 10, zero, zero + 1, zero, zero - 0.2, zero > 1, zero, zero.astype(np.uint8), zero > 1,
+                     np.zeros(0, np.int64))  # fmt: skip
+    return replace(plain, **given)
+
+
+# --- evidence -----------------------------------------------------------------------------------------------------------
+
+
+def test_evidence_of_a_street_is_what_was_built() -> None:
+    given, truth = given_at(STREET)
+    found = gather(given)
+    _, _, depth = STREET.image(given.view)
+    near = found.away_deg < 0.3
+    road = (truth == ID["road"]) & near & (depth < 25)
+    assert np.abs(found.height_m[road]).max() < 0.4
+    assert np.median(np.abs(found.height_m[road])) < 0.03
+    assert np.median(found.upwards[road]) > 0.97
+    wall = (truth == ID["building"]) & near
+    assert np.median(found.upwards[wall]) < 0.1
+    assert np.median(found.height_m[wall]) > 0.5
+    assert (found.elevation_rad == ray_elevation(given.view)).all()
+    measured = np.isfinite(visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg))
+    assert ((found.away_deg == 0) == measured).all()
+    car = truth == ID["car"]
+    inside = (found.box == 1) & found.in_box
+    assert found.box_labels.tolist() == [ID["car"]]
+    assert (inside & car).sum() / (inside | car).sum() > 0.75
+
+
+def test_without_returns_evidence_says_so_and_keeps_outlines() -> None:
+    found = gather(given_at(STREET, lidar=False)[0])
+    assert np.isnan(found.depth_m).all()
+    assert (found.away_deg == 90).all()
+    assert not found.in_box.any()
+    assert (found.box == 1).any()
+    planes = dict(zip(PLANES, encode(found), strict=False))
+    assert not planes["measured at all"].any()
+    assert (planes["distance to a return"] == 1).all()
+
+
+def test_a_nearer_surface_hides_a_box() -> None:
+    given, truth = given_at(replace(STREET, car_start=(40.0, 0.0)))
+    assert not (truth == ID["car"]).any()
+    assert not (gather(given).box > 0).any()
+
+
+def test_encoding_is_finite_and_of_unit_size() -> None:
+    for lidar in (True, False):
+        planes = encode(gather(given_at(STREET, lidar=lidar)[0]))
+        assert planes.shape[0] == PLANE_COUNT
+        assert planes.dtype == np.float32
+        assert np.abs(planes).max() < 3
+    box = np.zeros((4, 6), np.uint8)
+    box[1, :3], box[2] = 1, 2
+    sure = box == 2
+    labels = np.array([ID["bus"], ID["person"]])
+    groups = encode(made_up(box=box, in_box=sure, box_labels=labels))[len(PLANES) :]
+    bus, person = (next(n for n, g in enumerate(BOX_GROUPS) if name in g) for name in ("bus", "person"))
+    assert (groups[bus] == np.float32(0.4) * (box == 1)).all()
+    assert (groups[person] == (box == 2)).all()
+    assert groups.sum() == pytest.approx(0.4 * 3 + 6)
+    assert {TRAIN_ID_OF[label] for label in TRAIN_ID_OF} <= {ID[name] for group in BOX_GROUPS for name in group}
+
+
+# --- what evidence settles ----------------------------------------------------------------------------------------------
+
+
+def even() -> np.ndarray:
+    return np.full((len(CLASSES), 4, 6), 1 / len(CLASSES), np.float32)
+
+
+def test_sky_is_neither_at_returns_nor_below_the_horizon() -> None:
+    elevation = np.full((4, 6), 0.3, np.float32)
+    elevation[2:] = -0.3
+    away = np.full((4, 6), 5, np.float32)
+    away[:, :2] = 0
+    found = settled(even(), made_up(elevation_rad=elevation, away_deg=away, height_m=away * 0))
+    free = np.zeros((4, 6), bool)
+    free[:2, 2:] = True
+    assert (found[ID["sky"], ~free] < 1e-3).all()
+    assert found[:, free] == pytest.approx(1 / len(CLASSES))
+    assert found.sum(0) == pytest.approx(1)
+
+
+def test_roads_are_low_and_boxes_hold_their_own_classes() -> None:
+    height = np.zeros((4, 6), np.float32)
+    height[0] = 3
+    box = np.zeros((4, 6), np.uint8)
+    box[2:, 3:] = 1
+    inside = box.astype(bool)
+    inside[3] = False
+    found = settled(even(), made_up(height_m=height, box=box, in_box=inside, box_labels=np.array([ID["rider"]])))
+    assert (found[ID["road"], 0] < 1e-3).all()
+    assert (found[ID["road"], 1] > 0.04).all()
+    classes = [ID[name] for name in ("rider", "motorcycle", "bicycle")]
+    assert found[classes][:, 2, 3:].sum(0) == pytest.approx(1)
+    assert (found[classes][:, 3, 3:].sum(0) < 0.01).all()  # in the outline, but not in the box
+    assert found[classes][:, 3, :3].sum(0) == pytest.approx(
+        3 / 16, abs=1e-3
+    )  # no sky; driven ground: no sidewalk, no terrain
+
+
+def test_no_people_beside_or_behind_what_fills_their_box() -> None:
+    box = np.zeros((4, 6), np.uint8)
+    box[2:] = 1
+    found = settled(even(), made_up(box=box, box_labels=np.array([ID["person"]])))
+    assert (found[ID["person"], 2:] < 1e-3).all()
+    assert (found[ID["person"], :2] > 0.04).all()
+    far = settled(
+        even(), made_up(box=box, box_labels=np.array([ID["person"]]), away_deg=np.full((4, 6), 9, np.float32))
+    )
+    assert (far[ID["person"]] > 0.04).all()
+
+
+def test_a_guess_changes_probabilities_by_bayes_rule_and_a_new_one_not_at_all() -> None:
+    table = np.full((len(CLASSES), len(CLASSES) + 1), 0.05, np.float32)
+    table[:, ID["train"]] = 0
+    table[ID["road"], ID["road"]] = 0.8
+    ids = np.full((4, 6), ID["road"], np.uint8)
+    ids[2], ids[3] = ID["train"], 255
+    found = with_guess(even(), ids, table)
+    assert found[ID["road"], :2] == pytest.approx(0.8 / (0.8 + 18 * 0.05))
+    assert found[:, 2:] == pytest.approx(1 / len(CLASSES))
+    assert found.sum(0) == pytest.approx(1)
+
+
+def test_the_guess_knows_road_car_and_sky() -> None:
+    given, truth = given_at(STREET)
+    ids = guess(given.rgb, gather(given))
+    for name in ("road", "car", "sky"):
+        assert overlap(ids, truth, name) > 0.75
+
+
+def test_a_picture_is_looked_at_with_the_focal_length_of_training() -> None:
+    given, _ = given_at(STREET)
+    camera = given.view.camera
+    small = reduced(given, camera.fx / 2)
+    assert small.rgb.shape[:2] == (small.view.camera.height, small.view.camera.width)
+    assert small.rgb.shape[1] == round(camera.width / 2)
+    assert small.view.camera.fx == pytest.approx(camera.fx / 2, rel=0.01)
+    assert reduced(given, camera.fx + 1) is given
+    ids, confidence = at_size(np.eye(len(CLASSES), dtype=np.float32)[:, [[3, 3], [7, 7]]], 40, 20)
+    assert ids.shape == confidence.shape == (40, 20)
+    assert (ids[:10] == 3).all() and (ids[30:] == 7).all()
+
+
+# --- the network --------------------------------------------------------------------------------------------------------
+
+
+def test_every_pixel_gets_scores_at_any_size() -> None:
+    net = StreetNet(TINY).eval()
+    rng = np.random.default_rng(0)
+    for height, width in ((20, 33), (64, 32)):
+        rgb = rng.integers(0, 256, (height, width, 3), np.uint8)
+        found = net.probabilities(rgb, rng.normal(0, 1, (PLANE_COUNT, height, width)).astype(np.float32))
+        assert found.shape == (len(CLASSES), height, width)
+        assert found.sum(0) == pytest.approx(1, abs=1e-5)
+
+
+def test_temperature_flattens_and_keeps_the_order() -> None:
+    net = StreetNet(TINY).eval()
+    rng = np.random.default_rng(0)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.copy_(torch.from_numpy(rng.normal(0, 0.05, parameter.shape).astype(np.float32)))
+    rgb, planes = (
+        rng.integers(0, 256, (32, 32, 3), np.uint8),
+        rng.normal(0, 1, (PLANE_COUNT, 32, 32)).astype(np.float32),
+    )
+    sharp = net.probabilities(rgb, planes)
+    net.config = replace(TINY, temperature=2.0)
+    flat = net.probabilities(rgb, planes)
+    assert (sharp.argmax(0) == flat.argmax(0)).all()
+    assert (flat.max(0) <= sharp.max(0) + 1e-6).all()
+    assert np.log(flat[0] / flat[1]) == pytest.approx(np.log(sharp[0] / sharp[1]) / 2, abs=1e-3)
+
+
+def test_the_shipped_network_knows_a_street_it_never_saw() -> None:
+    given, truth = given_at(STREET)
+    labels = labeller("embedded")(given)
+    assert overlap(labels.semantics, truth, "road") > 0.9
+    assert overlap(labels.semantics, truth, "car") > 0.75
+    assert overlap(labels.semantics, truth, "sky") > 0.9
+    assert labels.confidence.dtype == np.float32
+    assert ((labels.confidence > 0) & (labels.confidence <= 1)).all()
+    assert (labels.depth[labels.sky] == 100).all()
+    again = labeller("embedded")(given)
+    assert (again.semantics == labels.semantics).all()
+    assert (again.confidence == labels.confidence).all()
+
+
+def test_the_shipped_network_works_without_lidar_and_boxes() -> None:
+    given, truth = given_at(STREET, lidar=False, boxes=False)
+    labels = labeller("embedded")(given)
+    assert overlap(labels.semantics, truth, "sky") > 0.9
+    assert np.isnan(labels.depth[~labels.sky]).all()
+
+
+def test_the_shipped_files_are_small_and_explained() -> None:
+    folder = street_net.EMBEDDED
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 8 * 2**20
+    card = (folder / "MODEL_CARD.md").read_text()
+    assert "Apache-2.0" in card
+    assert "generated cities" in card
+
+
+# --- files --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_network_is_read_as_it_was_written(tmp_path: Path) -> None:
+    net = StreetNet(replace(TINY, temperature=1.25)).half().float().eval()
+    street_net.save(net, tmp_path, "card", {"seed": 1})
+    again = street_net.load(tmp_path)
+    assert again.config == net.config
+    for name, value in net.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name])
+
+
+def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
+    street_net.save(StreetNet(TINY), tmp_path / "good", "card", {})
+    with pytest.raises(ResourceError, match="weights are missing"):
+        street_net.load(tmp_path)
+    for field, value, words in (
+        ("widths", [8, 8, 8, 8, 9], "not possible"), ("widths", "8", "not possible"), ("blocks", [1] * 4, "not possible"),
+        ("blocks", [1, 1, 1, 1, 10**9], "not possible"), ("temperature", 0, "positive"), ("focal_px", "x", "positive"),
+        ("widths", [8, 8, 8, 8, 16], "do not fit"),
+    ):  # fmt: skip
+        shutil.rmtree(tmp_path / "bad", ignore_errors=True)
+        shutil.copytree(tmp_path / "good", tmp_path / "bad")
+        content = json.loads((tmp_path / "bad/model.json").read_text())
+        content["config"][field] = value
+        (tmp_path / "bad/model.json").write_text(json.dumps(content))
+        with pytest.raises(InputError, match=words):
+            street_net.load(tmp_path / "bad")
+    weights = tmp_path / "good" / street_net.WEIGHTS_FILE
+    spoilt = bytearray(weights.read_bytes())
+    spoilt[-1] ^= 1
+    weights.write_bytes(spoilt)
+    with pytest.raises(IntegrityError):
+        street_net.load(tmp_path / "good")
+
+
+# --- training -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tools(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOOLS))
+
+
+def options_of(work: Path, run: str, **given: object) -> Namespace:
+    plain = {"seed": 3, "cities": 1, "first_cities": 1, "all_cities_at": 1, "run": run, "start": "", "steps": 2, "batch": 1,
+             "lr": 1e-3, "balance": 0.25, "checkpoint_every": 1, "workers": 0}  # fmt: skip
+    return Namespace(work=work, **plain | given)
+
+
+@pytest.mark.usefixtures("tools")
+def test_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import segmenter_data
+    import train_segmenter
+
+    monkeypatch.setattr(train_segmenter, "StreetNetConfig", lambda: TINY)
+    for number in range(segmenter_data.VIEWS):
+        given, truth = given_at(ToyStreet(car_start=(11.0 + number, 1.0)))
+        made = segmenter_data.Sample(given.rgb, gather(given), truth.astype(np.uint8))
+        segmenter_data.save(train_segmenter.image_file(tmp_path, 0, number), made)
+    train_segmenter.train(options_of(tmp_path, "whole"))
+    with pytest.MonkeyPatch.context() as patch:
+
+        def stopped(options: Namespace, step: int) -> object:
+            if step == 1:
+                raise KeyboardInterrupt
+            return draw(options, step)
+
+        draw = train_segmenter.draw
+        patch.setattr(train_segmenter, "draw", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            train_segmenter.train(options_of(tmp_path, "parts"))
+    train_segmenter.train(options_of(tmp_path, "parts"))
+    one, two = (checkpoint.latest(tmp_path / run) for run in ("whole", "parts"))
+    assert one is not None and two is not None
+    assert one.step == two.step == 2
+    for group in ("net", "average", "moments"):
+        a, b = one.tensors(group), two.tensors(group)
+        assert all(torch.equal(a[name], b[name]) for name in a)
+        assert set(a) == set(b)
+    assert not torch.equal(one.tensors("net")["head.bias"], one.tensors("average")["head.bias"])
+
+
+@pytest.mark.usefixtures("tools")
+def test_variations_are_drawn_anew_and_keep_classes_on_their_pixels() -> None:
+    import segmenter_vary
+    from segmenter_data import Sample
+
+    given, truth = given_at(STREET)
+    sample = Sample(given.rgb, gather(given), truth.astype(np.uint8))
+    rules = segmenter_vary.Rules(no_returns=0.0, no_ground=0.0, no_boxes=0.0)
+    for seed in range(4):
+        rgb, planes, classes = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
+        assert rgb.shape == (3, *segmenter_vary.CROP)
+        assert rgb.dtype == planes.dtype == np.float32
+        assert np.isfinite(rgb).all()
+        assert np.isfinite(planes).all()
+        elevation = planes[PLANES.index("elevation")]
+        assert (elevation[classes == ID["sky"]] > 0).all()
+        assert (elevation[classes == ID["road"]] < 0).all()
+        again = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
+        assert all((a == b).all() for a, b in zip((rgb, planes, classes), again, strict=True))
+    bare = segmenter_vary.disturbed(sample.evidence, np.random.default_rng(0), segmenter_vary.Rules(no_returns=1.0))
+    assert np.isnan(bare.depth_m).all()
+    assert not encode(bare)[PLANES.index("measured at all")].any()
