@@ -197,8 +197,8 @@ def test_temperature_flattens_and_keeps_the_order() -> None:
         for parameter in net.parameters():
             parameter.copy_(torch.from_numpy(rng.normal(0, 0.05, parameter.shape).astype(np.float32)))
     rgb, planes = (
-        rng.integers(0, 256, (32, 32, 3), np.uint8),
-        rng.normal(0, 1, (PLANE_COUNT, 32, 32)).astype(np.float32),
+        rng.integers(0, 256, (64, 64, 3), np.uint8),
+        rng.normal(0, 1, (PLANE_COUNT, 64, 64)).astype(np.float32),
     )
     sharp = net.probabilities(rgb, planes)
     net.config = replace(TINY, temperature=2.0)
