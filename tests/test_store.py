@@ -112,6 +112,15 @@ def test_run_folder_refuses_another_configuration_and_names_the_difference(tmp_p
         store.RunDir.open(tmp_path / "r", "fit", {"value": 1, "nested": {"x": 0.5}}, {"scene": "xyz"})
 
 
+def test_a_run_that_failed_before_it_made_anything_is_in_nobodys_way(tmp_path: Path) -> None:
+    _run(tmp_path / "r")
+    corrected = _run(tmp_path / "r", value=2)
+    assert not corrected.complete
+    store.write_text(corrected.path / "out.txt", "half")
+    with pytest.raises(UsageError, match="value: 2 there, 1 asked"):
+        _run(tmp_path / "r")
+
+
 def test_run_folder_never_touches_foreign_files(tmp_path: Path) -> None:
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / "thesis.tex").write_text("precious")

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 MANIFEST = "manifest.json"
 _MAX_JSON_BYTES = 512 * 1024 * 1024
 _CHUNK = 1 << 20
+_OWN_FILES = frozenset({"run.json", "run.yaml", "lock"})
+"""What a run folder holds before anything is made."""
 
 
 # single files ---------------------------------------------------------------------------------------------------------
@@ -394,7 +396,9 @@ class RunDir:
         state_file = path / "run.json"
         if state_file.is_file():
             state = read_json(state_file)
-            if state.get("key") != key:
+            # A run that failed before it made anything (a mistyped flag) is in nobody's way.
+            other = state.get("key") != key
+            if other and (state.get("state") == "complete" or any(entry.name not in _OWN_FILES for entry in path.iterdir())):
                 cls._refuse_other(path, verb, config, inputs, state)
             if state.get("state") == "complete":
                 cls._verify_finished(path)
