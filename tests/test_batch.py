@@ -131,6 +131,12 @@ def test_many_scenes_fused_by_shards(tmp_path: Path) -> None:
     assert (tmp_path / "fused" / "three" / "static.safetensors").is_file()
 
 
+def test_a_folder_as_list_leaves_out_what_an_earlier_list_wrote_there(tmp_path: Path) -> None:
+    for name in ("b", "a.tfrecord", "status.json", "status-3-of-8.json", ".hidden", "status.yaml"):
+        (tmp_path / name).write_text("")
+    assert [Path(entry.source).name for entry in batch.read_list(tmp_path)] == ["a.tfrecord", "b", "status.yaml"]
+
+
 def test_list_flags_alone_make_no_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["fuse", "scene", "--out", str(tmp_path / "o"), "--shard", "0/2"]) == 2
     assert cli.main(["annotate", "--out", str(tmp_path / "o")]) == 2

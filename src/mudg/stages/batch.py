@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import multiprocessing
 import os
+import re
 import shlex
 import signal
 import sys
@@ -28,6 +29,7 @@ from mudg.data.scene_schema import NAME_PATTERN
 FAILED_BASE: Final = 10
 """Exit code of n failed scenes: this plus n, at most ``FAILED_MOST``; apart from all codes with a meaning of their own."""
 FAILED_MOST: Final = 99
+_STATUS_FILE: Final = re.compile(r"status(-\d+-of-\d+)?\.json")
 
 Work = Callable[["Entry", Path, bool], Path]
 """(entry, output folder, overwrite) -> the folder; a function of a module, since it is called in another process."""
@@ -58,7 +60,7 @@ class Outcome:
 
 
 def read_list(path: Path, settings: Sequence[str] = ()) -> list[Entry]:
-    """Entries of a list file, or one for each entry of a folder.
+    """Entries of a list file, or one for each entry of a folder (but for what an earlier run over a list wrote there).
 
     A line is ``SOURCE [name=NAME] [setting=value ...]``, quoted as in a shell; ``#`` starts a comment. Relative sources count
     from the list's folder. Without a name, the last part of the source is taken.
@@ -71,7 +73,9 @@ def read_list(path: Path, settings: Sequence[str] = ()) -> list[Entry]:
     """
     if path.is_dir():
         lines = [
-            (str(entry), shlex.quote(entry.name)) for entry in sorted(path.iterdir()) if not entry.name.startswith(".")
+            (str(entry), shlex.quote(entry.name))
+            for entry in sorted(path.iterdir())
+            if not entry.name.startswith(".") and not _STATUS_FILE.fullmatch(entry.name)
         ]
         folder = path
     else:
