@@ -175,7 +175,7 @@ def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
 
 def _with_lidar(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
     del options
-    network_class = folders.member(folders.transformers_package(), "PromptDepthAnythingForDepthEstimation")
+    network_class = folders.member(folders.package("transformers"), "PromptDepthAnythingForDepthEstimation")
     network: Any = folders.load_network(network_class, folder, place)
     preparation = Preparation.read(folder, 756, int(network.config.patch_size))
     return TransformersDepth(network, preparation, "depth", with_lidar=True, place=place)
@@ -183,7 +183,7 @@ def _with_lidar(folder: Path, place: Place, options: DepthOptions) -> DepthNetwo
 
 def _from_image(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
     del options
-    network_class = folders.member(folders.transformers_package(), "DepthAnythingForDepthEstimation")
+    network_class = folders.member(folders.package("transformers"), "DepthAnythingForDepthEstimation")
     network: Any = folders.load_network(network_class, folder, place)
     preparation = Preparation.read(folder, 518, int(network.config.patch_size))
     space: Space = "depth" if network.config.depth_estimation_type == "metric" else "disparity"

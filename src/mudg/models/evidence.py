@@ -29,6 +29,7 @@ from mudg.models.labellers import (
     LabelInput,
     box_outline,
     distance_to_path,
+    far_to_near,
     ground_near,
 )
 
@@ -186,14 +187,12 @@ def _boxes(
     A box without a return in it is left out where there are returns at all: it is hidden, or empty.
     """
     view = given.view
-    placed = []
-    for track in given.tracks:
-        pose = track.pose_at(view.time_s) if track.label in TRAIN_ID_OF else None
-        if pose is not None:
-            placed.append((float(np.linalg.norm(pose[:3, 3] - view.center_world)), track, pose))
     box, in_box = np.zeros(depth.shape, np.uint8), np.zeros(depth.shape, bool)
     labels: list[int] = []
-    for _, track, pose in sorted(placed, key=lambda item: -item[0])[-_MAX_BOXES:]:
+    for _, track in far_to_near(given)[-_MAX_BOXES:]:
+        pose = track.pose_at(view.time_s)
+        if pose is None:
+            continue
         outline = box_outline(view, pose, track.size_m + 2 * GROWTH_M)
         if outline is None:
             continue

@@ -43,43 +43,32 @@ class Place:
 CPU: Final = Place()
 
 
-def transformers_package() -> ModuleType:
-    """The transformers package; ResourceError naming the extra where it is missing."""
+def package(name: Literal["transformers", "diffusers"]) -> ModuleType:
+    """A package that reads folders, its progress bars off; ResourceError naming the extra where it is missing."""
     try:
-        package = importlib.import_module("transformers")
+        found = importlib.import_module(name)
     except ImportError as error:
         raise ResourceError(
-            "the transformers package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
+            f"the {name} package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
         ) from error
-    return _quiet(package)
+    return _quiet(found)
 
 
-def diffusers_package() -> ModuleType:
-    """The diffusers package; ResourceError naming the extra where it is missing."""
-    try:
-        package = importlib.import_module("diffusers")
-    except ImportError as error:
-        raise ResourceError(
-            "the diffusers package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
-        ) from error
-    return _quiet(package)
-
-
-def _quiet(package: ModuleType) -> ModuleType:
+def _quiet(found: ModuleType) -> ModuleType:
     """Progress bars of the package would run through ours."""
-    logging = getattr(getattr(package, "utils", None), "logging", None)
+    logging = getattr(getattr(found, "utils", None), "logging", None)
     if logging is not None:
         logging.disable_progress_bar()
-    return package
+    return found
 
 
-def member(package: ModuleType, class_name: str) -> Any:
+def member(owner: ModuleType, class_name: str) -> Any:
     """A class of a package; ResourceError where the installed version is too old to have it."""
-    found = getattr(package, class_name, None)
+    found = getattr(owner, class_name, None)
     if found is None:
         raise ResourceError(
-            f"the installed {package.__name__} package has no {class_name}", where="pretrained network", expected="a newer version",
-            got=str(getattr(package, "__version__", "")), remedy=f"pip install --upgrade {package.__name__}",
+            f"the installed {owner.__name__} package has no {class_name}", where="pretrained network", expected="a newer version",
+            got=str(getattr(owner, "__version__", "")), remedy=f"pip install --upgrade {owner.__name__}",
         )  # fmt: skip
     return found
 

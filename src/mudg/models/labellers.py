@@ -133,7 +133,7 @@ def label_by_geometry(given: LabelInput) -> Labels:
     semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
     confidence[standing] = 0.3
     semantics[sky], confidence[sky] = ID["sky"], 0.8
-    for _, track in _far_to_near(given):
+    for _, track in far_to_near(given):
         _paint_box(semantics, confidence, track, given.view, measured, surface)
     sky &= semantics == ID["sky"]
     return _with_surface(given, semantics, confidence, sky, surface)
@@ -167,10 +167,9 @@ def _network(weights: str, place: Place) -> Labeller:
 
 
 def _embedded(weights: str, place: Place) -> Labeller:
-    del place  # the labels are part of a scene's identity: one device, one order of sums
     from mudg.models.street_labels import StreetLabeller
 
-    return StreetLabeller.load(weights)
+    return StreetLabeller.load(weights, place)
 
 
 LABELLERS: Mapping[str, Callable[[str, Place], Labeller]] = {
@@ -251,7 +250,7 @@ def _measure(given: LabelInput) -> _Measured:
 def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) -> _Surface:
     """Dense depth of what is not sky, and its points."""
     beyond = beyond_reach(given.view, measured.depth_m, given.highest_rad, gap_deg=given.beam_gap_deg)
-    for _, track in _far_to_near(given):  # windows of what is tracked are silent, not far
+    for _, track in far_to_near(given):  # windows of what is tracked are silent, not far
         pose = track.pose_at(given.view.time_s)
         outline = None if pose is None else box_outline(given.view, pose, track.size_m)
         if outline is not None:
@@ -319,8 +318,8 @@ def _beside_path(surface: _Surface, path_world: NDArray[np.float64], step: int =
     return grid.repeat(step, 0).repeat(step, 1)[:height, :width]
 
 
-def _far_to_near(given: LabelInput) -> list[tuple[int, Track]]:
-    """Tracks with a class that are present, and their numbers."""
+def far_to_near(given: LabelInput) -> list[tuple[int, Track]]:
+    """Tracks with a class that are present, the farthest first, and their numbers."""
     here = given.view.center_world
     placed: list[tuple[float, int, Track]] = []
     for number, track in enumerate(given.tracks):
@@ -378,7 +377,7 @@ def _paint_box(
 def find_dynamic(given: LabelInput, semantics: NDArray[np.uint8], surface: _Surface) -> NDArray[np.bool_]:
     """Pixels of tracked things that move, bool[H, W]: the surface lies in their box, or is unsure and has their class."""
     dynamic = np.zeros(semantics.shape, bool)
-    for number, track in _far_to_near(given):
+    for number, track in far_to_near(given):
         box = _box_pixels(track, given.view, surface) if number in given.moving else None
         if box is not None:
             unsure = box.outline & ~(surface.confidence[box.window] > 0.3)

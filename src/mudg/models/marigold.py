@@ -82,7 +82,7 @@ class Marigold:
         """
         path = Path(folder)
         index = folders.read_settings(path / "model_index.json")
-        diffusers, transformers = folders.diffusers_package(), folders.transformers_package()
+        diffusers, transformers = folders.package("diffusers"), folders.package("transformers")
         text = folders.load_network(folders.member(transformers, "CLIPTextModel"), path, place, "text_encoder")
         with torch.no_grad():
             empty_text = text(_empty_tokens(path).to(place.device))[0].float()

@@ -372,7 +372,7 @@ class SkyNode:
         texel_rad = np.pi / self.rows
         stride = int(np.clip(0.7 * texel_rad * min(camera.fx, camera.fy), 1, 8))
         height, width = -(-camera.height // stride), -(-camera.width // stride)
-        grid = torch.from_numpy(self._grid(view, height, width)).to(self.table["panorama"].dtype)
+        grid = torch.from_numpy(self._grid(view, height, width)).to(self.table["panorama"])
         padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
         return F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)[0]
 
@@ -622,7 +622,7 @@ def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
 def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
     """Rendered class logits ``[C, H, W]`` with the sky's logit added where nothing covers it (``sky_lift``)."""
     lift = sky_lift(model, alpha)
-    return extra if lift is None else extra.index_add(0, torch.tensor([lift[0]]), lift[1][None])
+    return extra if lift is None else extra.index_add(0, torch.tensor([lift[0]], device=extra.device), lift[1][None])
 
 
 # ---- starting values ---------------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ class Segmenter:
         train_ids = match_classes(settings.get("id2label", {}), str(path / "config.json"))
         prepared = path / "preprocessor_config.json"
         colors = folders.read_settings(prepared) if prepared.is_file() else {}
-        network_class = folders.member(folders.transformers_package(), KINDS[kind].class_name)
+        network_class = folders.member(folders.package("transformers"), KINDS[kind].class_name)
         network = folders.load_network(network_class, path, place)
         square_px = int(network.config.image_size) if KINDS[kind].square else 0  # type: ignore[union-attr, arg-type]
         mean, deviation = (

@@ -20,6 +20,7 @@ from torch.nn import functional
 from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.models import street_net
 from mudg.models.evidence import BOX_GROUPS, GROUP_OF, Evidence, encode, gather
+from mudg.models.folders import CPU, Place
 from mudg.models.labellers import (
     GAP_DEG,
     GROUND_M,
@@ -51,13 +52,14 @@ _SMALL: Final = 1e-3
 class StreetLabeller:
     """A network ready for labelling; called with a ``LabelInput`` it returns ``Labels``."""
 
-    def __init__(self, net: StreetNet) -> None:
-        self._net = net
+    def __init__(self, net: StreetNet, place: Place = CPU) -> None:
+        """``place``: where the network computes; evidence is gathered on the processor."""
+        self._net, self._place = net.to(place.ready()), place
 
     @classmethod
-    def load(cls, folder: Path | str = "") -> StreetLabeller:
+    def load(cls, folder: Path | str = "", place: Place = CPU) -> StreetLabeller:
         """From a folder, or, without one, from the package; errors as in ``street_net.load``."""
-        return cls(street_net.load(folder or street_net.EMBEDDED))
+        return cls(street_net.load(folder or street_net.EMBEDDED), place)
 
     def __call__(self, given: LabelInput) -> Labels:
         return label_by_network(given, *self.classes(given))
@@ -66,8 +68,9 @@ class StreetLabeller:
         """Train ids u8[H, W] and the probability of each f32[H, W]."""
         small = reduced(given, self._net.config.focal_px)
         evidence = gather(small)
-        found = self._net.probabilities(small.rgb, encode(evidence))
-        found = settled(with_guess(found, guess(small.rgb, evidence), self._net.guess_given_class.numpy()), evidence)
+        with self._place.autocast():
+            found = self._net.probabilities(small.rgb, encode(evidence))
+        found = settled(with_guess(found, guess(small.rgb, evidence), self._net.guess_given_class.cpu().numpy()), evidence)
         return at_size(found, given.rgb.shape[0], given.rgb.shape[1])
 
 

@@ -104,8 +104,9 @@ class StreetNet(nn.Module):
         pad = (0, -width % STRIDE, 0, -height % STRIDE)
         color = functional.pad(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 255, pad, mode="replicate")
         planes = functional.pad(torch.from_numpy(evidence)[None], pad, mode="replicate")
-        scores = self(color, planes)[0, :, :height, :width].float()
-        return (scores / self.config.temperature).softmax(0).numpy()
+        device = self.head.weight.device
+        scores = self(color.to(device), planes.to(device))[0, :, :height, :width].float()
+        return (scores / self.config.temperature).softmax(0).cpu().numpy()
 
 
 # files ----------------------------------------------------------------------------------------------------------------

@@ -57,8 +57,8 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     """
     settings = to_dict(config)
     settings.pop("processes")  # changes no result
-    networks = annotate_depth.digests(config)
-    folder = store.RunDir.open(out, "annotate", settings, inputs_of(config, scene), _VERSION, overwrite)
+    inputs = inputs_of(config, scene)
+    folder = store.RunDir.open(out, "annotate", settings, inputs, _VERSION, overwrite)
     if folder.complete:
         return folder.reused()
     loaded = read_scene(scene)
@@ -70,7 +70,7 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
         aside = folder.path / _ASIDE
         _label_frames(config, Path(scene), loaded, missing, aside)
         source = dataclasses.replace(
-            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, networks, aside))
+            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, inputs, aside))
         )
         with SceneWriter(folder.path, loaded.id, source) as writer:
             add_rest(writer, loaded)
@@ -108,13 +108,13 @@ def wanted_labels(config: AnnotateConfig) -> set[str]:
     )  # fmt: skip
 
 
-def _notes(config: AnnotateConfig, missing: Sequence[Frame], networks: Mapping[str, str], aside: Path) -> Iterator[str]:
+def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str, str], aside: Path) -> Iterator[str]:
     """A sentence for each label that was made: for how many frames, and from what."""
     made_by = f"labeller '{config.labeller}'"
-    if "weights" in networks:
-        made_by += annotate_depth.folder_words(config.weights, networks["weights"])
+    if "weights" in inputs:
+        made_by += annotate_depth.folder_words(config.weights, inputs["weights"])
     depth = annotate_depth.origin(
-        config, networks, [frame.id for frame in missing if "depth" not in frame.labels], aside
+        config, inputs, [frame.id for frame in missing if "depth" not in frame.labels], aside
     )
     origins = {"semantics": made_by, "sky": made_by, "depth": depth, "dynamic": "tracked boxes that move and dense depth",
                "ego": "pixels that stay the same while the vehicle moves"}  # fmt: skip

@@ -66,7 +66,7 @@ class AnnotateConfig:
     depth_steps: int = Field(default=0, ge=0)
     """Marigold: denoising steps (0 = what the folder says, or 50 with LiDAR steering)."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where networks of `weights` and `depth_network` compute."""
+    """Where the networks of labeller and `depth_network` compute."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Of these networks. auto is float32: bfloat16 is faster on some devices, and rounds depth to 0.4 percent."""
     sweeps: int = Field(default=6, ge=1, le=100)
@@ -356,7 +356,7 @@ class FitConfig:
     method: Literal["gs3d", "street_gaussians", "mudg_s"] = "mudg_s"
     """Which nodes and which supervision (see the table of methods)."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
-    """Optimisation steps, one view each. Schedules and learning rates follow this number."""
+    """Optimisation steps, one recorded view each (mudg_s: see virtual_probability). Schedules and learning rates follow this number."""
     seed: int = 0
     """Fixes every random draw."""
     cameras: tuple[str, ...] = ()
