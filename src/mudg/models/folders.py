@@ -46,7 +46,7 @@ CPU: Final = Place()
 def package(name: Literal["transformers", "diffusers"]) -> ModuleType:
     """A package that reads folders, its progress bars off; ResourceError naming the extra where it is missing."""
     try:
-        found = importlib.import_module(name)
+        found = importlib.import_module("transformers") if name == "transformers" else importlib.import_module("diffusers")
     except ImportError as error:
         raise ResourceError(
             f"the {name} package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
