@@ -21,7 +21,7 @@ from tiny_networks import eomt, mask2former, segformer
 
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, ID, UNLABELLED
-from mudg.models import segmenters
+from mudg.models import folders, segmenters
 from mudg.models.segmenters import KINDS, Segmenter, match_classes, tile_starts
 
 NAMES = {"0": "Road", "1": "traffic light", "2": "sky", "3": "unicorn"}
@@ -197,3 +197,32 @@ def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ResourceError, match="models"):
         Segmenter.load(tmp_path)
+
+
+def test_a_network_is_found_in_the_cache_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    revision = "0123456789abcdef0123456789abcdef01234567"
+    home = tmp_path / "hub/models--a-town--streets.b0"
+    segformer(home / "snapshots" / revision)
+    (home / "refs").mkdir()
+    (home / "refs/main").write_text(revision)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    for name in ("a-town/streets.b0", f"a-town/streets.b0@{revision}"):
+        found = folders.find(name)
+        assert found == home / "snapshots" / revision
+        assert folders.title(found) == "a-town/streets.b0@0123456789ab"
+    assert isinstance(Segmenter.load("a-town/streets.b0"), Segmenter)
+    for name in ("a-town/streets.b1", "a-town/streets.b0@other"):
+        with pytest.raises(ResourceError, match="no copy of such a repository") as caught:
+            folders.find(name)
+        assert "hf download a-town/streets" in str(caught.value.remedy)
+
+
+def test_a_folder_goes_before_the_cache_and_paths_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "weights/net").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert folders.find("weights/net") == Path("weights/net")
+    assert folders.find(tmp_path / "nowhere/at/all") == tmp_path / "nowhere/at/all"
+    assert folders.title("weights/net") == "net"
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(ResourceError, match="no such folder, nor the package"):
+        folders.find("weights/other")

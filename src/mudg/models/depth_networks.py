@@ -215,7 +215,7 @@ def kind_of(folder: str | Path) -> str:
     Raises:
         ResourceError: no such folder, or it has no description. InputError: another kind of network.
     """
-    path = Path(folder)
+    path = folders.find(folder)
     for name, key in (("config.json", "model_type"), ("model_index.json", "_class_name")):
         if folder and (path / name).is_file():
             kind = str(folders.read_settings(path / name).get(key))
@@ -231,12 +231,13 @@ def kind_of(folder: str | Path) -> str:
 
 
 def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = DepthOptions()) -> DepthNetwork:
-    """A depth network of the table, read from its folder.
+    """A depth network of the table, read from its folder, or from the Hugging Face cache by its name (``folders.find``).
 
     Raises:
         ResourceError: folder, package or device is missing. InputError: another kind of network, or not all of it.
     """
-    return KINDS[kind_of(folder)](Path(folder), place, options)
+    path = folders.find(folder)
+    return KINDS[kind_of(path)](path, place, options)
 
 
 # --- what every network's depth goes through --------------------------------------------------------------------------

@@ -1,4 +1,5 @@
-"""Pretrained networks in folders, as the packages transformers and diffusers write them: read from disk alone, whole or not at all.
+"""Pretrained networks in folders, as the packages transformers and diffusers write them, or in the Hugging Face cache: read from disk
+alone, whole or not at all.
 
 The packages are extras and imported when a network is asked for. Which class reads a folder is decided by our tables: no name in a
 file becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the network
@@ -8,6 +9,7 @@ has and the folder lacks is an error, where the packages would leave it random a
 from __future__ import annotations
 
 import importlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -43,10 +45,53 @@ class Place:
 CPU: Final = Place()
 
 
-def package(name: Literal["transformers", "diffusers"]) -> ModuleType:
+_IN_HUB: Final = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?")
+
+
+def find(name: str | Path) -> Path:
+    """Folder of a network: ``name`` itself where it is a folder, else the copy of the repository "owner/name" or "owner/name@revision"
+    that lies in the Hugging Face cache of this machine. Nothing is downloaded.
+
+    Raises:
+        ResourceError: neither is there, or the package that knows the cache is missing.
+    """
+    text = str(name)
+    parts = _IN_HUB.fullmatch(text)
+    if Path(name).is_dir() or parts is None:
+        return Path(name)
+    try:
+        hub = package("huggingface_hub")
+    except ResourceError as error:
+        raise ResourceError("no such folder, nor the package that knows the Hugging Face cache", where=text, remedy=_REMEDY) from error
+    try:
+        found = hub.snapshot_download(parts["repository"], revision=parts["revision"], local_files_only=True)
+    except (OSError, ValueError) as error:
+        raise ResourceError(
+            "no such folder, and no copy of such a repository in the Hugging Face cache", where=text, got=str(error).splitlines()[0],
+            expected=f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}", remedy=f"hf download {parts['repository']}",
+        ) from error  # fmt: skip
+    return Path(found)
+
+
+def title(folder: str | Path) -> str:
+    """What a folder is called in notes: "owner/name@revision" of one in the Hugging Face cache, else its own name."""
+    path = Path(folder)
+    parent = path.parent.parent.name
+    if path.parent.name == "snapshots" and parent.startswith("models--"):
+        return f"{parent.removeprefix('models--').replace('--', '/', 1)}@{path.name[:12]}"
+    return path.name
+
+
+def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> ModuleType:
     """A package that reads folders, its progress bars off; ResourceError naming the extra where it is missing."""
     try:
-        found = importlib.import_module("transformers") if name == "transformers" else importlib.import_module("diffusers")
+        match name:
+            case "transformers":
+                found = importlib.import_module("transformers")
+            case "diffusers":
+                found = importlib.import_module("diffusers")
+            case "huggingface_hub":
+                found = importlib.import_module("huggingface_hub")
     except ImportError as error:
         raise ResourceError(
             f"the {name} package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
@@ -57,7 +102,7 @@ def package(name: Literal["transformers", "diffusers"]) -> ModuleType:
 def _quiet(found: ModuleType) -> ModuleType:
     """Progress bars of the package would run through ours."""
     logging = getattr(getattr(found, "utils", None), "logging", None)
-    if logging is not None:
+    if hasattr(logging, "disable_progress_bar"):
         logging.disable_progress_bar()
     return found
 

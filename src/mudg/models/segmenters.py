@@ -77,18 +77,19 @@ class Segmenter:
 
     @classmethod
     def load(cls, folder: str | Path, place: Place = CPU) -> Segmenter:
-        """Read a network from a local folder.
+        """Read a network from a local folder, or from the Hugging Face cache by its name (``folders.find``).
 
         Raises:
             ResourceError: the folder, the device or the transformers package is missing. InputError: another kind of network, one
             that lacks weights, or none of its class names is one of ours.
         """
-        path = Path(folder)
+        path = folders.find(folder)
         if not folder or not (path / "config.json").is_file():
             raise ResourceError(
                 "the labeller's weights are missing", where=str(folder) or "weights",
                 expected="a folder with config.json and model.safetensors",
-                remedy="give the folder of a segmentation network with Cityscapes classes as --weights, or use --labeller geometry",
+                remedy="give the folder of a segmentation network with Cityscapes classes as --weights, or its name in the Hugging Face "
+                "cache, or use --labeller geometry",
             )  # fmt: skip
         settings = folders.read_settings(path / "config.json")
         kind = str(settings.get("model_type"))

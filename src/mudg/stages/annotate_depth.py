@@ -26,7 +26,7 @@ from mudg.models.depth_networks import (
     kind_of,
     load_depth_network,
 )
-from mudg.models.folders import Place
+from mudg.models.folders import Place, find, title
 from mudg.models.labellers import RULES, LabelInput, Labels
 from mudg.stages.config import AnnotateConfig
 
@@ -45,8 +45,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
         UsageError: a depth network, but no depth. ResourceError: its folder is missing. InputError: it holds another kind.
     """
     found: dict[str, str] = {}
-    if config.labeller == "network" and config.weights and Path(config.weights).is_dir():
-        found["weights"] = store.digest(Path(config.weights))
+    if config.labeller == "network" and config.weights and (weights := find(config.weights)).is_dir():
+        found["weights"] = store.digest(weights)
     if config.labeller == "embedded":
         found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
@@ -54,7 +54,7 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
             raise UsageError("a depth network is named, but no depth is asked for", where="--depth-network",
                              remedy="leave out --no-depth, or --depth-network")  # fmt: skip
         kind_of(config.depth_network)
-        found["depth_network"] = store.digest(Path(config.depth_network))
+        found["depth_network"] = store.digest(find(config.depth_network))
     return found
 
 
@@ -103,7 +103,7 @@ def origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequence[s
 
 def folder_words(folder: str, digest: str) -> str:
     """Name (of one that did not come with the package) and digest of a network's folder, in words for the scene's notes."""
-    where = f" in folder '{Path(folder).name}'" if folder else ""
+    where = f" in folder '{title(find(folder))}'" if folder else ""
     return f"{where} (sha256 {digest[:16]})"
 
 

@@ -54,13 +54,14 @@ class AnnotateConfig:
     """What tells classes and sky. geometry: rules for heights, boxes and colour; embedded: the small network that comes with the package,
     from image, heights and boxes; network: a segmentation network from `weights`."""
     weights: str = ""
-    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it. labeller
-    embedded: folder of a network trained with tools/train_segmenter.py (empty = the one that comes with the package)."""
+    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it, or its name in the
+    Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with
+    tools/train_segmenter.py (empty = the one that comes with the package)."""
     depth: bool = True
     """Write dense depth: LiDAR of several sweeps, filled along the image."""
     depth_network: str = ""
-    """Take dense depth from a network, aligned to LiDAR: folder of a PromptDepthAnything, Depth Anything (transformers) or Marigold
-    (diffusers)."""
+    """Take dense depth from a network, aligned to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything, Depth
+    Anything (transformers) or Marigold (diffusers)."""
     depth_guided: bool = True
     """Marigold: LiDAR steers every denoising step (slower); else the result is only aligned to it."""
     depth_steps: int = Field(default=0, ge=0)

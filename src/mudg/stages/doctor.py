@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 _CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
     # module: (what it is for, how to get it)
+    "pyarrow": ("logs of Argoverse 2 and format 2 of Waymo", "pip install 'mudg[data]'"),
+    "transformers": ("networks of annotate from folders", "pip install 'mudg[models]'"),
+    "diffusers": ("Marigold in annotate", "pip install 'mudg[models]'"),
     "gsplat": ("faster rasteriser on CUDA devices", "pip install 'mudg[gsplat]'"),
+    "tensorboard": ("curves of learn --tensorboard", "pip install 'mudg[track]'"),
 }
 _ENCODERS = ("libx264", "h264_videotoolbox", "libopenh264")
 
