@@ -196,6 +196,24 @@ def test_photometric_equals_its_float64_twin(isa: str, shape: tuple[int, int, in
     assert (mine.grad.double() - exact.grad).norm() <= 2e-6 * exact.grad.norm()
 
 
+@pytest.mark.parametrize("shape", [(3, 1, 1), (1, 40, 33), (2, 70, 16), (3, 33, 129)])
+def test_weighted_photometric_equals_its_float64_twin(isa: str, shape: tuple[int, int, int]) -> None:
+    prediction, target = _images(shape)
+    weight = torch.rand(shape[1:], generator=torch.Generator().manual_seed(2)) * (torch.arange(shape[2]) % 5 > 0)
+    mine = prediction.clone().requires_grad_()
+    exact = prediction.double().requires_grad_()
+    got = fused.photometric(mine, target, 0.4, weight)
+    want = losses.photometric(exact, target.double(), 0.4, weight.double())
+    assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
+    got.backward()
+    want.backward()
+    assert mine.grad is not None
+    assert exact.grad is not None
+    assert (mine.grad.double() - exact.grad).norm() <= 2e-6 * exact.grad.norm() + 1e-12
+    whole = fused.photometric(prediction, target, 0.4, torch.ones(shape[1:]))
+    assert whole.item() == pytest.approx(fused.photometric(prediction, target, 0.4).item(), rel=1e-6)
+
+
 @needs_native
 def test_photometric_of_equal_images_is_zero_and_flat() -> None:
     _, target = _images((3, 30, 40))
@@ -224,8 +242,35 @@ def test_photometric_does_not_depend_on_the_number_of_threads(pool: Any) -> None
 def test_photometric_refuses_what_does_not_fit() -> None:
     with pytest.raises(InputError, match="one shape"):
         fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 5))
+    with pytest.raises(InputError, match="every pixel"):
+        fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 0.2, torch.zeros(1, 4, 4))
     with pytest.raises(UsageError, match="SSIM"):
         fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 1.5)
+
+
+# ---- means over boxes ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 2, 9), (1, 4, 40, 33), (2, 5, 129)])
+@pytest.mark.parametrize("size", [1, 5, 7])
+def test_box_mean_equals_its_float64_twin(isa: str, shape: tuple[int, ...], size: int) -> None:
+    generator = torch.Generator().manual_seed(4)
+    values, upstream = (torch.randn(shape, generator=generator) for _ in range(2))
+    mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
+    got, want = fused.box_mean(mine, size), fused.torch_box_mean(exact, size)
+    assert got.shape == values.shape
+    assert (got.double() - want).abs().max() < 1e-6
+    got.backward(upstream)
+    want.backward(upstream.double())
+    assert mine.grad is not None
+    assert exact.grad is not None
+    assert (mine.grad.double() - exact.grad).abs().max() < 2e-6
+
+
+def test_box_mean_keeps_constants_and_wants_odd_sizes() -> None:
+    torch.testing.assert_close(fused.box_mean(torch.full((2, 6, 7), 3.0), 5), torch.full((2, 6, 7), 3.0))
+    with pytest.raises(UsageError, match="odd"):
+        fused.box_mean(torch.zeros(1, 4, 4), 4)
 
 
 def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,6 +282,7 @@ def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.Mon
     assert fused.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
     fused.adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
     torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
+    torch.testing.assert_close(fused.box_mean(prediction, 3), fused.torch_box_mean(prediction, 3))
     cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
     torch.testing.assert_close(fused.over(prediction, cover, target), fused.torch_over(prediction, cover, target))
     got = fused.class_loss(prediction, labels, cover[0], 2.0)

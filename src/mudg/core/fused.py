@@ -1,7 +1,9 @@
-"""Training steps that touch much memory, done in one native pass: losses with their gradients, pictures over the sky, and Adam.
+"""Training steps that touch much memory, done in one native pass: losses with their gradients, pictures over the sky, means over boxes
+of pixels, and Adam.
 
-Each has a plain-torch twin (``core.losses.photometric``, ``core.losses.class_loss``, ``torch_over``, ``core.table.torch_adam_columns``),
-which is used, and named once, where the native library is missing or the tensors are not float32 on the CPU.
+Each has a plain-torch twin (``core.losses.photometric``, ``core.losses.class_loss``, ``torch_over``, ``torch_box_mean``,
+``core.table.torch_adam_columns``), which is used, and named once, where the native library is missing or the tensors are not float32
+on the CPU.
 """
 
 from __future__ import annotations
@@ -22,10 +24,11 @@ from mudg.core import losses
 from mudg.core.table import BETA1, BETA2, EPSILON, AdamColumn, torch_adam_columns
 
 
-def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[C, H, W]`` in [0, 1].
+def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
+    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[C, H, W]`` in [0, 1]; with a weight ``[H, W]`` for every pixel the
+    mean over all of them of weight times ``(1 - w) |p - t| + w (1 - SSIM)``.
 
-    Differentiable in the prediction (once); the target is data. The value does not depend on the number of threads.
+    Differentiable in the prediction (once); target and weight are data. The value does not depend on the number of threads.
     SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding.
 
     Raises:
@@ -37,10 +40,13 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
                          got=str(tuple(target.shape)))  # fmt: skip
     if not 0 <= ssim_weight <= 1:
         raise UsageError("the weight of SSIM must lie in [0, 1]", got=str(ssim_weight))
+    if weight is not None and weight.shape != prediction.shape[1:]:
+        raise InputError("photometric: one weight for every pixel", expected=str(tuple(prediction.shape[1:])), got=str(tuple(weight.shape)))
+    weight = None if weight is None else weight.detach().to(prediction.dtype).contiguous()
     library = _library_for((prediction, target))
     if library is None or prediction.numel() == 0:
-        return losses.photometric(prediction, target, ssim_weight)
-    return _Photometric.apply(prediction, target.detach(), ssim_weight, library)
+        return losses.photometric(prediction, target, ssim_weight, weight)
+    return _Photometric.apply(prediction, target.detach(), weight, ssim_weight, library)
 
 
 def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
@@ -96,6 +102,28 @@ def torch_over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
     """``over`` in plain torch."""
     size = (rgb.shape[1], rgb.shape[2])
     return rgb + (1 - alpha) * functional.interpolate(coarse[None], size=size, mode="bilinear", align_corners=False)[0]
+
+
+def box_mean(values: Tensor, size: int) -> Tensor:
+    """Means over ``size`` x ``size`` pixels (odd), of the same shape ``[..., H, W]``; at the borders, over what is there.
+
+    Differentiable (once).
+
+    Raises:
+        UsageError: an even size.
+    """
+    if size < 1 or size % 2 == 0:
+        raise UsageError("the side of a box of pixels must be odd", got=str(size))
+    library = _library_for((values,))
+    if library is None or values.numel() == 0:
+        return torch_box_mean(values, size)
+    return _BoxMean.apply(values, size // 2, library)
+
+
+def torch_box_mean(values: Tensor, size: int) -> Tensor:
+    """The plain-torch twin of ``box_mean``."""
+    planes = values.reshape(1, -1, *values.shape[-2:])
+    return functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False).reshape(values.shape)
 
 
 def adam(
@@ -178,13 +206,15 @@ def _check_column(column: AdamColumn, first: Tensor, visible: Tensor | None) -> 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float, library: ctypes.CDLL) -> Tensor:
+    def forward(
+        ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float, library: ctypes.CDLL
+    ) -> Tensor:
         image, wanted = prediction.detach().contiguous(), target.contiguous()
         gradient, status = torch.empty_like(image), ctypes.c_int(0)
         library.mudg_photometric.restype = ctypes.c_double
         value = library.mudg_photometric(
-            ctypes.c_void_p(image.data_ptr()), ctypes.c_void_p(wanted.data_ptr()), *map(ctypes.c_int, image.shape),
-            ctypes.c_float(ssim_weight), ctypes.c_void_p(gradient.data_ptr()), ctypes.byref(status),
+            *map(_address, (image, wanted, weight)), *map(ctypes.c_int, image.shape), ctypes.c_float(ssim_weight), _address(gradient),
+            ctypes.byref(status),
         )  # fmt: skip
         if status.value != 0:
             raise ResourceError("not enough memory for the photometric loss", where=f"image {tuple(image.shape)}")
@@ -196,7 +226,7 @@ class _Photometric(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
         # The usual case, a loss term of weight 1, needs no copy.
-        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None
+        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None, None
 
 
 class _ClassLoss(torch.autograd.Function):
@@ -243,6 +273,27 @@ class _Over(torch.autograd.Function):
             *map(_address, (None, cover, small)), ctx.sizes, *map(_address, (None, gradient, of_alpha, of_coarse))
         ))  # fmt: skip
         return upstream, of_alpha, of_coarse, None
+
+
+class _BoxMean(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, radius: int, library: ctypes.CDLL) -> Tensor:
+        ctx.radius, ctx.library = radius, library
+        return _boxes(values.detach(), radius, False, library)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return _boxes(upstream, ctx.radius, True, ctx.library), None, None
+
+
+def _boxes(values: Tensor, radius: int, transposed: bool, library: ctypes.CDLL) -> Tensor:
+    values = values.contiguous()
+    out, (height, width) = torch.empty_like(values), values.shape[-2:]
+    sizes = map(ctypes.c_int, (values.numel() // (height * width), height, width, radius, transposed))
+    if library.mudg_box_mean(_address(values), *sizes, _address(out)) != 0:
+        raise ResourceError("not enough memory for means over boxes of pixels")
+    return out
 
 
 def _address(tensor: Tensor | None) -> ctypes.c_void_p:

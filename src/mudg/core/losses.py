@@ -79,11 +79,15 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     return luminance * (2 * covariance + SSIM_C2) / (variance_p + variance_t + SSIM_C2)
 
 
-def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
 
-    ``core.fused.photometric`` computes the same value and gradient in one native pass.
+    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.fused.photometric`` computes the same value and
+    gradient in one native pass.
     """
+    if weight is not None:
+        both = (1 - ssim_weight) * l1_map(prediction, target) + ssim_weight * (1 - ssim_map(prediction, target))
+        return confident_mean(both, weight)
     return (1 - ssim_weight) * l1_map(prediction, target).mean() + ssim_weight * (1 - ssim_map(prediction, target).mean())
 
 

@@ -25,6 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mudg.base.errors import InputError
+from mudg.core.fused import box_mean
 from mudg.core.metrics import Pair, distance_to_units, unit_features
 from mudg.models.vae import PatchCodec
 
@@ -65,17 +66,12 @@ class FilterBank(nn.Module):
         padded = F.pad(colors[:, :1], (1, 1, 1, 1), mode="replicate")
         slope = F.conv2d(padded, self.derivative.to(colors.dtype))
         power = (slope**2).sum(1, keepdim=True)
-        contrast = torch.sqrt(_pool(power, 7) + self.contrast_floor**2)
+        contrast = torch.sqrt(box_mean(power, 7) + self.contrast_floor**2)
         dx, dy = slope[:, :1] / contrast, slope[:, 1:] / contrast
         diagonal, antidiagonal = (dx + dy) * 0.5**0.5, (dx - dy) * 0.5**0.5
-        energy = _pool(torch.cat([dx, dy, diagonal, antidiagonal], 1) ** 2, 5)
+        energy = box_mean(torch.cat([dx, dy, diagonal, antidiagonal], 1) ** 2, 5)
         amplitude = torch.sqrt(energy + 1e-4)
-        return torch.cat([0.5 * dx, 0.5 * dy, amplitude, 4.0 * _pool(colors, 5)], 1)
-
-
-def _pool(values: Tensor, size: int) -> Tensor:
-    """Box mean over ``size`` x ``size`` pixels, same size out, borders averaged over what is there."""
-    return F.avg_pool2d(values, size, stride=1, padding=size // 2, count_include_pad=False)
+        return torch.cat([0.5 * dx, 0.5 * dy, amplitude, 4.0 * box_mean(colors, 5)], 1)
 
 
 class CodecFeatures(nn.Module):

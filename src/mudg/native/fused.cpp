@@ -1,4 +1,4 @@
-// C interface of the fused training kernels: photometric loss, class loss, pictures over a coarse sky, and Adam.
+// C interface of the fused training kernels: photometric loss, class loss, pictures over a coarse sky, box means, and Adam.
 #include <cmath>
 
 #include "api.h"
@@ -36,14 +36,15 @@ bool prepare_over(OverScratch& scratch, mudg::OverJob& job) {
 
 extern "C" {
 
-// Value of the loss, and its gradient with respect to x (f32[planes][height][width], like y). NaN and status 1: no
-// memory.
-MUDG_API double mudg_photometric(const float* x, const float* y, int planes, int height, int width, float ssim_weight,
-                                 float* gradient, int* status) {
+// Value of the loss, and its gradient with respect to x (f32[planes][height][width], like y); weight f32[height][width] or null. NaN
+// and status 1: no memory.
+MUDG_API double mudg_photometric(const float* x, const float* y, const float* weight, int planes, int height, int width,
+                                 float ssim_weight, float* gradient, int* status) {
   static thread_local PhotometricScratch scratch;
   mudg::PhotometricJob job{};
   job.x = x;
   job.y = y;
+  job.weight = weight;
   job.planes = planes;
   job.height = height;
   job.width = width;
@@ -113,6 +114,16 @@ MUDG_API int mudg_over(const float* rgb, const float* alpha, const float* coarse
   job.of_coarse = of_coarse;
   if (!prepare_over(scratch, job)) return 1;
   mudg::kernels().over(job);
+  return 0;
+}
+
+// Means over squares of 2 radius + 1 pixels, or the transposed map, of f32[planes][height][width]. Status 1: no memory.
+MUDG_API int mudg_box_mean(const float* x, int planes, int height, int width, int radius, int transposed, float* out) {
+  static thread_local mudg::Buffer<float> workers;
+  mudg::BoxJob job{x, planes, height, width, radius, transposed != 0, out, nullptr, mudg::thread_count()};
+  if (!workers.reserve((static_cast<std::size_t>(width) + 2 * radius) * job.workers)) return 1;
+  job.worker_scratch = workers.data();
+  mudg::kernels().box_mean(job);
   return 0;
 }
 

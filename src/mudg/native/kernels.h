@@ -13,6 +13,7 @@ constexpr int kPhotometricApron = 16;  // zeros left and right of a row of a der
 constexpr int kPhotometricStrip = 48;  // rows per piece of work
 struct PhotometricJob {
   const float *x, *y;
+  const float* weight;  // [height][width], null: 1 everywhere
   int planes, height, width;
   float ssim_weight;
   float* gradient;        // like x
@@ -73,6 +74,16 @@ struct OverJob {
   int workers;
 };
 
+// Means over squares of 2 radius + 1 pixels of planar images (box.h), cut at the borders; or the transposed map.
+struct BoxJob {
+  const float* x;
+  int planes, height, width, radius;
+  bool transposed;
+  float* out;
+  float* worker_scratch;  // [workers][width + 2 radius]
+  int workers;
+};
+
 struct Kernels {
   void (*project_forward)(RasterState&, RasterImage&);
   void (*blend_forward)(RasterState&, RasterImage&);
@@ -82,6 +93,7 @@ struct Kernels {
   void (*adam)(const AdamJob&);
   double (*class_loss)(const ClassLossJob&);
   void (*over)(const OverJob&);
+  void (*box_mean)(const BoxJob&);
   double (*peak_multiply_add)(std::int64_t rounds, float* sink);
 };
 

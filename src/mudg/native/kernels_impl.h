@@ -2,6 +2,7 @@
 #pragma once
 
 #include "adam.h"
+#include "box.h"
 #include "classes.h"
 #include "kernels.h"
 #include "loss.h"
@@ -72,7 +73,7 @@ void blend_backward(RasterState& state, const RasterImageGradient& image) {
 }
 
 constexpr Kernels kTable = {project_forward, blend_forward, blend_backward, project_backward, photometric, adam,
-                            class_loss, over, peak_multiply_add};
+                            class_loss, over, box_mean, peak_multiply_add};
 
 }  // namespace
 }  // namespace mudg::MUDG_ISA_NAMESPACE

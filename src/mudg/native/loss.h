@@ -1,4 +1,5 @@
-// (1 - w) mean |x - y| + w (1 - mean SSIM) of planar images, and its gradient with respect to x, in two sweeps.
+// (1 - w) mean |x - y| + w (1 - mean SSIM) of planar images, and its gradient with respect to x, in two sweeps. With a
+// weight for every pixel: the mean over all pixels of weight times (1 - w) |x - y| + w (1 - SSIM).
 //
 // SSIM as usual: 11x11 Gaussian window of sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2. The window is
 // separable: rows are blurred into a ring of eleven, which is then blurred across. The first sweep leaves the
@@ -67,6 +68,14 @@ MUDG_INLINE void blur_inputs(const PhotometricJob& job, const float* x, const fl
   }
 }
 
+// Weights of the pixels from column `at` of a row; 0 beyond its end.
+MUDG_INLINE Floats weight_at(const PhotometricJob& job, int y, int at) {
+  const int count = smaller(kLanes, job.width - at);
+  if (count <= 0) return splat(0.0f);
+  if (job.weight == nullptr) return keep(first_lanes(count), splat(1.0f));
+  return load_first(job.weight + static_cast<std::size_t>(y) * job.width + at, count);
+}
+
 // SSIM at sixteen pixels, and its derivatives with respect to the blurred x, x^2 and x y.
 struct SsimTerms {
   Floats value, of_mean, of_square, of_product;
@@ -83,7 +92,7 @@ MUDG_INLINE SsimTerms ssim_terms(Floats mean_x, Floats mean_y, Floats squares, F
   return {value, of_mean, splat(0.0f) - value * inv_d, two * a * inv_c * inv_d};
 }
 
-// First sweep over a strip of rows of one plane: SSIM and its derivative maps. Returns the sum of SSIM.
+// First sweep over a strip of rows of one plane: SSIM and its derivative maps. Returns the sum of SSIM - 1, weighted.
 double ssim_strip(const PhotometricJob& job, int plane, int y0, int y1, float* scratch) {
   const std::size_t offset = static_cast<std::size_t>(plane) * job.height;
   const RowRing<4> ring = {scratch + 4 * job.row_stride, job.padded_width};
@@ -109,18 +118,18 @@ double ssim_strip(const PhotometricJob& job, int plane, int y0, int y1, float* s
     for (int i = 0; i < job.padded_width; i += kLanes) {
       const SsimTerms s = ssim_terms(blur_column(rows[0], i), blur_column(rows[1], i), blur_column(rows[2], i),
                                      blur_column(rows[3], i));
-      const Mask inside = first_lanes(job.width - i);
-      sums = sums + keep(inside, s.value);
-      store_unaligned(maps[0] + kPhotometricApron + i, keep(inside, s.of_mean));
-      store_unaligned(maps[1] + kPhotometricApron + i, keep(inside, s.of_square));
-      store_unaligned(maps[2] + kPhotometricApron + i, keep(inside, s.of_product));
+      const Floats weight = weight_at(job, y, i);  // 0 beyond the row
+      sums = mul_add(weight, s.value - splat(1.0f), sums);
+      store_unaligned(maps[0] + kPhotometricApron + i, weight * s.of_mean);
+      store_unaligned(maps[1] + kPhotometricApron + i, weight * s.of_square);
+      store_unaligned(maps[2] + kPhotometricApron + i, weight * s.of_product);
     }
     total += sum(sums);
   }
   return total;
 }
 
-// Second sweep: blurs the derivative maps and writes the gradient. Returns the sum of absolute differences.
+// Second sweep: blurs the derivative maps and writes the gradient. Returns the sum of absolute differences, weighted.
 double gradient_strip(const PhotometricJob& job, int plane, int y0, int y1, float* scratch) {
   const std::size_t offset = static_cast<std::size_t>(plane) * job.height;
   const RowRing<3> ring = {scratch, job.padded_width};
@@ -155,8 +164,9 @@ double gradient_strip(const PhotometricJob& job, int plane, int y0, int y1, floa
       const Floats ssim = mul_add(wanted, blur_column(rows[2], i),
                                   mul_add(value + value, blur_column(rows[1], i), blur_column(rows[0], i)));
       const Floats sign = select(difference > zero, of_l1, select(difference < zero, zero - of_l1, zero));
-      sums = sums + abs_of(difference);
-      store(out, neg_mul_add(of_ssim, ssim, sign));
+      const Floats weight = weight_at(job, y, i);
+      sums = mul_add(weight, abs_of(difference), sums);
+      store(out, neg_mul_add(of_ssim, ssim, weight * sign));
       std::memcpy(job.gradient + at + i, out, sizeof(float) * count);
     }
     total += sum(sums);
@@ -187,7 +197,7 @@ double photometric(const PhotometricJob& job) {
   }
   double total = 0.0;  // in a fixed order: the same value for any number of threads
   for (int piece = 0; piece < pieces; ++piece) total += job.partial[piece];
-  return total / (static_cast<double>(job.planes) * job.height * job.width) + job.ssim_weight;
+  return total / (static_cast<double>(job.planes) * job.height * job.width);
 }
 
 }  // namespace

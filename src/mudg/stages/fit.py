@@ -332,11 +332,7 @@ def virtual_terms(
     rgb = rgb if appearance is None else appearance.colored(rgb, sample.name, seen.kind)
     terms: dict[str, Tensor] = {}
     if config.virtual_color_weight:
-        share = config.virtual_ssim_weight
-        loss = (1 - share) * losses.l1_map(rgb, seen.rgb)
-        if share:
-            loss = loss + share * (1 - losses.ssim_map(rgb, seen.rgb))
-        terms["virtual_color"] = config.virtual_color_weight * losses.confident_mean(loss, weight)
+        terms["virtual_color"] = config.virtual_color_weight * kernels.photometric(rgb, seen.rgb, config.virtual_ssim_weight, weight[0])
     if config.virtual_perceptual_weight:
         terms["virtual_perceptual"] = config.virtual_perceptual_weight * perception(rgb, seen.rgb, weight)
     if seen.depth is not None and config.virtual_depth_weight:
