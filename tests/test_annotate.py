@@ -24,10 +24,7 @@ from mudg.models.labellers import (
     TRAIN_ID_OF,
     LabelInput,
     box_outline,
-    distance_to_path,
     find_sky,
-    fit_ground,
-    ground_near,
     label_by_geometry,
     labeller,
 )  # fmt: skip
@@ -135,38 +132,6 @@ def test_labels_of_boxes_are_train_ids() -> None:
 
 
 # --- parts ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("slope", [(0.0, 0.0, -1.7), (0.05, -0.03, 0.4), (-0.12, 0.02, 2.0)])
-def test_ground_plane_is_found_among_walls_and_noise(slope: tuple[float, float, float]) -> None:
-    rng = np.random.default_rng(0)
-    flat = rng.uniform(-30, 30, (6000, 2))
-    ground = np.c_[flat, flat @ slope[:2] + slope[2] + rng.normal(0, 0.02, 6000)]
-    wall = np.c_[np.full(3000, 12.0), rng.uniform(-20, 20, 3000), rng.uniform(0, 8, 3000) + 12 * slope[0] + slope[2]]
-    plane = fit_ground(np.concatenate([ground, wall]).astype(np.float32), np.zeros((3, 3)))
-    assert plane is not None
-    assert np.abs(plane - slope).max() < 0.02
-
-
-def test_no_ground_is_no_plane() -> None:
-    assert fit_ground(np.zeros((0, 3), np.float32), np.zeros((1, 3))) is None
-    cliff = np.random.default_rng(0).uniform(0, 30, (4000, 3))
-    cliff[:, 2] = 1.5 * cliff[:, 0]
-    assert fit_ground(cliff, np.array([[15.0, 15, 0]])) is None
-
-
-def test_ground_is_found_at_the_end_of_a_long_drive() -> None:
-    given, _ = given_at(STREET)
-    behind = given.path_world[:1] - np.c_[np.arange(500.0, 0, -5), np.zeros((100, 2))]
-    long = replace(given, path_world=np.concatenate([behind, given.path_world]))
-    assert ground_near(given) == pytest.approx(ground_near(long))
-
-
-def test_distance_to_path_goes_on_beyond_its_ends() -> None:
-    path = np.c_[np.arange(0, 10, 0.5), np.zeros(20), np.zeros(20)]
-    points = np.array([[5.0, 3, 9], [40, -4, 0], [-30, 2, 0]])
-    assert np.abs(distance_to_path(points, path) - [3, 4, 2]).max() < 0.3
-    assert distance_to_path(points, path[:1])[1] == pytest.approx(np.hypot(40, 4))
 
 
 def test_box_outline_covers_the_projected_box_exactly() -> None:

@@ -21,7 +21,7 @@ from mudg.core.complete import ray_elevation, visible_depth
 from mudg.models import street_net
 from mudg.models.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
 from mudg.models.labellers import TRAIN_ID_OF, labeller
-from mudg.models.street_labels import at_size, guess, reduced, settled, with_guess
+from mudg.models.street_labels import at_size, reduced, settled, settled_by_color
 from mudg.models.street_net import StreetNet, StreetNetConfig
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
@@ -31,8 +31,8 @@ TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))
 def made_up(height: int = 4, width: int = 6, **given: np.ndarray) -> Evidence:
     """Evidence of a road 10 m away, seen by every ray, without boxes."""
     zero = np.zeros((height, width), np.float32)
-    plain = Evidence(zero, zero + 10, zero, zero + 1, zero, zero - 0.2, zero > 1, zero, zero.astype(np.uint8), zero > 1,
-                     np.zeros(0, np.int64))  # fmt: skip
+    plain = Evidence(zero, zero + 10, zero, zero + 1, zero, zero == 0, zero == 0, zero, zero - 0.2, zero > 1, zero,
+                     zero.astype(np.uint8), zero > 1, np.zeros(0, np.int64))  # fmt: skip
     return replace(plain, **given)
 
 
@@ -58,6 +58,16 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     inside = (found.box == 1) & found.in_box
     assert found.box_labels.tolist() == [ID["car"]]
     assert (inside & car).sum() / (inside | car).sum() > 0.75
+
+
+def test_evidence_tells_ground_beyond_a_kerb() -> None:
+    given, truth = given_at(STREET)
+    found = gather(given)
+    near = (found.away_deg < 0.3) & (found.depth_m < 20)
+    road, wall = (truth == ID["road"]) & near, (truth == ID["building"]) & near & (found.height_m > 1)
+    assert found.joined[road].mean() > 0.95
+    assert not found.joined[wall].any()
+    assert (found.raised_m[wall] == 0).all()
 
 
 def test_without_returns_evidence_says_so_and_keeps_outlines() -> None:
@@ -107,7 +117,7 @@ def test_sky_is_neither_at_returns_nor_below_the_horizon() -> None:
     elevation[2:] = -0.3
     away = np.full((4, 6), 5, np.float32)
     away[:, :2] = 0
-    found = settled(even(), made_up(elevation_rad=elevation, away_deg=away, height_m=away * 0))
+    found = settled(even(), made_up(elevation_rad=elevation, away_deg=away, height_m=away * 0, direct=away > 99))
     free = np.zeros((4, 6), bool)
     free[:2, 2:] = True
     assert (found[ID["sky"], ~free] < 1e-3).all()
@@ -145,23 +155,38 @@ def test_no_people_beside_or_behind_what_fills_their_box() -> None:
     assert (far[ID["person"]] > 0.04).all()
 
 
-def test_a_guess_changes_probabilities_by_bayes_rule_and_a_new_one_not_at_all() -> None:
-    table = np.full((len(CLASSES), len(CLASSES) + 1), 0.05, np.float32)
-    table[:, ID["train"]] = 0
-    table[ID["road"], ID["road"]] = 0.8
-    ids = np.full((4, 6), ID["road"], np.uint8)
-    ids[2], ids[3] = ID["train"], 255
-    found = with_guess(even(), ids, table)
-    assert found[ID["road"], :2] == pytest.approx(0.8 / (0.8 + 18 * 0.05))
-    assert found[:, 2:] == pytest.approx(1 / len(CLASSES))
-    assert found.sum(0) == pytest.approx(1)
+def test_joined_ground_is_hardly_sidewalk() -> None:
+    beside = np.full((4, 6), 8, np.float32)
+    joined = np.zeros((4, 6), bool)
+    joined[:, 3:] = True
+    found = settled(even(), made_up(beside_m=beside, direct=joined))[ID["sidewalk"]]
+    assert (found[:, 3:] < 0.002).all()
+    assert (found[:, :3] > 0.05).all()
 
 
-def test_the_guess_knows_road_car_and_sky() -> None:
+def test_outside_boxes_there_is_hardly_anything_that_boxes_are_drawn_around() -> None:
+    box = np.zeros((4, 6), np.uint8)
+    box[:, :2] = 1
+    given = made_up(box=box, in_box=box > 0, box_labels=np.array([ID["car"]]))
+    free, found = settled(even(), given), settled(even(), given, boxes_known=True)
+    assert found[:, :, :2] == pytest.approx(free[:, :, :2])
+    for name in ("car", "person", "bus"):
+        assert (found[ID[name], :, 2:] < 0.2 * free[ID[name], :, 2:]).all()
+    assert (found[ID["pole"], :, 2:] > free[ID["pole"], :, 2:]).all()
+
+
+def test_a_dark_place_is_hardly_sky_unless_all_is_dark() -> None:
     given, truth = given_at(STREET)
-    ids = guess(given.rgb, gather(given))
-    for name in ("road", "car", "sky"):
-        assert overlap(ids, truth, name) > 0.75
+    evidence = gather(given)
+    evenly = np.full((len(CLASSES), *truth.shape), 1 / len(CLASSES), np.float32)
+    found = settled_by_color(evenly, given.rgb, evidence)[ID["sky"]]
+    assert (found[truth == ID["building"]] < 0.01).mean() > 0.9
+    assert (found[truth == ID["sky"]] > 0.05).mean() > 0.9
+    road = (truth == ID["road"]) & evidence.direct
+    grey = settled_by_color(evenly, given.rgb, evidence)
+    assert (grey[ID["terrain"], road] < 0.2 * grey[ID["road"], road]).mean() > 0.9
+    night = settled_by_color(evenly, given.rgb // 16, evidence)
+    assert night[ID["sky"]] == pytest.approx(1 / len(CLASSES))
 
 
 def test_a_picture_is_looked_at_with_the_focal_length_of_training() -> None:
@@ -213,7 +238,7 @@ def test_the_shipped_network_knows_a_street_it_never_saw() -> None:
     labels = labeller("embedded")(given)
     assert overlap(labels.semantics, truth, "road") > 0.9
     assert overlap(labels.semantics, truth, "car") > 0.75
-    assert overlap(labels.semantics, truth, "sky") > 0.9
+    assert overlap(labels.semantics, truth, "sky") > 0.8
     assert labels.confidence.dtype == np.float32
     assert ((labels.confidence > 0) & (labels.confidence <= 1)).all()
     assert (labels.depth[labels.sky] == 100).all()

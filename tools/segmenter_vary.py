@@ -16,23 +16,28 @@ from PIL import Image
 from scipy import ndimage
 from segmenter_data import Sample
 
-from mudg.base.palette import UNLABELLED
+from mudg.base.palette import ID, UNLABELLED
 from mudg.models.evidence import Evidence, encode
+from mudg.models.ground import LOW_M
 
+_FLAT = (ID["road"], ID["sidewalk"])
 CROP = (192, 288)
 """Rows and columns of a training crop."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How often (0..1) a sample goes without its image, colours, returns, boxes, or ground plane."""
+    """How often (0..1) a sample goes without its image, colours, returns, boxes, or ground plane; or the step at the kerb is lost, or found
+    where there is none."""
 
     no_image: float = 0.06
     grey: float = 0.1
     no_returns: float = 0.12
     no_boxes: float = 0.35
     no_ground: float = 0.04
-    recoloured: float = 0.35
+    no_kerb: float = 0.1
+    kerb_everywhere: float = 0.1
+    recoloured: float = 0.5
     largest_scale: float = 1.6
 
 
@@ -55,15 +60,22 @@ def varied(
 
 
 def disturbed(evidence: Evidence, rng: np.random.Generator, rules: Rules) -> Evidence:
-    """Evidence with an error of the ground plane, boxes left out, or without returns."""
+    """Evidence with an error of the ground plane or kerbs, boxes left out, or without returns."""
     height = evidence.height_m + rng.normal(0, 0.05) + rng.normal(0, 0.004) * np.minimum(evidence.depth_m, 60)
     if rng.random() < rules.no_ground or not np.isfinite(height).all():
         height = np.zeros_like(evidence.height_m)
+    joined, luck = evidence.joined, rng.random()
+    if luck < rules.no_kerb:  # lowered, or hidden behind parked cars
+        joined = np.abs(evidence.height_m) < LOW_M
+    elif luck < rules.no_kerb + rules.kerb_everywhere:
+        joined = joined & (evidence.depth_m < rng.uniform(2, 30))
+    raised = evidence.raised_m * rng.uniform(0.4, 1.6) + np.abs(rng.normal(0, 0.02)) * (evidence.raised_m > 0)
     kept = np.ones(256, bool)
     kept[1:] = rng.random(255) >= (1.0 if rng.random() < rules.no_boxes else rng.uniform(0, 0.5))
     kept = kept[evidence.box]
     evidence = dataclasses.replace(
-        evidence, height_m=height.astype(np.float32), rough=evidence.rough * np.float32(rng.uniform(0.5, 1.5)),
+        evidence, height_m=height.astype(np.float32), joined=joined, raised_m=raised.astype(np.float32),
+        rough=evidence.rough * np.float32(rng.uniform(0.5, 1.5)),
         box=np.where(kept, evidence.box, 0).astype(np.uint8), in_box=evidence.in_box & kept,
     )  # fmt: skip
     if rng.random() >= rules.no_returns:
@@ -71,6 +83,7 @@ def disturbed(evidence: Evidence, rng: np.random.Generator, rules: Rules) -> Evi
     zero = np.zeros_like(evidence.height_m)
     return dataclasses.replace(
         evidence, height_m=zero, depth_m=zero + np.float32(np.nan), away_deg=zero + 90, upwards=zero, beside_m=zero,
+        joined=np.zeros_like(joined), direct=np.zeros_like(joined), raised_m=zero,
         silent=np.zeros_like(evidence.silent), rough=zero, in_box=np.zeros_like(evidence.in_box),
     )  # fmt: skip
 
@@ -106,6 +119,7 @@ def coloured(
     if rng.random() < rules.recoloured:  # each class its own tint, brightness and pattern
         gain = np.exp(rng.normal(0, 0.35, (256, 1)) + rng.normal(0, 0.15, (256, 3))).astype(np.float32)
         shift = (rng.normal(0, 0.08, (256, 1)) + rng.normal(0, 0.04, (256, 3))).astype(np.float32)
+        gain[list(_FLAT)] *= np.exp(rng.normal(0, 0.3, (len(_FLAT), 1)))  # a road in the sun is as bright as any sidewalk
         touched = rng.random(256) < rng.uniform(0.2, 1)
         gain[~touched], shift[~touched], shift[UNLABELLED] = 1, 0, 0
         strength = np.where(touched, np.abs(rng.normal(0, 0.15, 256)), 0).astype(np.float32)[truth][..., None]

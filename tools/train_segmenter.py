@@ -38,21 +38,20 @@ from mudg.data import city_logs
 from mudg.models import street_net
 from mudg.models.evidence import encode
 from mudg.models.labellers import label_by_geometry
-from mudg.models.street_labels import StreetLabeller, guess
+from mudg.models.street_labels import StreetLabeller
 from mudg.models.street_net import StreetNet, StreetNetConfig
 
 RECIPE = ("seed", "size", "cities", "first_cities", "all_cities_at", "batch", "lr", "balance")
 AVERAGE = 0.995
 WARMUP = 60
 FALL = 0.4
-GUESS_WEIGHT = 0.6
 
 
 CARD = """# Small segmentation network for streets
 
 Tells the Cityscapes classes of a picture from its colours and from measured evidence at every pixel: height above the
 ground plane, dense depth and how far away it was measured, the surface's direction and roughness, distance to the
-driven path, elevation of the ray, and tracked boxes (`models/evidence.py`). Works, with less, without LiDAR or boxes.
+driven path and whether a step lies between, elevation of the ray, and tracked boxes (`models/evidence.py`). Works, with less, without LiDAR or boxes.
 {parameters:.2f} million parameters, stored in float16.
 
 **Training data**: generated cities only (numbers 0 to {last} of seed {seed}), {images} images at {size} pixels,
@@ -73,7 +72,7 @@ out now and then.
 {scores}```
 
 **Limits**: the train class never occurs in training; a box labelled so is still painted. Fences, walls and poles of
-real streets look different from generated ones. Bonnets of the own vehicle, tunnels, night, rain and snow were not
+real streets look different from generated ones; on recorded images thin things and signs are found badly. Bonnets of the own vehicle, tunnels, night, rain and snow were not
 trained on. Not for use in vehicles.
 
 **Licence**: Apache-2.0, as the package.
@@ -246,7 +245,6 @@ def trained(options: argparse.Namespace) -> tuple[StreetNet, int, float]:
         raise ResourceError("the run has no checkpoint", where=str(options.work / options.run), remedy="train first")
     net = StreetNet(StreetNetConfig())
     put(net, found.tensors("average"))
-    net.guess_given_class = guess_table(options)
     return net.eval().to(memory_format=torch.channels_last), found.step, float(found.state["processor_s"])
 
 
@@ -308,9 +306,8 @@ def score(options: argparse.Namespace) -> None:
 
 
 def temperature(net: StreetNet, options: argparse.Namespace) -> float:
-    """What the network's scores are divided by so that the classes are likeliest, guess included, on varied images of cities that were
-    not trained on."""
-    kept, prior, classes = [], [], []
+    """What the network's scores are divided by so that the classes are likeliest, on varied images of cities that were not trained on."""
+    kept, classes = [], []
     rules = segmenter_vary.Rules()
     for city in range(options.cities, options.cities + options.held_out):
         for number in range(segmenter_data.VIEWS):
@@ -318,44 +315,14 @@ def temperature(net: StreetNet, options: argparse.Namespace) -> float:
             picked = segmenter_data.load(image_file(options.work, city, number))
             rgb = segmenter_vary.coloured(picked.rgb.astype(np.float32) / 255, picked.truth, rng, rules)
             rgb = (np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-            evidence = segmenter_vary.disturbed(picked.evidence, rng, rules)
-            found = net.probabilities(rgb, encode(evidence))
+            found = net.probabilities(rgb, encode(segmenter_vary.disturbed(picked.evidence, rng, rules)))
             rows, columns = (rng.integers(size, size=2000) for size in picked.truth.shape)
-            ids = np.minimum(guess(rgb, evidence), len(CLASSES))[rows, columns]
             kept.append(np.log(np.maximum(found[:, rows, columns], 1e-12)))
-            prior.append(np.log(net.guess_given_class.numpy()[:, ids]))
             classes.append(picked.truth[rows, columns].astype(np.int64))
-    scores, guessed, truth = (np.concatenate(parts, -1) for parts in (kept, prior, classes))
+    scores, target = torch.from_numpy(np.concatenate(kept, 1).T), torch.from_numpy(np.concatenate(classes))
     choices = np.geomspace(0.5, 4, 32)
-    target = torch.from_numpy(truth)
-    losses = [float(functional.cross_entropy(torch.from_numpy((scores / t + guessed).T), target, ignore_index=UNLABELLED))
-              for t in choices]  # fmt: skip
+    losses = [float(functional.cross_entropy(scores / t, target, ignore_index=UNLABELLED)) for t in choices]
     return round(float(choices[int(np.argmin(losses))]), 3)
-
-
-def guess_table(options: argparse.Namespace) -> Tensor:
-    """How likely each guess by plain rules is in each class f32[19, 20], on the training images; boxes missing in some of them.
-
-    Every class counts as if it had been seen a thousand times more, with guesses as frequent as they are overall. The logarithms
-    are made smaller by ``GUESS_WEIGHT``, since network and guess look at the same picture. Kept in WORK/guess.safetensors.
-    """
-    path = options.work / "guess.safetensors"
-    if path.is_file():
-        return torch.from_numpy(store.read_safetensors(path)["guess_given_class"].copy()) ** GUESS_WEIGHT
-    counts = np.zeros((len(CLASSES), len(CLASSES) + 1))
-    rules = segmenter_vary.Rules()
-    for city in range(options.cities):
-        for number in range(segmenter_data.VIEWS):
-            rng = seeds.numpy_rng(options.seed, city, f"segmenter guess {number}")
-            picked = segmenter_data.load(image_file(options.work, city, number))
-            ids = guess(picked.rgb, segmenter_vary.disturbed(picked.evidence, rng, rules))
-            known = picked.truth != UNLABELLED
-            pairs = picked.truth[known].astype(np.int64) * 20 + np.minimum(ids[known], len(CLASSES))
-            counts += np.bincount(pairs, minlength=len(CLASSES) * 20).reshape(counts.shape)
-    counts += 1000 * counts.sum(0) / counts.sum()
-    table = (counts / counts.sum(1, keepdims=True)).astype(np.float32)
-    store.write_safetensors(path, {"guess_given_class": table})
-    return torch.from_numpy(table) ** GUESS_WEIGHT
 
 
 def ship(options: argparse.Namespace) -> None:
@@ -383,13 +350,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--size", default="384x256")
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--cities", type=int, default=90)
+    parser.add_argument("--cities", type=int, default=134)
     parser.add_argument("--first-cities", type=int, default=40, help="cities in use from the first step")
     parser.add_argument("--all-cities-at", type=int, default=500, help="step from which on all are in use")
     parser.add_argument("--run", default="run", help="folder of checkpoints in WORK")
     parser.add_argument("--start", default="", help="folder of a network to begin with")
     parser.add_argument("--workers", type=int, default=1, help="processes that make batches ahead of time")
-    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--lr", type=float, default=2e-3)
     parser.add_argument("--balance", type=float, default=0.25)

@@ -1,8 +1,8 @@
 """What LiDAR, calibration, path and boxes tell about each pixel, as planes of numbers for a segmentation network.
 
 These numbers mean the same in a generated city and in a recorded log, which colours do not: how high a pixel's surface lies above the
-ground, how far away and how far beside the driven path it is, whether it faces upwards, how rough the returns around it are, how far the
-nearest return is, at which elevation the camera looks, and which tracked boxes it lies in.
+ground, how far away and how far beside the driven path it is, whether a kerb lies between, whether it faces upwards, how rough the
+returns around it are, how far the nearest return is, at which elevation the camera looks, and which tracked boxes it lies in.
 
 Depth is filled from the returns at the size of the given view, sky not excepted: where nothing was measured, ``away_deg`` says so.
 """
@@ -22,15 +22,14 @@ from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.core.complete import beyond_reach, complete_depth, ray_elevation, visible_depth
 from mudg.core.fusion import points_in_box
+from mudg.models.ground import GroundMap, above_plane, distance_to_path, map_ground
 from mudg.models.labellers import (
     FLOOR_M,
     GROWTH_M,
     TRAIN_ID_OF,
     LabelInput,
     box_outline,
-    distance_to_path,
     far_to_near,
-    ground_near,
 )
 
 BOX_GROUPS: Final[tuple[tuple[str, ...], ...]] = (
@@ -41,7 +40,7 @@ GROUP_OF: Final[Mapping[int, int]] = {ID[name]: n for n, names in enumerate(BOX_
 """Number of the group of each class that boxes have."""
 PLANES: Final = (
     "height, fine", "height", "log depth", "distance to a return", "upwards", "beside the path", "elevation", "silent", "roughness",
-    "measured at all",
+    "measured at all", "joined to the path", "raised",
 )  # fmt: skip
 """Planes that ``encode`` makes, before one for each of ``BOX_GROUPS``."""
 PLANE_COUNT: Final = len(PLANES) + len(BOX_GROUPS)
@@ -62,6 +61,9 @@ class Evidence:
         upwards: upward part of the surface's normal f32[H, W], 0..1.
         beside_m: horizontal distance to the driven path f32[H, W].
         elevation_rad: of the pixel's ray above the horizontal f32[H, W].
+        joined: bool[H, W], ground that is reached from the driven path without a step.
+        direct: bool[H, W], and that without much of a detour (not given to the network).
+        raised_m: above the lowest ground within 3 m f32[H, W], 0 where it is no ground.
         silent: bool[H, W], the scanner looked, above the road, and nothing came back.
         rough: spread of the logarithm of measured depth around a local plane f32[H, W].
         box: u8[H, W], 1 + place in ``box_labels`` of the nearest box seen here, 0 = none.
@@ -74,6 +76,9 @@ class Evidence:
     away_deg: NDArray[np.float32]
     upwards: NDArray[np.float32]
     beside_m: NDArray[np.float32]
+    joined: NDArray[np.bool_]
+    direct: NDArray[np.bool_]
+    raised_m: NDArray[np.float32]
     elevation_rad: NDArray[np.float32]
     silent: NDArray[np.bool_]
     rough: NDArray[np.float32]
@@ -96,16 +101,19 @@ def gather(given: LabelInput) -> Evidence:
     zero = np.zeros(shape, np.float32)
     if not known.any():
         box, in_box, labels = _boxes(given, None, np.full(shape, np.nan, np.float32), known)
-        return Evidence(zero, np.full(shape, np.nan, np.float32), np.full(shape, 90, np.float32), zero, zero, elevation,
-                        np.zeros(shape, bool), zero, box, in_box, labels)  # fmt: skip
+        return Evidence(zero, np.full(shape, np.nan, np.float32), np.full(shape, 90, np.float32), zero, zero,
+                        zero > 1, zero > 1, zero, elevation, zero > 1, zero, box, in_box, labels)  # fmt: skip
     away_px = np.asarray(ndimage.distance_transform_edt(~known), np.float32)
     beyond = beyond_reach(view, measured, given.highest_rad, gap_deg=gap_deg)
     depth = complete_depth(given.rgb, measured, None, beyond).depth
     xyz = _points(view, depth)
     box, in_box, labels = _boxes(given, xyz, depth, known)
+    ground = map_ground(given.xyz_world, given.path_world, view.center_world)
+    joined, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.at(xyz)
     return Evidence(
-        _height(given, xyz), depth, np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32), _upwards(xyz),
-        _beside(xyz, given.path_world), elevation, beyond, _roughness(measured, gap_deg, view.camera.fy), box, in_box, labels,
+        _height(ground, xyz), depth, np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32), _upwards(xyz),
+        _beside(xyz, given.path_world), joined, direct, raised, elevation, beyond,
+        _roughness(measured, gap_deg, view.camera.fy), box, in_box, labels,
     )  # fmt: skip
 
 
@@ -117,6 +125,7 @@ def encode(evidence: Evidence) -> NDArray[np.float32]:
         np.tanh(evidence.height_m / 0.3), np.tanh(evidence.height_m / 4), np.log(depth / 20) / 1.5,
         np.where(known, np.tanh(evidence.away_deg / 1.5), 1), evidence.upwards, np.tanh(evidence.beside_m / 12),
         np.clip(evidence.elevation_rad / 0.4, -2, 2), evidence.silent, np.tanh(evidence.rough / 0.04), known,
+        evidence.joined, np.tanh(evidence.raised_m / 0.15),
     ]  # fmt: skip
     group = np.full(256, 255)
     group[1 : 1 + len(evidence.box_labels)] = [GROUP_OF[int(label)] for label in evidence.box_labels]
@@ -136,13 +145,11 @@ def _points(view: View, depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return xyz.reshape(*depth.shape, 3).astype(np.float32)
 
 
-def _height(given: LabelInput, xyz: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Height above the ground plane of the part of the path that is near, metres; 0 without a plane."""
-    plane = ground_near(given)
-    if plane is None:
+def _height(ground: GroundMap | None, xyz: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Height above the ground plane, metres; 0 without one."""
+    if ground is None:
         return np.zeros(xyz.shape[:2], np.float32)
-    height = xyz[..., 2] - (plane[0] * xyz[..., 0] + plane[1] * xyz[..., 1] + plane[2])
-    return np.clip(height, -60, 60).astype(np.float32)
+    return np.clip(above_plane(ground.plane, xyz), -60, 60).astype(np.float32)
 
 
 def _upwards(xyz: NDArray[np.float32]) -> NDArray[np.float32]:

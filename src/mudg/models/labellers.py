@@ -3,8 +3,8 @@
 ``geometry`` holds no parameters and needs no download. It starts from dense depth (``core.complete``), knows few classes and says 255
 (unlabelled) where it cannot tell:
 
-* **road**: what lies near a ground plane fitted to the LiDAR. Green ground is **terrain**; beside the path and a kerb's height above the
-  plane it is **sidewalk**. Far beside the path all of it has less confidence.
+* **road**: what lies near a ground plane fitted to the LiDAR. Green ground is **terrain**; other ground that the path
+  does not reach without a step or a detour (``ground.map_ground``) is **sidewalk**. Far beside the path all of it has less confidence.
 * **car, truck, bus, train, person, rider, ...**: tracked boxes, where the dense surface lies in them.
 * **sky**: bright or blue, smooth, above the horizon, joined to the top of the image, and without LiDAR returns.
 * **vegetation**: what rises from the ground, or stands above the horizon, and is green.
@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError
 
 from mudg.base import geometry
 from mudg.base.errors import UsageError
@@ -32,6 +32,7 @@ from mudg.base.types import Track, View
 from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation, visible_depth
 from mudg.core.fusion import points_in_box
 from mudg.models.folders import CPU, Place
+from mudg.models.ground import above_plane, distance_to_path, map_ground
 
 TRAIN_ID_OF: Final[Mapping[str, int]] = {
     "car": ID["car"], "van": ID["car"], "vehicle": ID["car"], "misc": ID["car"], "truck": ID["truck"], "bus": ID["bus"],
@@ -45,16 +46,15 @@ GAP_DEG: Final = 0.6
 """Beams of a turning LiDAR are at most this far apart; between two returns closer than this the surface goes on."""
 GROUND_M: Final = 0.2
 """Height above the ground plane up to which a pixel is ground (and a little more far away)."""
-PAVEMENT_M: Final = 0.07
-"""Ground beside the road that is higher than this is sidewalk."""
+LANE_M: Final = 2.5
+"""Nearer to the path than this, ground beyond a step is still road: the step is an error."""
 FLOOR_M: Final = 0.1
 GROWTH_M: Final = 0.15
 """Boxes begin this far above their floor and are grown by this on each side: annotations are not exact."""
 RULES: Final = CompletionRules()
 NEAR_ROAD_M: Final = 4.0
-NEAR_PATH_M: Final = 30.0
-"""The ground plane belongs to the part of the path within this distance of the camera."""
-_GRASS: Final = 6.0
+GRASS: Final = 6.0
+"""Ground greener than this (``greenness_of``) is terrain."""
 _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
 
 
@@ -67,7 +67,7 @@ class LabelInput:
         rgb: u8[H, W, 3].
         xyz_world: f32[N, 3] metres: LiDAR returns of static things and of things as they stand at the image's time.
         tracks: tracked boxes.
-        path_world: f64[M, 3], places of the vehicle.
+        path_world: f64[M, 3], places of the vehicle (``ground.driven_path``).
         beam_gap_deg: largest angle between neighbouring beams of the LiDAR.
         highest_rad: elevation of its highest beam above the horizontal.
         moving: numbers of the tracks that move at some time of the log.
@@ -195,50 +195,6 @@ def labeller(name: str, weights: str = "", place: Place = CPU) -> Labeller:
 # --- ground and returns ---------------------------------------------------------------------------------------------
 
 
-def fit_ground(
-    xyz_world: NDArray[np.floating], path_world: NDArray[np.float64], reach_m: float = 40.0
-) -> NDArray[np.float64] | None:
-    """Ground plane z = a x + b y + c around the path, f64[3], or None with too few points to tell.
-
-    Starts from the lowest returns of 2 m cells (their lower half by height), then least squares on what lies within
-    0.5, 0.3 and 0.2 m of the plane. A slope above 20 percent is not believed.
-    """
-    if len(xyz_world) < 50 or len(path_world) == 0:
-        return None
-    xyz = np.asarray(xyz_world, np.float64)
-    centre = path_world.mean(0)
-    xyz = xyz[(np.abs(xyz[:, :2] - centre[:2]) < reach_m).all(1)]
-    xyz = xyz[:: max(1, len(xyz) // 60_000)]
-    cells = np.floor(xyz[:, :2] / 2.0).astype(np.int64)
-    key = cells[:, 0] * 1_000_003 + cells[:, 1]
-    order = np.lexsort((xyz[:, 2], key))
-    lowest = xyz[order[np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])]] if len(order) else xyz
-    lowest = lowest[lowest[:, 2] <= np.median(lowest[:, 2])] if len(lowest) else lowest
-    if len(lowest) < 10:
-        return None
-    plane = np.array([0.0, 0.0, float(np.median(lowest[:, 2]))])
-    for support, band_m in ((lowest, 0.5), (xyz, 0.3), (xyz, 0.2)):
-        near = support[np.abs(support[:, 2] - _plane_z(plane, support)) < band_m]
-        if len(near) < 10:
-            return None
-        design = np.c_[near[:, :2], np.ones(len(near))]
-        plane = np.linalg.lstsq(design, near[:, 2], rcond=None)[0]
-    return plane if np.hypot(plane[0], plane[1]) < 0.2 else None
-
-
-def ground_near(given: LabelInput) -> NDArray[np.float64] | None:
-    """``fit_ground`` for the part of the path near the camera: a log is longer than a plane is flat."""
-    path = given.path_world
-    if len(path) == 0:
-        return None
-    away = np.linalg.norm(path[:, :2] - given.view.center_world[:2], axis=1)
-    return fit_ground(given.xyz_world, path[away <= max(NEAR_PATH_M, float(away.min()))])
-
-
-def _plane_z(plane: NDArray[np.float64], xyz: NDArray[np.floating]) -> NDArray[np.float64]:
-    return xyz[:, 0] * plane[0] + xyz[:, 1] * plane[1] + plane[2]
-
-
 def _measure(given: LabelInput) -> _Measured:
     gap_px = max(1.5, float(np.deg2rad(given.beam_gap_deg)) * given.view.camera.fy)
     depth = visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg)
@@ -262,26 +218,6 @@ def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) ->
     return _Surface(xyz.reshape(*sky.shape, 3).astype(np.float32), dense.depth, dense.confidence)
 
 
-def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Horizontal distance of points ``[N, 3]`` to the driven path, gone on straight for 80 m at both ends; metres f64[N].
-
-    A path shorter than half a metre has no direction; then it is the distance to its first place.
-    """
-    if len(path_world) == 0 or len(xyz_world) == 0:
-        return np.zeros(len(xyz_world))
-    far = np.flatnonzero(np.linalg.norm(path_world[:, :2] - path_world[0, :2], axis=1) > 0.5)
-    if len(far) == 0:
-        return np.linalg.norm(xyz_world[:, :2] - path_world[0, :2], axis=1)
-    forward = path_world[far[0], :2] - path_world[0, :2]
-    back = np.flatnonzero(np.linalg.norm(path_world[:, :2] - path_world[-1, :2], axis=1) > 0.5)[-1]
-    onward = path_world[-1, :2] - path_world[back, :2]
-    reach = np.arange(80.0, 0, -2.0)[:, None]
-    before = path_world[0, :2] - reach * forward / np.linalg.norm(forward)
-    after = path_world[-1, :2] + reach[::-1] * onward / np.linalg.norm(onward)
-    line = np.concatenate([before, path_world[:, :2], after])
-    return cKDTree(line).query(xyz_world[:, :2])[0]
-
-
 # --- painting -------------------------------------------------------------------------------------------------------
 
 
@@ -290,18 +226,21 @@ def _paint_surface(
     greenness: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Each pixel of known depth by its height above the ground, its place beside the path, and its colour."""
-    ground = ground_near(given)
     known = np.isfinite(surface.depth)
     height = np.full(known.shape, np.inf, np.float32)
+    direct = np.zeros(known.shape, bool)
+    ground = map_ground(given.xyz_world, given.path_world, given.view.center_world)
     if ground is not None:
-        height = surface.xyz_world[..., 2] - _plane_z(ground, surface.xyz_world.reshape(-1, 3)).reshape(known.shape)
+        height = above_plane(ground.plane, surface.xyz_world)
+        _, direct, _ = ground.at(surface.xyz_world)
     flat = known & (np.abs(height) < GROUND_M + 0.005 * surface.depth)
     beside = _beside_path(surface, given.path_world)
-    green = greenness > _GRASS
+    green = greenness > GRASS
     semantics[flat] = np.where(green[flat], ID["terrain"], ID["road"])
-    confidence[flat] = np.where(beside[flat] < NEAR_ROAD_M, 0.9, 0.5) * (0.3 + 0.7 * surface.confidence[flat])
-    raised = flat & ~green & (beside > NEAR_ROAD_M) & (height > PAVEMENT_M)
-    semantics[raised], confidence[raised] = ID["sidewalk"], 0.4
+    sure = np.where(beside < NEAR_ROAD_M, 0.9, np.where(direct, 0.7, 0.5))
+    confidence[flat] = sure[flat] * (0.3 + 0.7 * surface.confidence[flat])
+    kerbed = flat & ~green & ~direct & (beside > LANE_M)
+    semantics[kerbed], confidence[kerbed] = ID["sidewalk"], 0.4
     standing = known & ~flat & (height > 0)
     semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
     confidence[standing] = 0.3 + 0.2 * surface.confidence[standing]

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn import functional
 
-from mudg.base.palette import CLASSES, ID, UNLABELLED
+from mudg.base.palette import CLASSES, ID
 from mudg.models import street_net
 from mudg.models.evidence import BOX_GROUPS, GROUP_OF, Evidence, encode, gather
 from mudg.models.folders import CPU, Place
 from mudg.models.labellers import (
     GAP_DEG,
+    GRASS,
     GROUND_M,
-    NEAR_ROAD_M,
-    PAVEMENT_M,
+    TRAIN_ID_OF,
     LabelInput,
     Labels,
     find_sky,
@@ -47,6 +47,11 @@ _THIN: Final = tuple(ID[name] for name in ("person", "rider", "motorcycle", "bic
 """These fill little of their boxes: what a measured surface says counts, not the outline."""
 _SMALL: Final = 1e-3
 """What is left of the probability of a class that is ruled out."""
+_RARE: Final = 0.1
+"""And of one that contradicts evidence which is wrong now and then: things that nobody drew a box for."""
+_RARER: Final = 0.02
+"""And where plain rules are better than the network on recorded roads: sunlit lanes look like generated sidewalks, dark crowns of trees
+like what it takes for sky."""
 
 
 class StreetLabeller:
@@ -70,8 +75,8 @@ class StreetLabeller:
         evidence = gather(small)
         with self._place.autocast():
             found = self._net.probabilities(small.rgb, encode(evidence))
-        found = settled(with_guess(found, guess(small.rgb, evidence), self._net.guess_given_class.cpu().numpy()), evidence)
-        return at_size(found, given.rgb.shape[0], given.rgb.shape[1])
+        found = settled(found, evidence, any(track.label in TRAIN_ID_OF for track in given.tracks))
+        return at_size(settled_by_color(found, small.rgb, evidence), given.rgb.shape[0], given.rgb.shape[1])
 
 
 def reduced(given: LabelInput, focal_px: float) -> LabelInput:
@@ -85,45 +90,15 @@ def reduced(given: LabelInput, focal_px: float) -> LabelInput:
     return dataclasses.replace(given, view=given.view.resized(width, height), rgb=rgb)
 
 
-def guess(rgb: NDArray[np.uint8], evidence: Evidence) -> NDArray[np.uint8]:
-    """Classes u8[H, W] by the plain rules of the geometry labeller, at the size of the evidence, 255 = cannot tell."""
-    known, low = np.isfinite(evidence.depth_m), GROUND_M + 0.005 * np.nan_to_num(evidence.depth_m)
-    green, height = greenness_of(rgb), evidence.height_m
-    ids = np.full(known.shape, UNLABELLED, np.uint8)
-    flat = known & (np.abs(height) < low)
-    ids[flat] = np.where(green[flat] > 6, ID["terrain"], ID["road"])
-    ids[flat & (green <= 6) & (evidence.beside_m > NEAR_ROAD_M) & (height > PAVEMENT_M)] = ID["sidewalk"]
-    standing = ~flat & np.where(known, height > 0, evidence.elevation_rad > 0)
-    ids[standing] = np.where(green[standing] > 0, ID["vegetation"], ID["building"])
-    px_per_deg = 1 / max(1e-6, float(np.rad2deg(np.abs(np.diff(evidence.elevation_rad, axis=0)).max(initial=0))))
-    away_px = np.where(known, evidence.away_deg * px_per_deg, np.inf).astype(np.float32)
-    sky = find_sky(rgb, evidence.elevation_rad, away_px, max(1.5, GAP_DEG * px_per_deg))
-    ids[sky] = ID["sky"]
-    label = np.full(256, UNLABELLED)
-    label[1 : 1 + len(evidence.box_labels)] = evidence.box_labels
-    boxed = evidence.in_box | ((evidence.box > 0) & ~known)
-    ids[boxed] = label[evidence.box[boxed]]
-    return ids
-
-
-def with_guess(
-    probabilities: NDArray[np.float32], ids: NDArray[np.uint8], guess_given_class: NDArray[np.float32]
+def settled(
+    probabilities: NDArray[np.float32], evidence: Evidence, boxes_known: bool = False
 ) -> NDArray[np.float32]:
-    """Probabilities f32[19, H, W] by Bayes' rule after a guess u8[H, W] is known, with sum 1.
-
-    Args:
-        guess_given_class: f32[19, 20], how likely each guess is in each class, taken as at least 0.001, so that a guess that training
-            never met says nothing; the last column is "cannot tell".
-    """
-    found = probabilities * np.maximum(guess_given_class, 1e-3)[:, np.minimum(ids, len(CLASSES))]
-    return found / found.sum(0, keepdims=True)
-
-
-def settled(probabilities: NDArray[np.float32], evidence: Evidence) -> NDArray[np.float32]:
     """Probabilities f32[19, H, W] without what the evidence rules out, with sum 1.
 
     No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface
     lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
+    Ground that is directly joined to the path is road rather than sidewalk; where the log has boxes
+    (``boxes_known``), there is hardly anything outside them that boxes are drawn around.
     """
     found = probabilities.copy()
     measured = evidence.away_deg < RETURN_DEG
@@ -134,6 +109,10 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence) -> NDArray[n
     driven = near & (evidence.beside_m < CORRIDOR_M) & (np.abs(evidence.height_m) < GROUND_M) & (evidence.box == 0)
     found[ID["sidewalk"], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
     found[ID["terrain"], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
+    _hand_over(found, evidence.direct, "sidewalk", "road", _RARER)
+    if boxes_known:
+        for index in GROUP_OF:
+            found[index, evidence.box == 0] *= _RARE
     label = np.full(256, -1)
     label[1 : 1 + len(evidence.box_labels)] = evidence.box_labels
     around = near & (evidence.box > 0) & ~evidence.in_box & np.isin(label[evidence.box], _THIN)
@@ -145,6 +124,31 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence) -> NDArray[n
         allowed[[ID[name] for name in BOX_GROUPS[GROUP_OF[int(index)]]]] = 1
         found[:, inside == index] = (found[:, inside == index] + _SMALL) * allowed[:, None]
     return found / found.sum(0, keepdims=True)
+
+
+def settled_by_color(
+    probabilities: NDArray[np.float32], rgb: NDArray[np.uint8], evidence: Evidence
+) -> NDArray[np.float32]:
+    """Probabilities f32[19, H, W] without what the image u8[H, W, 3] speaks against, with sum 1.
+
+    Hardly any sky where the image does not look like it (``labellers.find_sky``: bright or blue, smooth), unless nothing in it does,
+    as at night. Ground that is directly joined to the path and not green is road rather than terrain.
+    """
+    found = probabilities.copy()
+    px_per_deg = 1 / max(1e-6, float(np.rad2deg(np.abs(np.diff(evidence.elevation_rad, axis=0)).max(initial=0))))
+    away_px = np.where(np.isfinite(evidence.depth_m), evidence.away_deg * px_per_deg, np.inf).astype(np.float32)
+    sky = find_sky(rgb, evidence.elevation_rad, away_px, max(1.5, GAP_DEG * px_per_deg))
+    if sky.any():
+        found[ID["sky"], ~sky] *= _RARER
+    _hand_over(found, evidence.direct & (greenness_of(rgb) <= GRASS), "terrain", "road", _RARE)
+    return found / found.sum(0, keepdims=True)
+
+
+def _hand_over(found: NDArray[np.float32], where: NDArray[np.bool_], loser: str, winner: str, kept: float) -> None:
+    """Give the probability of one class to another, but for the share ``kept``."""
+    given = (1 - kept) * found[ID[loser], where]
+    found[ID[winner], where] += given
+    found[ID[loser], where] -= given
 
 
 def at_size(

@@ -63,15 +63,11 @@ class _Block(nn.Module):
 
 
 class StreetNet(nn.Module):
-    """Class scores f32[N, 19, H, W] of colours f32[N, 3, H, W] in 0..1 and evidence f32[N, 15, H, W]; H, W multiples of 32."""
-
-    guess_given_class: Tensor
-    """f32[19, 20]: how likely a guess by plain rules (the last column: none) is in each class; see ``street_labels.with_guess``."""
+    """Class scores f32[N, 19, H, W] of colours f32[N, 3, H, W] in 0..1 and evidence f32[N, 17, H, W]; H, W multiples of 32."""
 
     def __init__(self, config: StreetNetConfig) -> None:
         super().__init__()
         self.config = config
-        self.register_buffer("guess_given_class", torch.ones(len(CLASSES), len(CLASSES) + 1))
         widths = config.widths
         self.stem = nn.Conv2d(4 * (3 + PLANE_COUNT), widths[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 3, 2, padding=1) for a, b in zip(widths, widths[1:]))
@@ -99,7 +95,7 @@ class StreetNet(nn.Module):
 
     @torch.inference_mode()
     def probabilities(self, rgb: NDArray[np.uint8], evidence: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Probability of each class f32[19, H, W] of an image u8[H, W, 3] and its evidence f32[15, H, W], of any size."""
+        """Probability of each class f32[19, H, W] of an image u8[H, W, 3] and its evidence f32[17, H, W], of any size."""
         height, width = rgb.shape[:2]
         pad = (0, -width % STRIDE, 0, -height % STRIDE)
         color = functional.pad(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 255, pad, mode="replicate")

@@ -29,6 +29,7 @@ from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.types import Frame, Scene
 from mudg.data.scenefile import SceneWriter, read_image, read_scene
+from mudg.models.ground import driven_path
 from mudg.models.labellers import LabelInput, Labels, labeller
 from mudg.stages import annotate_depth, batch
 from mudg.stages.annotate_ego import find_ego
@@ -163,12 +164,12 @@ def label_and_put_aside(config: AnnotateConfig, scene: Scene, ids: Sequence[str]
     label = labeller(config.labeller, config.weights, annotate_depth.place(config))
     network = annotate_depth.load(config)
     returns = NearbyReturns(scene, config.sweeps)
-    place = scene.ego.world_from_ego[:, :3, 3]
+    path = driven_path(scene.ego.world_from_ego)
     frames = {frame.id: frame for frame in scene.frames}
     for frame_id in ids:
         frame = frames[frame_id]
         near = returns.of(frame)
-        given = LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, place, near.beam_gap_deg,
+        given = LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, path, near.beam_gap_deg,
                            near.highest_rad, returns.moving)  # fmt: skip
         with _one_thread():
             labels = label(given)
