@@ -16,6 +16,7 @@ import pytest
 import tiny_networks
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 from test_depth_networks import street
 from tiny_networks import package
 from torch import Tensor
@@ -89,16 +90,34 @@ def same(found: dict[str, Tensor], expected: dict[str, Tensor]) -> bool:
 
 
 def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """CLIP as a pickle with the table that it once held, and half precision on the way out."""
-    folder = tmp_path / "copy"
+    """CLIP as a pickle, with the table that it once held and a default said twice; the autoencoder's attention under its old names."""
+    folder, made = tmp_path / "copy", published[1]
     shutil.copytree(published[0], folder)
-    clip = published[1]["clip"].state_dict()
+    clip = made["clip"].state_dict()
     (folder / "CLIP" / "model.safetensors").unlink()
     torch.save(
         {**clip, "vision_model.embeddings.position_ids": torch.arange(5)[None]}, folder / "CLIP" / "pytorch_model.bin"
     )
+    told = json.loads((folder / "CLIP" / "config.json").read_text())
+    inner = {**told["vision_config"], "projection_dim": 512, "num_beams": 1, "torch_dtype": None}
+    (folder / "CLIP" / "config.json").write_text(json.dumps({**told, "vision_config": inner}))
+    renamed = {}
+    for name, value in made["vae"].state_dict().items():
+        for new, old in (
+            (".to_q.", ".query."),
+            (".to_k.", ".key."),
+            (".to_v.", ".value."),
+            (".to_out.0.", ".proj_attn."),
+        ):
+            name = name.replace(new, old)
+        renamed[name] = value
+    file = folder / "marigold-depth-v1-0" / "vae" / "diffusion_pytorch_model.safetensors"
+    save_file(renamed, file, metadata={"format": "pt"})
     convert_depthlab.convert_folder(folder, tmp_path / "out", torch.float16, 1 << 20)
     parts = depthlab.read_parts(tmp_path / "out", json.loads((tmp_path / "out" / "model.json").read_text()))
+    rounded = {name: value.half().float() for name, value in made["vae"].state_dict().items()}
+    assert renamed.keys() != rounded.keys()
+    assert same(parts.vae.state_dict(), rounded)
     found = parts.image_encoder.visual_projection.weight
     assert torch.equal(found, clip["visual_projection.weight"].half().float())
 
