@@ -312,14 +312,16 @@ def prepare(given: DepthInput, sampling: Sampling, cell: int, crop_px: int) -> P
         raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
     low, high = float(depth[known].min()), float(depth[known].max())
     values = ((depth - low) / (high - low + 1e-6) - 0.5) * (2 * sampling.normalize_scale)
-    _, index = ndimage.distance_transform_edt(~known, return_indices=True)
-    scaled = np.array(Image.fromarray(given.rgb).resize(size[::-1], Image.Resampling.BICUBIC))
-    image = torch.from_numpy(scaled).permute(2, 0, 1)[None].float() / 127.5 - 1
-    planes = [torch.from_numpy(np.ascontiguousarray(plane, np.float32))[None, None]
-              for plane in (values[tuple(index)], linear_fill(values), ~known)]  # fmt: skip
+    index: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    scaled = np.array(Image.fromarray(given.rgb).resize((size[1], size[0]), Image.Resampling.BICUBIC))
     fill = (0, -size[1] % cell, 0, -size[0] % cell)
-    padded = [functional.pad(plane, fill, mode="replicate") for plane in (image, *planes)]
-    return Prepared(padded[0], clip_crop(given.rgb, crop_px), *padded[1:], size, low, high)
+
+    def padded(planes: NDArray[Any]) -> Tensor:
+        return functional.pad(torch.from_numpy(planes.astype(np.float32))[None], fill, mode="replicate")
+
+    image = padded(scaled.transpose(2, 0, 1)) / 127.5 - 1
+    nearest, linear = padded(values[tuple(index)][None]), padded(linear_fill(values)[None])
+    return Prepared(image, clip_crop(given.rgb, crop_px), nearest, linear, padded(~known[None]), size, low, high)
 
 
 def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
