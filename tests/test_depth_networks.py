@@ -147,7 +147,13 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, monkeypatch: pytest.M
     tiny_networks.hide(monkeypatch, "diffusers")
     with pytest.raises(ResourceError, match=r"mudg\[models\]"):
         load_depth_network(tmp_path / "m")
-    assert set(KINDS) == {"prompt_depth_anything", "depth_anything", "MarigoldDepthPipeline", "MarigoldPipeline"}
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "model.json").write_text(json.dumps({"kind": "published"}))
+    with pytest.raises(InputError, match="another kind"):
+        kind_of(tmp_path / "d")
+    assert set(KINDS) == {
+        "prompt_depth_anything", "depth_anything", "MarigoldDepthPipeline", "MarigoldPipeline", "depthlab",
+    }  # fmt: skip
 
 
 @real_packages

@@ -137,6 +137,35 @@ def marigold(folder: Path, *, prediction_type: str = "v_prediction", longest_px:
     )  # fmt: skip
 
 
+def depthlab(folder: Path) -> dict[str, Any]:
+    """DepthLab's files as they are published, around a Marigold of ``marigold`` and a CLIP of vectors of six numbers; the networks."""
+    t, d = package("transformers"), package("diffusers")
+    base = marigold(folder / "marigold-depth-v1-0")
+    config = {name: value for name, value in base.unet.config.items() if not name.startswith("_")}
+    tower = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2}
+    clip = t.CLIPModel(
+        t.CLIPConfig(
+            text_config={**tower, "vocab_size": 8, "max_position_embeddings": 8, "bos_token_id": 6, "eos_token_id": 7},
+            vision_config={**tower, "image_size": 28, "patch_size": 14}, projection_dim=6,
+        )
+    )  # fmt: skip
+    seeded(clip, 8)
+    made = {
+        "denoising_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 12}), 5),
+        "reference_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 4}), 6),
+        "mapping_layer": seeded(torch.nn.Linear(6, 8), 7), "vae": base.vae, "clip": _saved(clip, folder / "CLIP"),
+    }  # fmt: skip
+    (folder / "DepthLab").mkdir()
+    for name, prefix in (("denoising_unet", ""), ("reference_unet", ""), ("mapping_layer", "mapping_layer.")):
+        state = {
+            f"{prefix}{key}": value
+            for key, value in made[name].state_dict().items()
+            if name != "reference_unet" or not key.startswith(("conv_norm_out", "conv_out"))
+        }
+        torch.save(state, folder / "DepthLab" / f"{name}.pth")
+    return made
+
+
 def _saved(network: Any, folder: Path) -> Any:
     folder.mkdir(parents=True, exist_ok=True)
     network.save_pretrained(str(folder))

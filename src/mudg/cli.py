@@ -200,9 +200,10 @@ VERBS: dict[str, Verb] = {
         _learn,
     ),
     "convert": Verb(
-        "Published checkpoint -> model folder for synthesize.",
+        "Published checkpoint -> model folder for synthesize or annotate.",
         ("mudg convert 1024-mdm-checkpoint.ckpt --to models/mudg_1024",
-         "mudg convert model.ckpt --to models/dc_512 --resolution 320x512 --dtype bfloat16"),
+         "mudg convert model.ckpt --to models/dc_512 --resolution 320x512 --dtype bfloat16",
+         "mudg convert checkpoints --to weights/depthlab"),
         _convert,
     ),
     "synthesize": Verb(

@@ -106,7 +106,8 @@ class Convert(Common):
     """Flags of ``mudg convert``."""
 
     checkpoint: Annotated[Path, tyro.conf.Positional, arg(metavar="CKPT")]
-    """Checkpoint of MuDG, or of DynamiCrafter-512 or -1024: .ckpt, .pt or .safetensors."""
+    """Checkpoint of MuDG, or of DynamiCrafter-512 or -1024: .ckpt, .pt or .safetensors; or the folder that holds DepthLab's files,
+    Marigold's folder and the image encoder's."""
     to: Annotated[Path, arg(metavar="FOLDER")]
     """Model folder to write."""
     overwrite: FlagCreatePairsOff[bool] = False

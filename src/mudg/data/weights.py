@@ -365,13 +365,24 @@ def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], wher
         InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the counts.
     """
     published = published_names(wanted)
-    missing = [published[name] for name in wanted if published[name] not in found]
-    back = {theirs: ours for ours, theirs in published.items()}
-    unexpected = [name for name in found if name not in back and name not in UNUSED]
+    known = set(published.values())
+    read = {name: value for name, value in found.items() if name in known or name not in UNUSED}
+    match_exactly(read, {published[ours]: shape for ours, shape in wanted.items()}, where, "the published model")
+    return {ours: found[theirs] for ours, theirs in published.items()}
+
+
+def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str, network: str) -> None:
+    """Names and shapes of a checkpoint against what its network needs, strictly; ``network``: what to call it.
+
+    Raises:
+        InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the counts.
+    """
+    missing = [name for name in wanted if name not in found]
+    unexpected = [name for name in found if name not in wanted]
     misshaped = [
-        f"{name} {tuple(found[name].shape)} instead of {tuple(wanted[ours])}"
-        for name, ours in back.items()
-        if name in found and tuple(found[name].shape) != tuple(wanted[ours])
+        f"{name} {tuple(found[name].shape)} instead of {tuple(shape)}"
+        for name, shape in wanted.items()
+        if name in found and tuple(found[name].shape) != tuple(shape)
     ]
     if missing or unexpected or misshaped:
         lines = [
@@ -381,10 +392,9 @@ def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], wher
         ]
         raise InputError(
             "the checkpoint is not the network it should be", where=where,
-            expected=f"{len(wanted)} tensors of the published model", got="; ".join(lines),
+            expected=f"{len(wanted)} tensors of {network}", got="; ".join(lines),
             remedy="check that the file is complete and of the right kind",
         )  # fmt: skip
-    return {ours: found[theirs] for theirs, ours in back.items()}
 
 
 # safetensors folders --------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@
 | PromptDepthAnything | metric depth | image and a small map of depth from LiDAR |
 | Depth Anything, V1 and V2 | inverse depth up to scale and shift, or metric depth | image alone |
 | Marigold (``models.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
+| DepthLab (``models.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
 Whatever comes out is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the
 sky is put at its fixed distance, and the confidence is taken from how far the aligned depth is off at the returns near a pixel.
@@ -69,7 +70,7 @@ class DepthOptions:
     """Numbers for networks that denoise; others do not read them.
 
     Args:
-        guided: LiDAR steers every denoising step, instead of aligning the result only.
+        guided: Marigold: LiDAR steers every denoising step, instead of aligning the result only.
         steps: denoising steps; 0 = the folder's own number, or 50 where LiDAR steers.
     """
 
@@ -196,6 +197,12 @@ def _marigold(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork
     return Marigold.load(folder, place, guided=options.guided, steps=options.steps)
 
 
+def _depthlab(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
+    from mudg.models.depthlab import DepthLab
+
+    return DepthLab.load(folder, place, steps=options.steps)
+
+
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
@@ -204,9 +211,11 @@ KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] 
     "depth_anything": _from_image,
     "MarigoldDepthPipeline": _marigold,
     "MarigoldPipeline": _marigold,
+    "depthlab": _depthlab,
 }
-"""``model_type`` of a folder's ``config.json``, or ``_class_name`` of its ``model_index.json`` -> what reads the folder. The two last
-are one kind: early folders have the shorter name."""
+"""``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the ``model.json`` that
+``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders have the shorter name."""
+_DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_class_name"), ("model.json", "kind"))
 
 
 def kind_of(folder: str | Path) -> str:
@@ -216,7 +225,7 @@ def kind_of(folder: str | Path) -> str:
         ResourceError: no such folder, or it has no description. InputError: another kind of network.
     """
     path = folders.find(folder)
-    for name, key in (("config.json", "model_type"), ("model_index.json", "_class_name")):
+    for name, key in _DESCRIPTIONS:
         if folder and (path / name).is_file():
             kind = str(folders.read_settings(path / name).get(key))
             if kind not in KINDS:
@@ -225,7 +234,7 @@ def kind_of(folder: str | Path) -> str:
             return kind
     raise ResourceError(
         "the depth network's weights are missing", where=str(folder) or "--depth-network",
-        expected="a folder with config.json (transformers) or model_index.json (diffusers)",
+        expected="a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)",
         remedy="give the folder of such a network as --depth-network, or leave the flag out",
     )  # fmt: skip
 

@@ -15,6 +15,7 @@ image, so that a video does not flicker for its sake.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -37,6 +38,7 @@ PLAIN_STEPS: Final = 10
 RATE: Final = 0.05
 """Adam's rate for the latent, as published."""
 PROCESSING_PX: Final = 768
+SCHEDULE_FILE: Final = "scheduler/scheduler_config.json"
 MAX_RETURNS: Final = 50_000
 """Returns that steer; more are thinned evenly."""
 
@@ -86,10 +88,12 @@ class Marigold:
         text = folders.load_network(folders.member(transformers, "CLIPTextModel"), path, place, "text_encoder")
         with torch.no_grad():
             empty_text = text(_empty_tokens(path).to(place.device))[0].float()
+        schedule = path / SCHEDULE_FILE
         parts = Parts(
             folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet"),
             folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae"),
-            _scheduler(folders.member(diffusers, "DDIMScheduler"), path), empty_text,
+            ddim_scheduler(folders.member(diffusers, "DDIMScheduler"), folders.read_settings(schedule), str(schedule)),
+            empty_text,
         )  # fmt: skip
         space: Space = "disparity" if index.get("prediction_type") == "disparity" else "depth"
         usual = GUIDED_STEPS if guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
@@ -219,13 +223,11 @@ def _returns(given: DepthInput, space: Space, device: str) -> _Returns | None:
     )
 
 
-def _scheduler(scheduler_class: Any, folder: Path) -> Any:
-    """The DDIM scheduler that the folder describes; InputError for another one."""
-    file = folder / "scheduler" / "scheduler_config.json"
-    told = folders.read_settings(file)
+def ddim_scheduler(scheduler_class: Any, told: Mapping[str, Any], where: str) -> Any:
+    """The DDIM scheduler of diffusers that a description tells; InputError for another one."""
     if told.get("_class_name") != "DDIMScheduler" or told.get("prediction_type", "epsilon") not in _PREDICTIONS:
         raise InputError(
-            "the folder's noise schedule is of another kind", where=str(file), expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}",
+            "the folder's noise schedule is of another kind", where=where, expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}",
             got=f"{told.get('_class_name')}, {told.get('prediction_type')}",
         )  # fmt: skip
     return scheduler_class.from_config({name: value for name, value in told.items() if not name.startswith("_")})

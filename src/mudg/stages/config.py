@@ -61,11 +61,11 @@ class AnnotateConfig:
     """Write dense depth: LiDAR of several sweeps, filled along the image."""
     depth_network: str = ""
     """Take dense depth from a network, aligned to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything, Depth
-    Anything (transformers) or Marigold (diffusers)."""
+    Anything (transformers) or Marigold (diffusers), or folder of a DepthLab (mudg convert)."""
     depth_guided: bool = True
     """Marigold: LiDAR steers every denoising step (slower); else the result is only aligned to it."""
     depth_steps: int = Field(default=0, ge=0)
-    """Marigold: denoising steps (0 = what the folder says, or 50 with LiDAR steering)."""
+    """Marigold and DepthLab: denoising steps (0 = what the folder says, or 50 with LiDAR steering)."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the networks of labeller and `depth_network` compute."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"

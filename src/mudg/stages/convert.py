@@ -1,4 +1,4 @@
-"""convert: a published checkpoint -> a model folder that `synthesize` and training read.
+"""convert: a published checkpoint -> a model folder that `synthesize` and training read; or DepthLab's (`convert_depthlab`).
 
 The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's restricted
 unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so that the
@@ -7,12 +7,9 @@ text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no 
 
 from __future__ import annotations
 
-import concurrent.futures
-import multiprocessing
-import sys
+import functools
 import zipfile
-from collections.abc import Mapping
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,15 +18,14 @@ import torch
 from torch import Tensor
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import InputError, UsageError
 from mudg.data import weights
 from mudg.models import clip
 from mudg.models.clip import TextTower
 from mudg.models.published import SCALE_ENTRIES, PublishedConfig, PublishedMDM
-from mudg.stages import published_model
+from mudg.stages import confined, convert_depthlab, published_model
 from mudg.stages.config import ConvertConfig
 
-GIB = 1 << 30
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
 DTYPES = {"keep": None, "float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
@@ -51,7 +47,7 @@ def run(
     """Convert one checkpoint; returns `to`, which is whole or not there.
 
     Args:
-        config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file.
+        config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's files.
         to: folder of the model; replaced only with `overwrite`.
         network: sizes of the network the checkpoint should hold (None: the published ones).
 
@@ -64,27 +60,39 @@ def run(
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
     if to.exists() and not (to / "model.json").is_file():
         raise UsageError("the folder holds something else than a model", where=str(to), remedy="choose another --to")
+    work, limit = (
+        _from_folder(config, checkpoint, to) if checkpoint.is_dir() else _from_file(config, checkpoint, to, network)
+    )
+    with log.task("convert", 1) as bar:
+        peak = confined.run(work, limit, checkpoint)
+        bar.advance()
+    memory = f"; peak memory {peak / confined.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
+    log.info(f"convert: {to} is whole{memory}")
+    return to
+
+
+def _from_file(
+    config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None
+) -> tuple[Callable[[], None], int]:
+    """The conversion of a checkpoint, and the address space it may take."""
     if not checkpoint.is_file():
         raise InputError("no such checkpoint", where=str(checkpoint))
     height, width = resolution(config, checkpoint)
     network = replace(network or PublishedConfig(), height=height, width=width)
-    limit = memory_limit(config, checkpoint)
-    if sys.platform != "linux":
-        log.warn("convert: this system has no limit of address space; a hostile file may take all memory")
-    context = multiprocessing.get_context("spawn")
-    with log.task("convert", 1) as bar, concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
-        try:
-            peak = pool.submit(_in_process, config, checkpoint, to, network, limit).result()
-        except BrokenProcessPool as error:
-            raise ResourceError(
-                "the converting process was ended from outside, most likely for want of memory", where=str(checkpoint),
-                expected=f"about {limit / GIB:.0f} GiB of address space, of which the file takes most",
-                remedy="close other programs, or convert on a machine with more memory",
-            ) from error  # fmt: skip
-        bar.advance()
-    memory = f"; peak memory {peak / GIB:.1f} GiB, pages of the mapped file included" if peak else ""
-    log.info(f"convert: {to} is whole{memory}")
-    return to
+    towers = [Path(config.towers)] if config.towers and Path(config.towers).is_file() else []
+    return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint, *towers)
+
+
+def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Callable[[], None], int]:
+    """The conversion of DepthLab's files, and the address space it may take."""
+    if config.resolution != "auto" or config.towers:
+        raise UsageError("a folder is read as DepthLab, which has neither resolution nor towers", where=str(folder),
+                         remedy="leave out --resolution and --towers, or name a checkpoint file")  # fmt: skip
+    files = convert_depthlab.find(folder).files()
+    work = functools.partial(
+        convert_depthlab.convert_folder, folder, to, DTYPES[config.dtype], config.shard_mb << 20
+    )  # fmt: skip
+    return work, memory_limit(config, *files)
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
@@ -102,42 +110,16 @@ def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
     )  # fmt: skip
 
 
-def memory_limit(config: ConvertConfig, checkpoint: Path) -> int:
+def memory_limit(config: ConvertConfig, *files: Path) -> int:
     """Address space in bytes that conversion may add to what a process with torch has.
 
-    The file, mapped (or read, and then copied once, where its format cannot be mapped), twice the largest weight file
+    The files, mapped (or read, and then copied once, where their format cannot be mapped), twice the largest weight file
     written, 3 GiB for working.
     """
     if config.memory_gb:
         return int(config.memory_gb * 1e9)
-    size = checkpoint.stat().st_size
-    towers = Path(config.towers).stat().st_size if config.towers and Path(config.towers).is_file() else 0
-    copies = 1 if zipfile.is_zipfile(checkpoint) else 2
-    return copies * (size + towers) + 2 * config.shard_mb * (1 << 20) + 3 * GIB
-
-
-def _in_process(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig, limit: int) -> int:
-    """Convert under a limit of address space (Linux only); returns the peak of resident memory in bytes, 0 if unknown."""
-    log.set_quiet(True)
-    torch.set_num_threads(1)
-    if sys.platform != "linux":
-        convert_file(config, checkpoint, to, network)
-        return 0
-    import resource
-
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + limit
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    try:
-        convert_file(config, checkpoint, to, network)
-    except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and not weights.out_of_memory(error):
-            raise
-        raise ResourceError(
-            "conversion needs more memory than it may take", where=str(checkpoint), expected=f"<= {limit / 1e9:.1f} GB",
-            got=(str(error).splitlines() or [""])[0][:200], remedy="raise --memory-gb, unless the file should be small",
-        ) from error  # fmt: skip
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    read = sum(path.stat().st_size * (1 if zipfile.is_zipfile(path) else 2) for path in files)
+    return read + 2 * config.shard_mb * (1 << 20) + 3 * confined.GIB
 
 
 def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig) -> None:
