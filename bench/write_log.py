@@ -1,6 +1,6 @@
 """A generated city written as a log of a data set, with its sensors and image sizes: something to measure an importer on.
 
-    python bench/write_log.py {kitti360,pandaset,nuplan} FOLDER [--frames 6]
+    python bench/write_log.py {kitti360,pandaset,nuplan,custom} FOLDER [--frames 6]
     python bench/ingest_cost.py FORMAT FOLDER
 
 The logs are written by the writers of ``tests/``; cameras that the city's car lacks show another camera's images.
@@ -19,6 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import roundtrip
+from write_custom import write_log
 from write_kitti360 import write_kitti360
 from write_nuplan import write_nuplan
 from write_pandaset import write_pandaset
@@ -36,7 +37,7 @@ NUPLAN = {f"CAM_{name}": ("front", "front_left")[k % 2] for k, name in enumerate
 def main() -> None:
     """Write one log."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("format", choices=("kitti360", "pandaset", "nuplan"))
+    parser.add_argument("format", choices=("kitti360", "pandaset", "nuplan", "custom"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--frames", type=int, default=6)
     asked = parser.parse_args()
@@ -45,6 +46,8 @@ def main() -> None:
                      lidar_azimuth_step_deg=0.13)  # fmt: skip
     if asked.format == "kitti360":
         config = replace(config, width=1408, height=376, lidar_azimuth_step_deg=0.18)
+    if asked.format == "custom":
+        config = replace(config, width=960, height=640)
     with tempfile.TemporaryDirectory() as folder:
         truth = write_city(config, Path(folder) / "city")
         times = np.array([sweep.time_s for sweep in truth.sweeps])
@@ -59,6 +62,8 @@ def main() -> None:
             write_kitti360(truth, asked.folder)
         elif asked.format == "pandaset":
             write_pandaset(truth, asked.folder, cameras=PANDASET, suffix=".jpg", point_times=True)
+        elif asked.format == "custom":
+            write_log(truth, asked.folder, ".pcd")
         else:
             write_nuplan(truth, asked.folder, cameras=NUPLAN, distortion=DISTORTION, jpeg=True)
     sys.stdout.write(f"{asked.format}: {asked.frames} frames, {len(tracks)} boxes each, in {asked.folder}\n")

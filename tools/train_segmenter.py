@@ -51,7 +51,8 @@ CARD = """# Small segmentation network for streets
 
 Tells the Cityscapes classes of a picture from its colours and from measured evidence at every pixel: height above the
 ground plane, dense depth and how far away it was measured, the surface's direction and roughness, distance to the
-driven path and whether a step lies between, elevation of the ray, and tracked boxes (`models/evidence.py`). Works, with less, without LiDAR or boxes.
+driven path and whether a step lies between, elevation of the ray, and tracked boxes (`models/evidence.py`). Works, with
+less, without LiDAR or boxes.
 {parameters:.2f} million parameters, stored in float16.
 
 **Training data**: generated cities only (numbers 0 to {last} of seed {seed}), {images} images at {size} pixels,
@@ -72,8 +73,8 @@ out now and then.
 {scores}```
 
 **Limits**: the train class never occurs in training; a box labelled so is still painted. Fences, walls and poles of
-real streets look different from generated ones; on recorded images thin things and signs are found badly. Bonnets of the own vehicle, tunnels, night, rain and snow were not
-trained on. Not for use in vehicles.
+real streets look different from generated ones; on recorded images thin things and signs are found badly. Bonnets of
+the own vehicle, tunnels, night, rain and snow were not trained on. Not for use in vehicles.
 
 **Licence**: Apache-2.0, as the package.
 """
