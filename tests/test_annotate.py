@@ -322,7 +322,8 @@ def test_a_depth_network_needs_depth_and_a_folder(tmp_path: Path) -> None:
         annotate_depth.digests(AnnotateConfig(depth=False, depth_network="x"))
     with pytest.raises(ResourceError, match="weights"):
         annotate_depth.digests(AnnotateConfig(depth_network=str(tmp_path)))
-    assert annotate_depth.digests(AnnotateConfig()) == {}
+    assert annotate_depth.digests(AnnotateConfig(labeller="geometry")) == {}
+    assert set(annotate_depth.digests(AnnotateConfig())) == {"weights"}
 
 
 def test_bonnet_is_what_stays_the_same() -> None:

@@ -101,9 +101,9 @@ def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> Mo
 
 def _quiet(found: ModuleType) -> ModuleType:
     """Progress bars of the package would run through ours."""
-    logging = getattr(getattr(found, "utils", None), "logging", None)
-    if hasattr(logging, "disable_progress_bar"):
-        logging.disable_progress_bar()
+    switch = getattr(getattr(getattr(found, "utils", None), "logging", None), "disable_progress_bar", None)
+    if switch is not None:
+        switch()
     return found
 
 

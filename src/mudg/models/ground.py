@@ -7,7 +7,7 @@ every town. ``map_ground`` looks for it from above, in cells of ``CELL_M``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,8 +157,8 @@ def map_ground(
     behind = cKDTree(path_world[:, :2]).query(centres, distance_upper_bound=_BLIND_M)[0].reshape(side, side)
     passable = (known & (step < KERB_M)) | ((away_m > 2 * CELL_M) & (behind < _BLIND_M) & (step < KERB_M))
     way_m = _way(passable, beside)
-    joined = ndimage.binary_dilation(np.isfinite(way_m), mask=known)
-    direct = ndimage.binary_dilation(way_m <= _DETOUR[0] * beside + _DETOUR[1], mask=known)
+    joined, direct = np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1]
+    joined, direct = (reached | (_grown(reached) & known) for reached in (joined, direct))  # a step takes a cell from the road, too
     floor = ndimage.minimum_filter(ndimage.uniform_filter(height, 3), 2 * round(_FLOOR_WINDOW_M / CELL_M) + 1)
     raised = np.where(known, np.maximum(height - floor, 0), 0).astype(np.float32)
     return GroundMap(corner, plane, joined, direct, raised)
@@ -171,13 +171,19 @@ def _way(passable: NDArray[np.bool_], beside_m: NDArray[np.float64]) -> NDArray[
     """
     reached = passable & (beside_m < _TRACK_M)
     way = np.where(reached, 0.0, np.inf)
-    for count in range(1, 2 * passable.size):
-        grown = ndimage.binary_dilation(reached, ndimage.generate_binary_structure(2, 1 + count % 2)) & passable
-        if (new := grown & ~reached).any():
-            way[new], reached = count * CELL_M, grown
-        else:
-            break
+    count = idle = 0
+    while idle < 2:  # neither four nor eight neighbours bring more
+        count += 1
+        grown = _grown(reached, diagonally=count % 2 == 1) & passable
+        new = grown & ~reached
+        way[new], reached = count * CELL_M, grown
+        idle = 0 if new.any() else idle + 1
     return way
+
+
+def _grown(mask: NDArray[np.bool_], diagonally: bool = False) -> NDArray[np.bool_]:
+    """A mask and the four, or eight, neighbours of its cells."""
+    return np.asarray(ndimage.binary_dilation(mask, ndimage.generate_binary_structure(2, 1 + diagonally)), np.bool_)
 
 
 def _cell_heights(
@@ -199,5 +205,6 @@ def _cell_heights(
     height, known = height.reshape(side, side), known.reshape(side, side)
     if not known.any():
         return height, np.full(height.shape, np.inf)
-    away, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
-    return ndimage.median_filter(height[tuple(nearest)], 3), np.asarray(away) * CELL_M
+    nearest: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    away = np.asarray(ndimage.distance_transform_edt(~known))
+    return ndimage.median_filter(height[tuple(nearest)], 3), away * CELL_M

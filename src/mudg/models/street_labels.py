@@ -1,8 +1,8 @@
 """Labels by the network that comes with the package: ``mudg annotate --labeller embedded``.
 
 The network looks at a picture of at most its own focal length, so that things have the size on it that they had in training, with
-the measured evidence of ``models.evidence`` at the same size. What the evidence settles is then taken out of its hands (``settled``),
-and classes are brought to the image's size by their probabilities.
+the measured evidence of ``models.evidence`` at the same size. What the evidence and plain rules of colour settle is then taken out of
+its hands (``settled``, ``settled_by_color``), and classes are brought to the image's size by their probabilities.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ def settled(
 
     No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface
     lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
-    Ground that is directly joined to the path is road rather than sidewalk; where the log has boxes
-    (``boxes_known``), there is hardly anything outside them that boxes are drawn around.
+    Ground that is directly joined to the path is road rather than sidewalk; where the log has boxes (``boxes_known``), there is hardly
+    anything outside them that boxes are drawn around.
     """
     found = probabilities.copy()
     measured = evidence.away_deg < RETURN_DEG

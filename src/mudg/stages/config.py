@@ -50,9 +50,9 @@ class IngestConfig:
 class AnnotateConfig:
     """Make the labels that a scene lacks: dense depth, classes, sky, movers, each with a confidence."""
 
-    labeller: Literal["geometry", "embedded", "network"] = "geometry"
-    """What tells classes and sky. geometry: rules for heights, boxes and colour; embedded: the small network that comes with the package,
-    from image, heights and boxes; network: a segmentation network from `weights`."""
+    labeller: Literal["embedded", "geometry", "network"] = "embedded"
+    """What tells classes and sky. embedded: the small network that comes with the package, from image, heights and boxes; geometry: rules
+    for these, without a network; network: a segmentation network from `weights`."""
     weights: str = ""
     """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes, as transformers writes it, or its name in the
     Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with
