@@ -215,5 +215,7 @@ def _boxes(
             if not known[seen][inside].any():
                 continue
         labels.append(TRAIN_ID_OF[track.label])
-        box[seen], in_box[seen] = len(labels), inside
+        free = inside | ~in_box[seen]  # what lies in a farther box is not taken by the outline of a nearer one
+        box[seen] = np.where(free, len(labels), box[seen])
+        in_box[seen] |= inside
     return box, in_box, np.array(labels, np.int64)
