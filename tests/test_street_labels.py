@@ -14,7 +14,7 @@ import torch
 from test_annotate import STREET, given_at, overlap
 from toy_scene import ToyStreet
 
-from mudg.base import checkpoint
+from mudg.base import checkpoint, geometry
 from mudg.base.errors import InputError, IntegrityError, ResourceError
 from mudg.base.palette import CLASSES, ID
 from mudg.core.complete import ray_elevation, visible_depth
@@ -85,6 +85,25 @@ def test_a_nearer_surface_hides_a_box() -> None:
     given, truth = given_at(replace(STREET, car_start=(40.0, 0.0)))
     assert not (truth == ID["car"]).any()
     assert not (gather(given).box > 0).any()
+
+
+def test_the_outline_of_a_nearer_box_does_not_take_what_lies_in_a_farther_one() -> None:
+    given, truth = given_at(STREET)
+    (car,) = given.tracks
+    toward = np.eye(4)
+    toward[:3, 3] = -0.4 * (car.world_from_object[0, :3, 3] - given.view.center_world) * [1, 1, 0]
+    nearer = replace(car, id="nearer", label="truck", size_m=car.size_m * [0.1, 1, 1], world_from_object=toward @ car.world_from_object)
+    pose = nearer.pose_at(given.view.time_s)
+    assert pose is not None
+    rng = np.random.default_rng(0)
+    half = nearer.size_m / 2
+    strip = rng.uniform([-half[0], -half[1], -0.4], [-half[0], -half[1] + 0.5, 0.4], (800, 3))  # of its back only this is seen
+    xyz = np.concatenate([given.xyz_world, geometry.transform_points(pose, strip)]).astype(np.float32)
+    found = gather(replace(given, tracks=[car, nearer], xyz_world=xyz))
+    assert found.box_labels.tolist() == [ID["car"], ID["truck"]]
+    surely = gather(given).in_box & found.in_box & (found.depth_m > (given.view.cam_from_world @ pose)[2, 3] + 1)
+    assert surely.sum() > 200
+    assert (found.box[surely] == 1).all()
 
 
 def test_encoding_is_finite_and_of_unit_size() -> None:
