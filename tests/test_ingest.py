@@ -14,7 +14,7 @@ from toy_scene import ToyStreet
 
 from mudg import native
 from mudg.base import store
-from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 from mudg.data.city import CityConfig
 from mudg.data.importers import IMPORTERS, files_of
 from mudg.data.importers.options import ImportOptions
@@ -212,7 +212,7 @@ def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: P
     partial = out / ".scene.999999999-1.part"
     partial.mkdir()
     store.write_json(out / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
-    with pytest.raises(UsageError, match="another configuration"):
+    with pytest.raises(ResourceError, match="another process"):
         ingest.run(config, drive, out)
     assert partial.is_dir()
     store.write_json(out / "lock", {"pid": 999_999_999, "host": socket.gethostname()})

@@ -148,6 +148,9 @@ def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_pa
     store.write_json(run.path / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
     with pytest.raises(ResourceError, match=str(os.getppid())):
         _run(tmp_path / "r")
+    with pytest.raises(ResourceError, match="another process"):
+        _run(tmp_path / "r", overwrite=True)
+    assert (run.path / "run.json").is_file()
     store.write_json(run.path / "lock", {"pid": 2**22 + 1, "host": socket.gethostname()})
     assert not _run(tmp_path / "r").complete
 

@@ -392,6 +392,7 @@ class RunDir:
         key = hashlib.sha256(json_text([verb, version, dict(config), dict(inputs)], indent=None).encode()).hexdigest()
         if overwrite and path.exists():
             cls._refuse_foreign(path)
+            cls._refuse_while_others_work(path / "lock")
             shutil.rmtree(path)
         state_file = path / "run.json"
         if state_file.is_file():
@@ -456,21 +457,26 @@ class RunDir:
             remedy="choose another --out, or add --overwrite to replace it",
         )
 
+    @staticmethod
+    def _refuse_while_others_work(lock: Path) -> None:
+        if not lock.is_file():
+            return
+        try:
+            owner = read_json(lock)
+            pid, host = int(owner["pid"]), str(owner["host"])
+        except (InputError, KeyError, TypeError, ValueError):
+            return
+        if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
+            raise ResourceError(
+                "another process is working in this folder",
+                where=str(lock.parent),
+                got=f"pid {pid} on {host}",
+                remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}",
+            )
+
     def _lock(self) -> None:
         lock = self.path / "lock"
-        if lock.is_file():
-            try:
-                owner = read_json(lock)
-                pid, host = int(owner["pid"]), str(owner["host"])
-            except (InputError, KeyError, TypeError, ValueError):
-                pid, host = -1, ""
-            if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
-                raise ResourceError(
-                    "another process is working in this folder",
-                    where=str(self.path),
-                    got=f"pid {pid} on {host}",
-                    remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}",
-                )
+        self._refuse_while_others_work(lock)
         write_json(lock, {"pid": os.getpid(), "host": socket.gethostname()})
 
     def _write_state(self, state: str, summary: Mapping[str, Any]) -> None:

@@ -7,7 +7,6 @@ import functools
 import hashlib
 import os
 import shutil
-import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -73,14 +72,11 @@ def _empty(folder: Path, *, remove: bool) -> None:
 
 
 def _abandoned(out: Path) -> bool:
-    """Whether an import that failed or was killed left nothing at ``out`` but its bookkeeping."""
+    """Whether an import that is not finished made no scene at ``out`` yet."""
     try:
         state = store.read_json(out / "run.json")
-        owner = store.read_json(out / "lock") if (out / "lock").is_file() else {}
-        made = state["verb"] != "ingest" or state["state"] == "complete" or (out / "scene.json").is_file()
-        here = owner.get("host") == socket.gethostname() and owner.get("pid") != os.getpid()
-        return not made and not (here and store.process_alive(int(owner["pid"])))
-    except (InputError, KeyError, TypeError, ValueError, AttributeError):
+        return bool(state["verb"] == "ingest" and state["state"] != "complete" and not (out / "scene.json").is_file())
+    except (InputError, KeyError, TypeError):
         return False
 
 
