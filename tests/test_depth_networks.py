@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from tiny_networks import package
 
-from mudg.base.errors import InputError, ResourceError
+from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.core.complete import CompletionRules
 from mudg.models.depth_networks import (
     KINDS,
@@ -215,6 +215,12 @@ def test_marigold_without_guidance_answers_as_the_package_does(prediction_type: 
 
 
 @real_packages
+def test_marigold_refuses_more_steps_than_its_schedule_has(tmp_path: Path) -> None:
+    tiny_networks.marigold(tmp_path / "net")
+    with pytest.raises(UsageError, match="--depth-steps"):
+        load_depth_network(tmp_path / "net", options=DepthOptions(steps=100_000))
+
+
 def test_guidance_brings_marigold_nearer_to_the_returns(tmp_path: Path) -> None:
     """A random network knows nothing of depth: all the agreement that is gained comes from the returns."""
     tiny_networks.marigold(tmp_path, longest_px=32)

@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mudg.base import seeds
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, UsageError
 from mudg.core.align import AffineFit, Space, fit_affine
 from mudg.models import folders
 from mudg.models.depth_networks import DepthInput, Prediction
@@ -70,7 +70,10 @@ class Marigold:
         self, parts: Parts, *, space: Space = "depth", steps: int = PLAIN_STEPS, guided: bool = False,
         longest_px: int = PROCESSING_PX, place: Place = CPU,
     ) -> None:  # fmt: skip
-        """``longest_px``: longest side at which the networks work."""
+        """``longest_px``: longest side at which the networks work. Raises: UsageError: more steps than the noise schedule has."""
+        most = int(parts.scheduler.config.num_train_timesteps)
+        if steps > most:
+            raise UsageError("too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(steps))
         self._parts, self._space, self._steps, self._guided = parts, space, steps, guided
         self._longest_px, self._place = longest_px, place
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
@@ -80,7 +83,7 @@ class Marigold:
         """Read the networks of a folder; ``steps`` 0 = as many as it says (50 with guidance).
 
         Raises:
-            ResourceError: a package or the device is missing. InputError: a part is missing or another kind.
+            ResourceError: a package or the device is missing. InputError: a part is missing or another kind. UsageError: too many steps.
         """
         path = Path(folder)
         index = folders.read_settings(path / "model_index.json")
