@@ -35,6 +35,9 @@ from mudg.base.errors import MudgError, NumericsError, ResourceError, UsageError
 
 PATIENCE = datetime.timedelta(hours=6)
 """How long processes wait for each other: as long as the leader may need to make clips or to score."""
+PARTING_S = 0.5
+"""Rest after the last message. Threads of gloo let go of its tensors a moment later, and need the interpreter for that; one that comes
+when the interpreter is already shutting down aborts the process, after all the work is done and saved."""
 Layout = Literal["ddp", "fsdp"]
 
 
@@ -172,6 +175,7 @@ def joined(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
     finally:
         log.set_quiet(was_quiet)
         dist.destroy_process_group()
+        time.sleep(PARTING_S)
 
 
 def _place(rank: int, size: int, device: str) -> Ranks:
