@@ -243,7 +243,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     plain = read_scene(tmp_path / "plain")
     settings = to_dict(config)
     settings.pop("processes")
-    begun = store.RunDir.open(tmp_path / "begun", "annotate", settings, annotate.inputs_of(config, tmp_path / "plain"), 3)
+    begun = store.RunDir.open(tmp_path / "begun", "annotate", settings, annotate.inputs_of(config, tmp_path / "plain"), annotate._VERSION)
     aside = tmp_path / "begun" / "labelled"
     first = [frame.id for frame in plain.frames[:2]]
     assert list(annotate.label_and_put_aside(config, plain, first, aside)) == first

@@ -15,6 +15,7 @@ that one is computed here. The noise is the same for every image.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -221,8 +222,8 @@ class _Kept:
     features: Tensor
 
 
-class _Writing:
-    """An attention processor of the reference U-Net: keeps what is read, and changes nothing."""
+class _Sharing(abc.ABC):
+    """An attention processor: the given one, told what to read by ``read``."""
 
     def __init__(self, attend: Any, kept: _Kept) -> None:
         self._attend, self._kept = attend, kept
@@ -231,22 +232,25 @@ class _Writing:
         self, attn: Any, hidden_states: Tensor, encoder_hidden_states: Tensor | None = None,
         attention_mask: Tensor | None = None, temb: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
+        return self._attend(attn, hidden_states, self.read(hidden_states), attention_mask, temb)
+
+    @abc.abstractmethod
+    def read(self, hidden_states: Tensor) -> Tensor | None:
+        """What keys and values come from; None: from the block's own features."""
+
+
+class _Writing(_Sharing):
+    """In the reference U-Net: keeps what is read, and changes nothing."""
+
+    def read(self, hidden_states: Tensor) -> None:
         self._kept.features = hidden_states
-        return self._attend(attn, hidden_states, encoder_hidden_states, attention_mask, temb)
 
 
-class _Reading:
-    """An attention processor of the denoising U-Net: keys and values come from its own features and from the kept ones."""
+class _Reading(_Sharing):
+    """In the denoising U-Net: reads the kept features beside its own."""
 
-    def __init__(self, attend: Any, kept: _Kept) -> None:
-        self._attend, self._kept = attend, kept
-
-    def __call__(
-        self, attn: Any, hidden_states: Tensor, encoder_hidden_states: Tensor | None = None,
-        attention_mask: Tensor | None = None, temb: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
-        read = torch.cat([hidden_states, self._kept.features.to(hidden_states.dtype)], 1)
-        return self._attend(attn, hidden_states, read, attention_mask, temb)
+    def read(self, hidden_states: Tensor) -> Tensor:
+        return torch.cat([hidden_states, self._kept.features.to(hidden_states.dtype)], 1)
 
 
 def hand_over(reference_unet: Any, denoising_unet: Any) -> None:

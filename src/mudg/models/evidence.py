@@ -22,7 +22,7 @@ from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.core.complete import beyond_reach, complete_depth, ray_elevation, visible_depth
 from mudg.core.fusion import points_in_box
-from mudg.models.ground import GroundMap, above_plane, distance_to_path, map_ground
+from mudg.models.ground import GroundMap, above_plane, beside_path, map_ground
 from mudg.models.labellers import (
     FLOOR_M,
     GROWTH_M,
@@ -110,9 +110,10 @@ def gather(given: LabelInput) -> Evidence:
     box, in_box, labels = _boxes(given, xyz, depth, known)
     ground = map_ground(given.xyz_world, given.path_world, view.center_world)
     joined, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.at(xyz)
+    beside = beside_path(xyz, given.path_world, 2) if len(given.path_world) else np.full(shape, NO_PATH_M, np.float32)
     return Evidence(
         _height(ground, xyz), depth, np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32), _upwards(xyz),
-        _beside(xyz, given.path_world), joined, direct, raised, elevation, beyond,
+        beside, joined, direct, raised, elevation, beyond,
         _roughness(measured, gap_deg, view.camera.fy), box, in_box, labels,
     )  # fmt: skip
 
@@ -156,15 +157,6 @@ def _upwards(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
     right, down = np.gradient(xyz, axis=1), np.gradient(xyz, axis=0)
     normal = np.cross(right, down)
     return (np.abs(normal[..., 2]) / np.maximum(np.linalg.norm(normal, axis=2), 1e-9)).astype(np.float32)
-
-
-def _beside(xyz: NDArray[np.float32], path_world: NDArray[np.float64], step: int = 2) -> NDArray[np.float32]:
-    """Distance to the path, worked out at every ``step``-th pixel; ``NO_PATH_M`` without a path."""
-    if len(path_world) == 0:
-        return np.full(xyz.shape[:2], NO_PATH_M, np.float32)
-    coarse = xyz[::step, ::step]
-    beside = distance_to_path(coarse.reshape(-1, 3), path_world).reshape(coarse.shape[:2])
-    return beside.repeat(step, 0).repeat(step, 1)[: xyz.shape[0], : xyz.shape[1]].astype(np.float32)
 
 
 def _roughness(measured: NDArray[np.float32], gap_deg: float, fy_px: float) -> NDArray[np.float32]:

@@ -62,7 +62,8 @@ def find(name: str | Path) -> Path:
     try:
         hub = package("huggingface_hub")
     except ResourceError as error:
-        raise ResourceError("no such folder, nor the package that knows the Hugging Face cache", where=text, remedy=_REMEDY) from error
+        raise ResourceError("no such folder, nor the package that knows the Hugging Face cache", where=text,
+                            remedy=f"name a folder that exists; for names of repositories: {_REMEDY}") from error  # fmt: skip
     try:
         found = hub.snapshot_download(parts["repository"], revision=parts["revision"], local_files_only=True)
     except (OSError, ValueError) as error:

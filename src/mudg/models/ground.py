@@ -110,6 +110,19 @@ def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.flo
     return cKDTree(line).query(xyz_world[:, :2])[0]
 
 
+def beside_path(
+    xyz_world: NDArray[np.float32], path_world: NDArray[np.float64], step: int
+) -> NDArray[np.float32]:
+    """``distance_to_path`` of the points f32[H, W, 3] of an image, worked out at every ``step``-th pixel; metres f32[H, W], infinite where
+    a point is not finite."""
+    coarse = xyz_world[::step, ::step]
+    beside = np.full(coarse.shape[:2], np.inf, np.float32)
+    known = np.isfinite(coarse).all(-1)
+    beside[known] = distance_to_path(coarse[known], path_world)
+    height, width = xyz_world.shape[:2]
+    return beside.repeat(step, 0).repeat(step, 1)[:height, :width]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundMap:
     """Ground around a camera from above: cell [i, j] is ``CELL_M`` wide and begins at ``corner_m + CELL_M * (i, j)``.

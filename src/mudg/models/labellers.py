@@ -32,7 +32,7 @@ from mudg.base.types import Track, View
 from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation, visible_depth
 from mudg.core.fusion import points_in_box
 from mudg.models.folders import CPU, Place
-from mudg.models.ground import above_plane, distance_to_path, map_ground
+from mudg.models.ground import above_plane, beside_path, map_ground
 
 TRAIN_ID_OF: Final[Mapping[str, int]] = {
     "car": ID["car"], "van": ID["car"], "vehicle": ID["car"], "misc": ID["car"], "truck": ID["truck"], "bus": ID["bus"],
@@ -234,7 +234,7 @@ def _paint_surface(
         height = above_plane(ground.plane, surface.xyz_world)
         _, direct, _ = ground.at(surface.xyz_world)
     flat = known & (np.abs(height) < GROUND_M + 0.005 * surface.depth)
-    beside = _beside_path(surface, given.path_world)
+    beside = beside_path(surface.xyz_world, given.path_world, 4)
     green = greenness > GRASS
     semantics[flat] = np.where(green[flat], ID["terrain"], ID["road"])
     sure = np.where(beside < NEAR_ROAD_M, 0.9, np.where(direct, 0.7, 0.5))
@@ -244,17 +244,6 @@ def _paint_surface(
     standing = known & ~flat & (height > 0)
     semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
     confidence[standing] = 0.3 + 0.2 * surface.confidence[standing]
-
-
-def _beside_path(surface: _Surface, path_world: NDArray[np.float64], step: int = 4) -> NDArray[np.float32]:
-    """Horizontal distance to the path f32[H, W], worked out at every ``step``-th pixel; infinite where depth is unknown."""
-    coarse = surface.xyz_world[::step, ::step].reshape(-1, 3)
-    beside = np.full(len(coarse), np.inf, np.float32)
-    known = np.isfinite(coarse).all(1)
-    beside[known] = distance_to_path(coarse[known], path_world)
-    height, width = surface.depth.shape
-    grid = beside.reshape(-(-height // step), -(-width // step))
-    return grid.repeat(step, 0).repeat(step, 1)[:height, :width]
 
 
 def far_to_near(given: LabelInput) -> list[tuple[int, Track]]:

@@ -39,7 +39,7 @@ from mudg.stages.config import AnnotateConfig
 from mudg.stages.ingest import add_frame_copy, add_rest
 from mudg.stages.synthesize import quiet_openmp
 
-_VERSION = 3
+_VERSION = 4
 _ASIDE = "labelled"
 _FRAMES_PER_PROCESS = 8
 """Fewer frames than this are not worth the start of a process."""
