@@ -25,12 +25,12 @@ import torch
 
 from mudg import native
 from mudg.base import log
-from mudg.core import raster_cpu
+from mudg.core.raster import cpu as raster_cpu
 from mudg.data.city.config import CityConfig
-from mudg.models.densify import DensifyStats
+from mudg.models.scene.densify import DensifyStats
 from mudg.stages import fit, fuse, ingest
 from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
-from mudg.stages.fit_views import ViewSet
+from mudg.stages.fitting.views import ViewSet
 
 FORWARD = ("project", "sort", "bin", "blend")
 BACKWARD = ("blend_backward", "project_backward")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base.types import Gaussians
-from mudg.core.raster import RasterConfig, rasterize
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 
 IMAGES = ("rgb", "depth", "alpha", "extra")
 GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from mudg.base.types import Camera, Condition, View
-from mudg.models import mdm
+from mudg.models.mdm import model as mdm
 
 
 def seconds(work: Callable[[], object], repeats: int = 3) -> float:

@@ -2,13 +2,13 @@
 
     python bench/published_memory.py
 
-Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/stages/memory_plan.py` for what is counted.
+Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/stages/learning/memory_plan.py` for what is counted.
 """
 
 import sys
 
-from mudg.models.published import PublishedConfig
-from mudg.stages import memory_plan
+from mudg.models.published.model import PublishedConfig
+from mudg.stages.learning import memory_plan
 
 CUTS = (("all at once", 6), ("modalities together, guidance apart", 3), ("guidance together, modalities apart", 2), ("one by one", 1))
 BUDGETS_GB = (8, 10, 16, 24, 40, 80)

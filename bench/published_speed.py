@@ -16,8 +16,8 @@ from collections.abc import Callable
 import torch
 
 from mudg.base import seeds
-from mudg.models.published import Encoded, PublishedConfig, PublishedMDM, choose_trainable
-from mudg.stages import memory_plan
+from mudg.models.published.model import Encoded, PublishedConfig, PublishedMDM, choose_trainable
+from mudg.stages.learning import memory_plan
 
 
 def built(config: PublishedConfig, device: str, dtype: torch.dtype) -> PublishedMDM:

@@ -32,8 +32,8 @@ from torch import Tensor
 from mudg import native
 from mudg.base.errors import UsageError
 from mudg.base.types import Camera, Gaussians, View
-from mudg.core import raster_cpu
-from mudg.core.raster import RasterConfig, rasterize
+from mudg.core.raster import cpu as raster_cpu
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 
 RATIOS = Path(__file__).with_name("raster_ratios.json")
 CHECK_SIZES = ("20000:480x320", "100000:480x320")

@@ -23,11 +23,12 @@ from raster import street
 
 from mudg import native
 from mudg.base.types import Render
-from mudg.core import fused, losses, raster_cpu
-from mudg.core.raster import RasterConfig, rasterize
+from mudg.core import fused, losses
+from mudg.core.raster import cpu as raster_cpu
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
-from mudg.models.densify import DensifySettings, DensifyStats, densify
-from mudg.models.nodes import SceneModel, StaticNode, compose, composite_semantics
+from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
+from mudg.models.scene.nodes import SceneModel, StaticNode, compose, composite_semantics
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -37,7 +37,7 @@ from mudg.base.types import Scene
 from mudg.data.city import rig
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_scene
+from mudg.data.scene import read_scene
 
 Change = Callable[[bytes], bytes]
 TWO = {"cameras": ("front", "front_left")}

@@ -17,9 +17,9 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import EgoPath, Ref, Source, Sweep, View
 from mudg.core.complete import ray_elevation
-from mudg.data.scenefile import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
-from mudg.models.depth_networks import Prediction
-from mudg.models.labellers import (
+from mudg.data.scene import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
+from mudg.models.depth.networks import Prediction
+from mudg.models.labels.labellers import (
     LABELLERS,
     TRAIN_ID_OF,
     LabelInput,
@@ -28,10 +28,11 @@ from mudg.models.labellers import (
     label_by_geometry,
     labeller,
 )  # fmt: skip
-from mudg.stages import annotate, annotate_depth
-from mudg.stages.annotate_ego import steady_bottom
-from mudg.stages.annotate_points import nearest_sweeps
+from mudg.stages import annotate
 from mudg.stages.config import AnnotateConfig
+from mudg.stages.labelling import depth as annotate_depth
+from mudg.stages.labelling.ego import steady_bottom
+from mudg.stages.labelling.points import nearest_sweeps
 
 STREET = ToyStreet(car_start=(11, 1.0), car_velocity=(2, 0))
 

@@ -13,14 +13,15 @@ from toy_world import camera, fused_cloud, truth, view_at, write_scene
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError
 from mudg.core.fused import adam_columns
-from mudg.core.raster import RasterConfig
+from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import torch_adam_columns
-from mudg.data.scenefile import read_scene
-from mudg.models.appearance import Appearance, owner, rigid_motion
-from mudg.models.nodes import compose
-from mudg.stages import fit, fit_views
+from mudg.data.scene import read_scene
+from mudg.models.scene.appearance import Appearance, owner, rigid_motion
+from mudg.models.scene.nodes import compose
+from mudg.stages import fit
 from mudg.stages.config import FitConfig
-from mudg.stages.fit_objects import boxes_in_view, convex_outline, objects_only
+from mudg.stages.fitting import views as fit_views
+from mudg.stages.fitting.objects import boxes_in_view, convex_outline, objects_only
 
 SIZE = (60, 40)
 RECORDED = ("front/000000", "front/000001", "left/000000")

@@ -22,7 +22,7 @@ from mudg.base.types import Scene, Track
 from mudg.data.importers import IMPORTERS, RECOGNISERS
 from mudg.data.importers.argoverse2 import read_sweep
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_points
+from mudg.data.scene import read_points
 
 pytest.importorskip("pyarrow")
 Columns = dict[str, Any]

@@ -20,7 +20,7 @@ from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 from mudg.data.cloudfile import read_fused
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import check_scene, decode_image, read_image, read_points, read_scene, write_zip
+from mudg.data.scene import check_scene, decode_image, read_image, read_points, read_scene, write_zip
 from mudg.stages import annotate, fuse, ingest
 from mudg.stages.config import AnnotateConfig, FuseConfig, IngestConfig
 

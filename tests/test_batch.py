@@ -13,7 +13,7 @@ from toy_scene import ToyStreet
 
 from mudg import cli
 from mudg.base.errors import InputError, UsageError
-from mudg.data.scenefile import read_scene
+from mudg.data.scene import read_scene
 from mudg.stages import batch
 
 

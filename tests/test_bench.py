@@ -9,12 +9,14 @@ import pytest
 import torch
 
 from mudg.base.errors import MudgError, UsageError
+from mudg.bench import mdm_ablation
+from mudg.bench import run as bench
 from mudg.core import flicker
-from mudg.data import city_clips, clip_shards
-from mudg.models import mdm
-from mudg.models.mdm import MDM, MDMConfig
-from mudg.models.vae import CodecConfig
-from mudg.stages import bench, bench_ablation
+from mudg.data.clips import from_city
+from mudg.data.clips import shards as clip_shards
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages.config import BenchConfig
 
 SMALL = MDMConfig(
@@ -56,18 +58,18 @@ def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clips")
-    rules = city_clips.CityClipRules(48, 32, 4, clips=2)
-    city_clips.write_city(rules, city_clips.DEVELOPMENT[0], folder)
-    return clip_shards.read_batch(folder, [(city_clips.DEVELOPMENT[0], 0, range(4))])
+    rules = from_city.CityClipRules(48, 32, 4, clips=2)
+    from_city.write_city(rules, from_city.DEVELOPMENT[0], folder)
+    return clip_shards.read_batch(folder, [(from_city.DEVELOPMENT[0], 0, range(4))])
 
 
 def test_conditions_of_the_ablation(city):
-    points = bench_ablation.points_only(city)
+    points = mdm_ablation.points_only(city)
     assert torch.equal(points.color[points.valid.expand_as(points.color)], city.point_color[city.valid.expand_as(city.color)])
     assert float(points.color[~points.valid.expand_as(points.color)].abs().max()) == 0
     assert not bool(points.warped.any())
     assert bool((points.ids == 255).all())
-    nothing = bench_ablation.nothing_seen(city)
+    nothing = mdm_ablation.nothing_seen(city)
     assert float(nothing.color.abs().max()) == 0
     assert not bool(nothing.valid.any())
     assert torch.equal(nothing.reference, city.reference)
@@ -86,11 +88,11 @@ def test_concatenated_reference_adds_its_latent_to_every_frame(city):
 
 
 def test_reported_and_development_cities_differ():
-    assert not set(city_clips.REPORTED) & set(city_clips.DEVELOPMENT)
-    assert min(city_clips.REPORTED + city_clips.DEVELOPMENT) >= city_clips.HELD_OUT
-    rules = city_clips.CityClipRules()
-    for number in (city_clips.REPORTED[0], city_clips.DEVELOPMENT[0]):
-        assert city_clips.city_config(rules, number) == city_clips.city_config(replace(rules, seed=7), number)
+    assert not set(from_city.REPORTED) & set(from_city.DEVELOPMENT)
+    assert min(from_city.REPORTED + from_city.DEVELOPMENT) >= from_city.HELD_OUT
+    rules = from_city.CityClipRules()
+    for number in (from_city.REPORTED[0], from_city.DEVELOPMENT[0]):
+        assert from_city.city_config(rules, number) == from_city.city_config(replace(rules, seed=7), number)
 
 
 def test_what_reads_no_model_does_not_depend_on_it(tmp_path, monkeypatch):

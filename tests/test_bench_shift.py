@@ -10,11 +10,15 @@ import torch
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
-from mudg.data import city_clips, city_logs
+from mudg.bench import run as bench
+from mudg.bench import shift as bench_shift
+from mudg.bench import shift_page, shift_tables
 from mudg.data.city import CityWorld
-from mudg.data.city_logs import LogRules
+from mudg.data.city import logs as city_logs
+from mudg.data.city.logs import LogRules
+from mudg.data.clips import from_city
 from mudg.data.observations import list_observation_sets, read_observations
-from mudg.stages import bench, bench_shift, bench_shift_page, bench_shift_tables, score_truth
+from mudg.stages import score_truth
 from mudg.stages.config import BenchConfig
 
 TINY = LogRules(frames=4, width=96, height=64, cameras=("front",))
@@ -29,7 +33,7 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     assert not set(development) & set(reported)
     trained = {seeds.key(0, city, "city") & 0x7FFFFFFF for city in range(5000)}
     scored = {
-        city_clips.city_config(city_clips.CityClipRules(), c).seed for of in city_clips.LISTS.values() for c in of
+        from_city.city_config(from_city.CityClipRules(), c).seed for of in from_city.LISTS.values() for c in of
     }
     assert not (trained | scored) & set(development + reported)
 
@@ -131,17 +135,17 @@ def made_up(psnr, abs_rel):
 def test_differences_and_ratios_with_their_standard_errors_by_hand():
     logs = made_up({"a": [20.0, 22.0, 27.0], "b": [19.0, 20.0, 24.0]}, {"a": [0.1, 0.2, 0.3], "b": [0.2, 0.2, 0.2]})
     for entry in logs:
-        entry["values"] = {m: bench_shift_tables._with_mean(of, ["2", "4"]) for m, of in entry["values"].items()}
-    difference = bench_shift_tables.compare(
-        logs, bench_shift_tables.Comparison("", "a", "b", "shifted", "psnr", "difference")
+        entry["values"] = {m: shift_tables._with_mean(of, ["2", "4"]) for m, of in entry["values"].items()}
+    difference = shift_tables.compare(
+        logs, shift_tables.Comparison("", "a", "b", "shifted", "psnr", "difference")
     )
     assert difference["value"] == pytest.approx(2.0)
     assert difference["standard_error"] == pytest.approx(np.std([1, 2, 3], ddof=1) / math.sqrt(3))
-    ratio = bench_shift_tables.compare(logs, bench_shift_tables.Comparison("", "a", "b", "2", "abs_rel", "ratio"))
+    ratio = shift_tables.compare(logs, shift_tables.Comparison("", "a", "b", "2", "abs_rel", "ratio"))
     assert ratio["value"] == pytest.approx(1.0)
     left = [1.25, 1.0, 0.75]  # ratio of means without the first, second, third log
     assert ratio["standard_error"] == pytest.approx(math.sqrt(2 / 3 * sum((v - 1.0) ** 2 for v in left)))
-    one = bench_shift_tables.compare(logs[:1], bench_shift_tables.Comparison("", "a", "b", "2", "psnr", "difference"))
+    one = shift_tables.compare(logs[:1], shift_tables.Comparison("", "a", "b", "2", "psnr", "difference"))
     assert (one["value"], one["standard_error"]) == (1.0, None)
 
 
@@ -158,14 +162,14 @@ def test_what_a_log_lacks_is_left_out_and_named():
         "cameras": ["front"],
         "held_out_every": 4,
     }
-    document = bench_shift_tables.document(logs, rows, [2.0, 4.0], settings)
+    document = shift_tables.document(logs, rows, [2.0, 4.0], settings)
     assert document["pooled"]["a"]["2"]["psnr"] == {"mean": 20.0, "standard_error": None, "logs": 1}
     assert document["logs"][1]["values"]["a"]["shifted"]["psnr"] == "no truth"
     assert document["pooled"]["a"]["0"]["psnr"]["mean"] == pytest.approx(26.0)
     assert document["pooled"]["b"]["shifted"]["psnr"]["mean"] == pytest.approx(20.0)
     assert document["pooled"]["a"]["2"]["miou"] == "not produced"
-    assert "not produced" in bench_shift_tables.markdown(document)
-    assert "<script>" in bench_shift_page.page(document)
+    assert "not produced" in shift_tables.markdown(document)
+    assert "<script>" in shift_page.page(document)
 
 
 # ---- end to end --------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from mudg import native
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene
 from mudg.data.city import CityConfig, CityWorld, write_city
-from mudg.data.scenefile import read_image, read_label, read_points
+from mudg.data.scene import read_image, read_label, read_points
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 

@@ -8,8 +8,9 @@ import torch
 
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Clip, Condition, FusedCloud, PointCloud, Track, View
-from mudg.data import clip_shards, clips
-from mudg.data.clips import ConditionRules, Recorded, Source, build_condition
+from mudg.data.clips import condition as clips
+from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.condition import ConditionRules, Recorded, Source, build_condition
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
 RULES = ConditionRules(48, 32, occluder_m=0.0)
@@ -237,15 +238,15 @@ def test_variation_treats_truth_and_condition_alike(tmp_path):
 
 def test_city_clips_are_a_function_of_seed_and_number():
     from mudg import native
-    from mudg.data import city_clips
-    from mudg.data.city_clips import CityClipRules
+    from mudg.data.clips import from_city
+    from mudg.data.clips.from_city import CityClipRules
 
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=2, clips=2)
-    first, shifts = city_clips.make_clips(rules, 5)
-    again, _ = city_clips.make_clips(rules, 5)
-    other, _ = city_clips.make_clips(rules, 6)
+    first, shifts = from_city.make_clips(rules, 5)
+    again, _ = from_city.make_clips(rules, 5)
+    other, _ = from_city.make_clips(rules, 6)
     assert len(first) == len(shifts) == 2
     for name in ("rgb", "depth", "semantics"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name)), name
@@ -258,7 +259,7 @@ def test_city_clips_are_a_function_of_seed_and_number():
 
 
 def test_held_out_cities_have_the_stated_shifts():
-    from mudg.data.city_clips import HELD_OUT, CityClipRules, shifts_of
+    from mudg.data.clips.from_city import HELD_OUT, CityClipRules, shifts_of
 
     rules = CityClipRules()
     assert shifts_of(rules, HELD_OUT) == (2.0, -3.0, 4.0, 0.0)

@@ -12,7 +12,7 @@ from toy_scene import CAR_SIZE_M, ToyStreet
 
 from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project, yaw_matrix
 from mudg.base.types import Camera, View
-from mudg.stages import contact_sheet as sheets
+from mudg.report import contact_sheet as sheets
 
 VIEW = View(Camera("front", 96, 64, 70.0, 70.0, 48.0, 32.0), invert(CAM_FROM_EGO_AXES), 0.0)
 

@@ -13,7 +13,7 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.types import RasterTrace
 from mudg.core.table import Table
-from mudg.models.densify import (
+from mudg.models.scene.densify import (
     SPLIT_SHRINK,
     DensifySettings,
     DensifyStats,
@@ -22,7 +22,7 @@ from mudg.models.densify import (
     rotate,
     shorten_needles,
 )
-from mudg.models.nodes import RigidNode, SceneModel, StaticNode
+from mudg.models.scene.nodes import RigidNode, SceneModel, StaticNode
 from mudg.stages.config import FitConfig
 
 SETTINGS = DensifySettings(

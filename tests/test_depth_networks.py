@@ -14,7 +14,8 @@ from tiny_networks import package
 
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.core.complete import CompletionRules
-from mudg.models.depth_networks import (
+from mudg.models.depth.marigold import Marigold
+from mudg.models.depth.networks import (
     KINDS,
     DepthInput,
     DepthOptions,
@@ -26,7 +27,6 @@ from mudg.models.depth_networks import (
     residual_confidence,
 )
 from mudg.models.folders import Place
-from mudg.models.marigold import Marigold
 
 RULES = CompletionRules()
 real_packages = pytest.mark.filterwarnings("ignore")

@@ -23,10 +23,10 @@ from torch import Tensor
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
-from mudg.data.scenefile import read_label, read_scene
-from mudg.models import depthlab
-from mudg.models.depth_networks import DepthInput, DepthOptions, kind_of, load_depth_network
-from mudg.models.depthlab import DepthLab, Sampling, clip_crop, known_depth, linear_fill, prepare
+from mudg.data.scene import read_label, read_scene
+from mudg.models.depth import depthlab
+from mudg.models.depth.depthlab import DepthLab, Sampling, clip_crop, known_depth, linear_fill, prepare
+from mudg.models.depth.networks import DepthInput, DepthOptions, kind_of, load_depth_network
 from mudg.models.folders import Place
 from mudg.stages import annotate, convert, convert_depthlab
 from mudg.stages.config import AnnotateConfig, ConvertConfig

@@ -18,7 +18,7 @@ from mudg.base.geometry import invert, project, transform_points
 from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_points
+from mudg.data.scene import read_points
 
 CAMERAS = {"front": "front", "front_left": "front_left"}
 

@@ -9,6 +9,7 @@ import pytest
 import toy_views
 
 from mudg import cli
+from mudg.data.exporters import video
 from mudg.stages import doctor
 
 
@@ -32,8 +33,8 @@ def test_a_missing_native_library_is_a_problem_with_a_remedy(monkeypatch: pytest
 
 
 def test_a_missing_encoder_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_ENCODERS", ("no-such-encoder",))
-    assert doctor.video_encoders() == []
+    monkeypatch.setattr(video, "_H264_ENCODERS", ("no-such-encoder",))
+    assert video.video_encoders() == []
     assert any("H.264" in problem for problem in doctor.report_machine()["problems"])
 
 

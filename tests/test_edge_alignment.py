@@ -17,8 +17,8 @@ from mudg.core import edge_alignment as edges
 from mudg.data.city import CityConfig, write_city
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.alignment import camera_alignment, words
 from mudg.stages import doctor
-from mudg.stages.alignment import camera_alignment, words
 
 TURNS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
@@ -109,7 +109,7 @@ def test_too_little_to_tell_is_said(tmp_path: Path) -> None:
 def test_doctor_tells_of_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ToyStreet().write(tmp_path / "scene", labels=False, width=60, height=30)
     doubtful = edges.EdgeAlignment(0.2, (1.0, -0.5), 0.2, 900, "doubtful")
-    from mudg.stages import alignment
+    from mudg.data.scene import alignment
 
     for found, level, said in (
         (doubtful, "warning", "+1.0 degrees"),

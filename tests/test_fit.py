@@ -20,13 +20,16 @@ from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Gaussians, View
 from mudg.core import metrics, trajectory
-from mudg.core.raster import RasterConfig
+from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import ObservationWriter
-from mudg.data.scenefile import read_scene
-from mudg.models.nodes import RigidNode, SceneModel
-from mudg.stages import fit, fit_start, fit_trust, fit_views
+from mudg.data.scene import read_scene
+from mudg.models.scene.nodes import RigidNode, SceneModel
+from mudg.stages import fit
 from mudg.stages.config import FitConfig
+from mudg.stages.fitting import start as fit_start
+from mudg.stages.fitting import trust as fit_trust
+from mudg.stages.fitting import views as fit_views
 
 SIZE = (60, 40)
 FRAMES = 6

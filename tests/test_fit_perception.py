@@ -10,7 +10,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.core import losses, metrics
 from mudg.stages.config import FitConfig
-from mudg.stages.fit_perception import perception_of
+from mudg.stages.fitting.perception import perception_of
 
 
 def random(seed: int, *shape: int) -> torch.Tensor:

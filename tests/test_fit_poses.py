@@ -9,13 +9,15 @@ from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry, store
 from mudg.base.config import to_dict
-from mudg.core.raster import RasterConfig
-from mudg.data.scenefile import read_scene
-from mudg.models.nodes import compose
-from mudg.stages import fit, fit_poses, fit_views
-from mudg.stages.bench_poses import pose_errors
+from mudg.bench.poses import pose_errors
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.data.scene import read_scene
+from mudg.models.scene.nodes import compose
+from mudg.stages import fit
 from mudg.stages.config import FitConfig
-from mudg.stages.fit_objects import outline_mask
+from mudg.stages.fitting import poses as fit_poses
+from mudg.stages.fitting import views as fit_views
+from mudg.stages.fitting.objects import outline_mask
 
 SIZE, FRAMES = (96, 64), 6
 RASTER = RasterConfig(near_m=0.2)

@@ -36,7 +36,7 @@ from mudg.core.project import ProjectConfig, project_cloud
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_image, read_points
+from mudg.data.scene import read_image, read_points
 from mudg.stages import fuse
 from mudg.stages.config import FuseConfig
 

@@ -18,8 +18,8 @@ from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 from mudg.data.city import CityConfig
 from mudg.data.importers import IMPORTERS, files_of
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scene_schema import scene_to_json_text
-from mudg.data.scenefile import read_image, read_label, read_points, read_scene, write_zip
+from mudg.data.scene import read_image, read_label, read_points, read_scene, write_zip
+from mudg.data.scene.schema import scene_to_json_text
 from mudg.stages import ingest
 from mudg.stages.config import IngestConfig
 

@@ -13,11 +13,12 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import Scene, View
-from mudg.data.importers import IMPORTERS, kitti_boxes
-from mudg.data.importers.kitti_calib import read_calibration_day, read_calibration_text
-from mudg.data.importers.kitti_poses import read_timestamps
+from mudg.data.importers import IMPORTERS
+from mudg.data.importers.kitti import boxes as kitti_boxes
+from mudg.data.importers.kitti.calib import read_calibration_day, read_calibration_text
+from mudg.data.importers.kitti.poses import read_timestamps
 from mudg.data.importers.options import ImportOptions, holdout_split, parse_frame_range
-from mudg.data.scenefile import read_image, read_points
+from mudg.data.scene import read_image, read_points
 
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:

@@ -17,10 +17,10 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.kitti360_boxes import read_boxes
-from mudg.data.importers.kitti360_calib import read_calibration
+from mudg.data.importers.kitti360.boxes import read_boxes
+from mudg.data.importers.kitti360.calib import read_calibration
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_image, read_label, read_points
+from mudg.data.scene import read_image, read_label, read_points
 
 pytestmark = roundtrip.needs_native
 SAME = {"front": "front", "front_left": "front_stereo"}

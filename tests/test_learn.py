@@ -10,9 +10,12 @@ from toy_clips import WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.data import city_clips, clip_shards
-from mudg.models import mdm
-from mudg.stages import learn, learn_clips, learn_score
+from mudg.data.clips import from_city
+from mudg.data.clips import shards as clip_shards
+from mudg.models.mdm import model as mdm
+from mudg.stages import learn
+from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import score as learn_score
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +129,7 @@ def test_clips_that_never_come_are_an_error(tmp_path):
 
 
 def test_perfect_samples_score_perfectly(clips):
-    batch = clip_shards.read_batch(clips, [(city_clips.HELD_OUT, 0, range(WINDOW))])
+    batch = clip_shards.read_batch(clips, [(from_city.HELD_OUT, 0, range(WINDOW))])
     depth = batch.depth[0].clamp(max=100.0)
     sample = mdm.Sample(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
     row, counts = learn_score.score_clip(batch, sample)

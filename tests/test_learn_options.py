@@ -10,10 +10,12 @@ from toy_clips import WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.models import mdm
-from mudg.models.mdm import MDM, MDMConfig
-from mudg.models.vae import CodecConfig
-from mudg.stages import learn, learn_clips, learn_latents
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.stages import learn
+from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import latents as learn_latents
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,12 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
-from mudg.models import mdm
-from mudg.stages import learn, learn_clips, learn_parallel
-from mudg.stages.learn_parallel import Ranks
-from mudg.stages.learn_state import RowFiles, TrainingState
+from mudg.models.mdm import model as mdm
+from mudg.stages import learn
+from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import parallel as learn_parallel
+from mudg.stages.learning.parallel import Ranks
+from mudg.stages.learning.state import RowFiles, TrainingState
 
 SAME = 2e-6
 """Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows it)."""

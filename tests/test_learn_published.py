@@ -15,15 +15,18 @@ from toy_published import published_settings, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
-from mudg.data import city_clips, clip_shards, log_clips
-from mudg.data.clips import ConditionRules, build_condition
-from mudg.data.log_clips import LogClipRules, LogSource
+from mudg.data.clips import from_city, from_log
+from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.condition import ConditionRules, build_condition
+from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.observations import read_observations
-from mudg.data.scenefile import read_scene
-from mudg.models import published
-from mudg.models.published import PAPER_DROPOUT, RELEASED_DROPOUT, ContextDropout, PublishedMDM
-from mudg.stages import convert, fuse, learn, learn_clips, published_model, synthesize
+from mudg.data.scene import read_scene
+from mudg.models.published import model as published
+from mudg.models.published.model import PAPER_DROPOUT, RELEASED_DROPOUT, ContextDropout, PublishedMDM
+from mudg.stages import convert, fuse, learn, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
+from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import published_model
 
 
 @pytest.fixture(scope="module")
@@ -208,10 +211,10 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
 def test_clips_of_logs_show_points_alone(street, tmp_path):
     """The condition is the one that `synthesize` builds for the published model, and survives the disk."""
     rules = LogClipRules(width=48, height=32, window=4, stride=4, held_out_every=0, published=True)
-    log = log_clips.OpenLog(LogSource(street / "scene", street / "fuse"), rules)
-    window = log_clips.log_windows(log.scene, rules)[0]
+    log = from_log.OpenLog(LogSource(street / "scene", street / "fuse"), rules)
+    window = from_log.log_windows(log.scene, rules)[0]
     held = replace(window, held_out=True)  # all points are kept
-    clip = log_clips.make_clip(log, held, 0)
+    clip = from_log.make_clip(log, held, 0)
     recorded = synthesize.recorded_images(log.scene, SynthesizeConfig(given_classes=False))
     views = [log.frame(name).view for name in window.frames]
     conditions = ConditionRules(48, 32, 72, 48, published=True)
@@ -225,30 +228,30 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert bool((batch.sparse_depth == 0).any()) and not bool(batch.warped.any())
     assert torch.allclose(batch.color[0], wanted.color, atol=1 / 500)
     assert 0 < float(batch.depth[~batch.depth_known].min()) and float(batch.depth[~batch.depth_known].max()) <= 100
-    thinner = log_clips.make_clip(log, window, 0)
+    thinner = from_log.make_clip(log, window, 0)
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
 
 
 def test_filling_takes_the_nearest_measured_depth():
     depth = torch.zeros(2, 1, 1, 5)
     depth[0, 0, 0, 1], depth[0, 0, 0, 4] = 7.0, 30.0
-    assert log_clips._nearest_depth(depth, 100.0)[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
+    assert from_log._nearest_depth(depth, 100.0)[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
 
 
 def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
     sources = [LogSource(street / "scene", street / "fuse")]
     rules = LogClipRules(width=48, height=32, window=4)
-    log_clips.claim(tmp_path, rules, sources)
-    assert "published" not in json.loads((tmp_path / log_clips.INDEX).read_text())["rules"]  # as in earlier versions
+    from_log.claim(tmp_path, rules, sources)
+    assert "published" not in json.loads((tmp_path / from_log.INDEX).read_text())["rules"]  # as in earlier versions
     with pytest.raises(UsageError, match="other logs or settings"):
-        log_clips.claim(tmp_path, replace(rules, published=True), sources)
+        from_log.claim(tmp_path, replace(rules, published=True), sources)
 
 
 def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
-    rules = city_clips.CityClipRules(width=48, height=32, window=16, clips=1, published=True)
-    assert rules.frames == 18 and city_clips.CityClipRules().frames == city_clips.FRAMES
-    log = city_clips.make_log(replace(rules, width=24, height=16), 0, rules.frames)
-    (clip,), _ = city_clips.make_clips(replace(rules, width=24, height=16), 0, log)
+    rules = from_city.CityClipRules(width=48, height=32, window=16, clips=1, published=True)
+    assert rules.frames == 18 and from_city.CityClipRules().frames == from_city.FRAMES
+    log = from_city.make_log(replace(rules, width=24, height=16), 0, rules.frames)
+    (clip,), _ = from_city.make_clips(replace(rules, width=24, height=16), 0, log)
     condition = clip.condition
     assert len(clip.rgb) == 16 and condition.warped is None
     empty = ~condition.valid
@@ -269,7 +272,7 @@ def test_a_published_model_goes_on_learning_on_a_log(converted, street, tmp_path
         converted, "", scenes=(source,), stride=4, held_out_every=0, width=32, height=32, steps=1, batch_frames=4
     )
     made = learn.run(config, tmp_path / "run")
-    index = json.loads((tmp_path / "run" / "clips" / log_clips.INDEX).read_text())["rules"]
+    index = json.loads((tmp_path / "run" / "clips" / from_log.INDEX).read_text())["rules"]
     assert (index["width"], index["height"], index["published"]) == (32, 32, True)
     assert "the first image as condition" in (made / "MODEL_CARD.md").read_text()
     assert read_scene(street / "scene").cameras["front"].width == 72

@@ -11,11 +11,12 @@ from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Source
-from mudg.data import clip_shards, log_clips
-from mudg.data.city_clips import HELD_OUT
-from mudg.data.log_clips import LogClipRules, LogSource
-from mudg.data.scenefile import SceneWriter, read_image, read_label, read_points, read_scene
-from mudg.models import mdm
+from mudg.data.clips import from_log
+from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.from_city import HELD_OUT
+from mudg.data.clips.from_log import LogClipRules, LogSource
+from mudg.data.scene import SceneWriter, read_image, read_label, read_points, read_scene
+from mudg.models.mdm import model as mdm
 from mudg.stages import fuse, learn
 from mudg.stages.config import FuseConfig
 
@@ -60,25 +61,25 @@ def log(tmp_path_factory):
 
 def test_windows_to_score_share_no_moment_with_those_to_train_on(log):
     scene = read_scene(log[1].scene)
-    found = log_clips.log_windows(scene, RULES)
+    found = from_log.log_windows(scene, RULES)
     held = {name for w in found if w.held_out for name in w.frames}
     trained = {name for w in found if not w.held_out for name in w.frames}
     assert held and trained and not held & trained
     assert "front/000004" not in held | trained  # the scene holds it out
     assert all(len(w.frames) == 3 for w in found)
-    everything = log_clips.log_windows(scene, LogClipRules(48, 24, window=3, stride=2, held_out_every=0))
+    everything = from_log.log_windows(scene, LogClipRules(48, 24, window=3, stride=2, held_out_every=0))
     assert [w.frames[0] for w in everything] == [f"front/{n:06d}" for n in (0, 2, 5, 7, 9, 11, 13)]
     with pytest.raises(InputError, match="too short"):
-        log_clips.log_windows(scene, LogClipRules(48, 24, window=30))
+        from_log.log_windows(scene, LogClipRules(48, 24, window=30))
     with pytest.raises(InputError, match="too short to hold out"):
-        log_clips.plan([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
+        from_log.plan([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
 
 
 def test_truth_is_what_was_recorded(measured):
     street, source = measured
-    opened = log_clips.OpenLog(source, replace(RULES, width=120, height=60))
-    window = next(w for w in log_clips.log_windows(opened.scene, RULES) if not w.held_out)
-    clip = log_clips.make_clip(opened, window, 0)
+    opened = from_log.OpenLog(source, replace(RULES, width=120, height=60))
+    window = next(w for w in from_log.log_windows(opened.scene, RULES) if not w.held_out)
+    clip = from_log.make_clip(opened, window, 0)
     for number, view in enumerate(clip.condition.views):
         _, ids, depth = street.image(view)  # exact, at the clip's size
         known = clip.depth_valid[number, 0].numpy()
@@ -100,12 +101,12 @@ def test_a_view_never_sees_its_own_image(log, tmp_path):
     _, source = log
     scene = read_scene(source.scene)
     rules = replace(RULES, farthest=1)  # neighbours' images are given
-    opened = log_clips.OpenLog(source, rules)
-    window = next(w for w in log_clips.log_windows(scene, rules) if not w.held_out)
+    opened = from_log.OpenLog(source, rules)
+    window = next(w for w in from_log.log_windows(scene, rules) if not w.held_out)
     painted = window.frames[1]
     rewritten(scene, tmp_path / "scene", black=painted)
-    other = log_clips.OpenLog(LogSource(tmp_path / "scene", source.fused), rules)
-    clip, again = (log_clips.make_clip(x, window, 0) for x in (opened, other))
+    other = from_log.OpenLog(LogSource(tmp_path / "scene", source.fused), rules)
+    clip, again = (from_log.make_clip(x, window, 0) for x in (opened, other))
     assert torch.equal(clip.condition.color[1], again.condition.color[1])
     assert torch.equal(clip.condition.backdrop[1], again.condition.backdrop[1])
     assert not torch.equal(clip.condition.color, again.condition.color)  # its neighbours do see it
@@ -114,10 +115,10 @@ def test_a_view_never_sees_its_own_image(log, tmp_path):
 
 
 def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
-    opened = log_clips.OpenLog(measured[1], replace(RULES, width=64, height=32))
-    window = log_clips.log_windows(opened.scene, RULES)[0]
+    opened = from_log.OpenLog(measured[1], replace(RULES, width=64, height=32))
+    window = from_log.log_windows(opened.scene, RULES)[0]
     clip_shards.write_shard(
-        tmp_path, 0, clip_shards.pack_clips([log_clips.make_clip(opened, window, 0)], [0.0], gaps=True)
+        tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], [0.0], gaps=True)
     )
     model = mdm.MDM(learn.model_config(tiny(tmp_path, width=64, height=32, window=3)))
     batch = clip_shards.read_batch(tmp_path, [(0, 0, range(3))])
@@ -159,6 +160,6 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     facts = json.loads((made / "model.json").read_text())["facts"]
     assert facts["recipe"]["scenes"] == [str(run)]
     with pytest.raises(UsageError, match="other logs or settings"):
-        log_clips.claim(made.parent / "clips", RULES, [log[1]])
+        from_log.claim(made.parent / "clips", RULES, [log[1]])
     with pytest.raises(InputError, match="no scene with a fused cloud"):
         learn.run(tiny("", start=str(first), scenes=(str(tmp_path),)), tmp_path / "none")

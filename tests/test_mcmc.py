@@ -10,10 +10,10 @@ import torch
 
 from mudg.base import geometry
 from mudg.base.types import Camera, Gaussians, View
-from mudg.core.raster import RasterConfig, rasterize
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
-from mudg.models import mcmc
-from mudg.models.mcmc import (
+from mudg.models.scene import mcmc
+from mudg.models.scene.mcmc import (
     McmcSettings,
     drift,
     order_of_place,
@@ -22,7 +22,7 @@ from mudg.models.mcmc import (
     stack_of,
     systematic_counts,
 )
-from mudg.models.nodes import RigidNode, SceneModel, StaticNode
+from mudg.models.scene.nodes import RigidNode, SceneModel, StaticNode
 
 SETTINGS = McmcSettings(start=10, stop=100, every=10, max_rows=1000, growth=0.0)
 NOWHERE = -9.0  # a logit of opacity 0.0001

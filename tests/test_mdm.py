@@ -9,9 +9,10 @@ import torch
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
-from mudg.models import mdm, unet, vae
-from mudg.models.mdm import MDM, MDMConfig
-from mudg.models.vae import CodecConfig
+from mudg.models.mdm import codec, unet
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, MDMConfig
 
 TINY = MDMConfig(
     widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
@@ -191,7 +192,7 @@ def test_training_and_inference_attention_agree():
 
 def test_temporal_shift_moves_one_eighth_each_way():
     x = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 16, 2, 2)
-    moved = vae.temporal_shift(x, 3)
+    moved = codec.temporal_shift(x, 3)
     assert moved[:, :2].amax((1, 2, 3)).tolist() == [0, 0, 1]
     assert moved[:, 2:4].amax((1, 2, 3)).tolist() == [1, 2, 2]
     assert torch.equal(moved[:, 4:], x[:, 4:])

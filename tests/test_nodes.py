@@ -15,10 +15,10 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
 from mudg.core.edit import object_moved, without_tracks
-from mudg.core.raster_request import harmonics
+from mudg.core.raster.request import harmonics
 from mudg.core.table import Table, torch_adam_columns
-from mudg.models import motion, nodes
-from mudg.models.nodes import RigidNode, SceneModel, SkyNode, StaticNode, compose
+from mudg.models.scene import motion, nodes
+from mudg.models.scene.nodes import RigidNode, SceneModel, SkyNode, StaticNode, compose
 
 
 def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0.0) -> np.ndarray:

@@ -21,7 +21,7 @@ from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.types import Scene, Track
 from mudg.data.importers import IMPORTERS, RECOGNISERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_points, read_scene
+from mudg.data.scene import read_points, read_scene
 
 pytestmark = roundtrip.needs_native
 

@@ -14,7 +14,8 @@ import pandas_pickles
 import pytest
 
 from mudg.base.errors import InputError
-from mudg.data.importers import pandas_frame, plain_pickle
+from mudg.data.importers import plain_pickle
+from mudg.data.importers.pandaset import pandas_frame
 from mudg.data.importers.plain_pickle import NUMPY_MAKERS, Array, as_list, read_pickle
 
 GOLDEN = Path(__file__).parent / "golden"

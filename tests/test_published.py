@@ -17,14 +17,16 @@ from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.data.observations import read_observations
-from mudg.models import clip, published, video_unet
-from mudg.models.clip import ImageTower, TextTower, TowerConfig
-from mudg.models.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
-from mudg.models.published import PublishedConfig, Sampling, choose_trainable
-from mudg.models.resampler import Resampler, ResamplerConfig
-from mudg.models.video_unet import VideoUNet, VideoUNetConfig
-from mudg.stages import convert, fuse, memory_plan, published_model, synthesize
+from mudg.models.published import clip, video_unet
+from mudg.models.published import model as published
+from mudg.models.published.clip import ImageTower, TextTower, TowerConfig
+from mudg.models.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
+from mudg.models.published.model import PublishedConfig, Sampling, choose_trainable
+from mudg.models.published.resampler import Resampler, ResamplerConfig
+from mudg.models.published.video_unet import VideoUNet, VideoUNetConfig
+from mudg.stages import convert, fuse, synthesize
 from mudg.stages.config import ConvertConfig, FuseConfig, SynthesizeConfig
+from mudg.stages.learning import memory_plan, published_model
 
 GOLDEN = Path(__file__).parent / "golden"
 TOLERANCE = 1e-4
@@ -499,9 +501,9 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
 
 def test_the_released_resizing(street):
     """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
-    from mudg.data.clips import ConditionRules, build_conditions, project_sparse
+    from mudg.data.clips.condition import ConditionRules, build_conditions, project_sparse
     from mudg.data.cloudfile import read_fused
-    from mudg.data.scenefile import read_scene
+    from mudg.data.scene import read_scene
 
     scene, cloud = read_scene(street / "scene"), read_fused(street / "fused")
     view = scene.frames_of("front")[0].view
@@ -518,7 +520,7 @@ def test_the_released_resizing(street):
 
 
 def test_the_reference_fits_only_where_it_was_taken(street):
-    from mudg.data.scenefile import read_scene
+    from mudg.data.scene import read_scene
 
     scene = read_scene(street / "scene")
     recorded = synthesize.recorded_images(scene, SynthesizeConfig(held_out_images=True, given_classes=False))

@@ -16,8 +16,9 @@ from mudg import native
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.base.types import Camera, Gaussians, Render, View
-from mudg.core import raster, raster_gsplat
-from mudg.core.raster import BACKENDS, RasterConfig, rasterize
+from mudg.core.raster import gsplat_cuda
+from mudg.core.raster import rasterize as raster
+from mudg.core.raster.rasterize import BACKENDS, RasterConfig, rasterize
 
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
 CPU, TORCH = RasterConfig(backend="cpu"), RasterConfig(backend="torch")
@@ -603,7 +604,7 @@ def test_without_the_library_auto_takes_torch_and_cpu_is_refused(monkeypatch: py
 
 
 def test_gsplat_is_refused_where_it_is_missing() -> None:
-    if not raster_gsplat.problem():
+    if not gsplat_cuda.problem():
         pytest.skip("gsplat is installed here")
     with pytest.raises(ResourceError, match="gsplat"):
         rasterize(_gaussians(_parameters(5)), _view(), RasterConfig(backend="gsplat"))
@@ -640,7 +641,7 @@ def test_the_gsplat_adapter_maps_every_argument() -> None:
     config = RasterConfig(near_m=0.2, far_m=90.0, blur_px2=0.1, antialias=True)
     pose = torch.tensor(view.world_from_cam, dtype=torch.float32)
     request = raster.Request(_gaussians(p), (view,), False, config, 2, (torch.tensor([0.0, 0.0, 1.0]),), (pose,), True)
-    out = raster_gsplat.render(request, module=fake)  # type: ignore[arg-type]
+    out = gsplat_cuda.render(request, module=fake)  # type: ignore[arg-type]
     (_, degree, directions), (_, draw) = fake.calls
     assert degree == 2
     torch.testing.assert_close(directions[0], torch.nn.functional.normalize(p["means"] - pose[:3, 3], dim=1))
@@ -674,7 +675,7 @@ def test_gsplat_draws_several_views_in_one_call() -> None:
     fake, views = _FakeGsplat(), (_view(6, 4), _axis_view(6, 4))
     p = _leaves(_parameters(7, degree=1, channels=2))
     request = raster.Request(_gaussians(p), views, True, RasterConfig(), 1, (None, torch.ones(3)), (None, None), True)
-    out = raster_gsplat.render(request, module=fake)  # type: ignore[arg-type]
+    out = gsplat_cuda.render(request, module=fake)  # type: ignore[arg-type]
     assert [name for name, *_ in fake.calls] == ["sh", "draw"]
     draw = fake.calls[1][1]
     for index, view in enumerate(views):

@@ -14,8 +14,9 @@ from torch import Tensor
 from mudg import native
 from mudg.base import geometry
 from mudg.base.types import Camera, Gaussians, View
-from mudg.core import raster_cpu, raster_torch
-from mudg.core.raster import RasterConfig, rasterize
+from mudg.core.raster import cpu as raster_cpu
+from mudg.core.raster import torch_twin
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
 GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")
@@ -52,8 +53,8 @@ def _gaussians(parts: dict[str, Tensor], dtype: torch.dtype = torch.float64) -> 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradients_match_finite_differences_without_cut_offs(monkeypatch: pytest.MonkeyPatch, antialias: bool) -> None:
     """With the alpha cut at 1e-12 and no stop the picture is smooth in everything, so that every derivative can be checked."""
-    monkeypatch.setattr(raster_torch, "ALPHA_MIN", 1e-12)
-    monkeypatch.setattr(raster_torch, "STOP_TRANSMITTANCE", 0.0)
+    monkeypatch.setattr(torch_twin, "ALPHA_MIN", 1e-12)
+    monkeypatch.setattr(torch_twin, "STOP_TRANSMITTANCE", 0.0)
     view, values = _view(), _values(6, 2, 2)
     values["scales"] *= 3
     inputs = [values[name].requires_grad_() for name in GROUPS]

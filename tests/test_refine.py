@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from mudg.models import refine
-from mudg.models.refine import ConditionPixels, PixelTruth, Refined, Refiner
-from mudg.models.vae import CodecConfig, PatchCodec
+from mudg.models.mdm import refine
+from mudg.models.mdm.codec import CodecConfig, PatchCodec
+from mudg.models.mdm.refine import ConditionPixels, PixelTruth, Refined, Refiner
 
 
 def some(count=4, height=16, width=24, seed=0):

@@ -15,7 +15,7 @@ from mudg.base.palette import ID
 from mudg.data.cloudfile import write_fused
 from mudg.data.exporters.video import read_mp4
 from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
-from mudg.data.scenefile import read_scene
+from mudg.data.scene import read_scene
 from mudg.stages import fit, render
 from mudg.stages.config import FitConfig, RenderConfig
 

@@ -18,7 +18,9 @@ import toy_views
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
-from mudg.stages import report, report_page, score
+from mudg.report import page as report_page
+from mudg.report import run_report
+from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 
 
@@ -55,7 +57,7 @@ def finished_run(out: Path) -> Path:
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     out = finished_run(tmp_path_factory.mktemp("run"))
-    return report.write_report(out).read_text(encoding="utf-8")
+    return run_report.write_report(out).read_text(encoding="utf-8")
 
 
 class Outline(html.parser.HTMLParser):
@@ -136,16 +138,16 @@ def test_videos_hold_all_panels_and_play(page: str) -> None:
 def test_panels_show_what_they_say(tmp_path: Path) -> None:
     out = finished_run(tmp_path)
     scores = store.read_json(out / "score" / "metrics.json")
-    folders = report._folders(out, scores)
+    folders = run_report._folders(out, scores)
     assert list(folders) == ["truth", "street_gaussians", "mudg_r", "mudg_s"]
     course = next(c for c in scores["trajectories"] if c["shift_m"] == 0)
-    columns = report._columns(course, folders)
+    columns = run_report._columns(course, folders)
     assert columns.has_truth
-    panels = {c: tuple(report._modalities(columns, c)) for c in columns.sets}
+    panels = {c: tuple(run_report._modalities(columns, c)) for c in columns.sets}
     assert panels["truth"] == ("rgb", "depth", "semantics")
     assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
     assert "mudg_r" not in panels
-    atlas = next(report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
+    atlas = next(run_report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
     h, w = toy_views.HEIGHT, toy_views.WIDTH
     assert np.array_equal(atlas[:h, :w], toy_views.colours(0))
     assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colours(0) * 0.8)).max() <= 1
@@ -157,15 +159,15 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
 def test_a_shifted_view_of_a_log_shows_the_driven_line_beside_it(tmp_path: Path) -> None:
     out = finished_run(tmp_path)
     scores = store.read_json(out / "score" / "metrics.json")
-    folders = report._folders(out, scores)
+    folders = run_report._folders(out, scores)
     course = next(c for c in scores["trajectories"] if c["shift_m"] == 2)
-    columns = report._columns(course, folders)
+    columns = run_report._columns(course, folders)
     assert not columns.has_truth
     assert columns.sets["truth"].trajectory == "front_recorded"
     assert list(columns.indices["truth"]) == [0, 1, 2, 3]
-    panels = {c: tuple(report._modalities(columns, c)) for c in columns.sets}
+    panels = {c: tuple(run_report._modalities(columns, c)) for c in columns.sets}
     assert all("error" not in rows for rows in panels.values())
-    atlas = next(report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
+    atlas = next(run_report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
     assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colours(0))
 
 
@@ -211,8 +213,8 @@ def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
 
 def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = finished_run(tmp_path)
-    monkeypatch.setattr(report, "video_encoders", list)
-    page = report.write_report(out).read_text(encoding="utf-8")
+    monkeypatch.setattr(run_report, "video_encoders", list)
+    page = run_report.write_report(out).read_text(encoding="utf-8")
     outline(page)
     assert "<video" not in page
     assert page.count("data:image/jpeg") == 2
@@ -220,11 +222,11 @@ def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytes
 
 def test_an_unscored_run_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="file not found"):
-        report.write_report(tmp_path)
+        run_report.write_report(tmp_path)
 
 
 def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = finished_run(tmp_path)
-    large = report.write_report(out).stat().st_size
-    monkeypatch.setattr(report, "BUDGET_BYTES", 1000)
-    assert report.write_report(out).stat().st_size < large
+    large = run_report.write_report(out).stat().st_size
+    monkeypatch.setattr(run_report, "BUDGET_BYTES", 1000)
+    assert run_report.write_report(out).stat().st_size < large

@@ -12,11 +12,12 @@ import pytest
 
 from mudg import cli
 from mudg.base import config as configuration
-from mudg.base import store
+from mudg.base import processes, store
 from mudg.base.errors import InputError, NumericsError, UsageError
-from mudg.stages import annotate, fit, fuse, ingest, render, report, run, score, side_by_side, synthesize
+from mudg.base.processes import Task
+from mudg.report import run_report
+from mudg.stages import annotate, fit, fuse, ingest, render, run, score, synthesize
 from mudg.stages.config import RunConfig, run_preset, with_seed
-from mudg.stages.side_by_side import Task
 
 
 @pytest.fixture
@@ -57,8 +58,8 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         store.write_text(out / "report.html", "page")
         return out / "report.html"
 
-    monkeypatch.setattr(report, "film", film)
-    monkeypatch.setattr(report, "write_page", write_page)
+    monkeypatch.setattr(run_report, "film", film)
+    monkeypatch.setattr(run_report, "write_page", write_page)
     return seen
 
 
@@ -95,7 +96,7 @@ def test_the_fits_run_side_by_side_on_two_cores_unless_one_is_there(
         for task in tasks:
             fit.run(*task.arguments, **task.named)
 
-    monkeypatch.setattr(side_by_side, "run_side_by_side", in_a_row)
+    monkeypatch.setattr(processes, "run_side_by_side", in_a_row)
     run.run_chain(RunConfig(), "city", tmp_path / "one core")
     assert not started
     monkeypatch.setenv("MUDG_THREADS", "5")

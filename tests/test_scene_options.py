@@ -15,15 +15,17 @@ from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, w
 from mudg.base.errors import InputError, NumericsError
 from mudg.base.types import FusedCloud, PointCloud, Scene, Track
 from mudg.core import metrics, trajectory
-from mudg.core.raster import RasterConfig
+from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.cloudfile import write_fused
 from mudg.data.observations import ObservationWriter
-from mudg.data.scenefile import SceneWriter, read_scene
-from mudg.models.densify import DensifySettings, DensifyStats, densify
-from mudg.models.nodes import DeformableNode, compose
-from mudg.stages import fit, fit_start, fit_views
+from mudg.data.scene import SceneWriter, read_scene
+from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
+from mudg.models.scene.nodes import DeformableNode, compose
+from mudg.stages import fit
 from mudg.stages.config import FitConfig
-from mudg.stages.fit_start import mirrored_points
+from mudg.stages.fitting import start as fit_start
+from mudg.stages.fitting import views as fit_views
+from mudg.stages.fitting.start import mirrored_points
 from mudg.stages.ingest import add_frame_copy, add_rest
 
 SIZE, FRAMES = (60, 40), 6

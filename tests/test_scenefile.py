@@ -20,9 +20,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError, MudgError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
-from mudg.data.scene_files import open_files
-from mudg.data.scene_schema import ref_problem, scene_to_json_text
-from mudg.data.scenefile import (
+from mudg.data.scene import (
     SceneWriter,
     check_scene,
     read_image,
@@ -32,6 +30,8 @@ from mudg.data.scenefile import (
     read_trusted_classes,
     write_zip,
 )
+from mudg.data.scene.files import open_files
+from mudg.data.scene.schema import ref_problem, scene_to_json_text
 
 CAMERA = Camera("front", 32, 20, 30.0, 31.0, 16.0, 10.0, (0.1, -0.02), 0.005)
 

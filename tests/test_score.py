@@ -14,7 +14,8 @@ import toy_views
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
-from mudg.stages import score, score_tables
+from mudg.report import score_tables
+from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 
 

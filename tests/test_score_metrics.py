@@ -18,9 +18,10 @@ from mudg.base.types import Camera, View
 from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.data.city import CityConfig, CityWorld
-from mudg.models import mdm
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
-from mudg.stages import score, score_tables
+from mudg.models.mdm import model as mdm
+from mudg.report import score_tables
+from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 
 

@@ -18,11 +18,11 @@ from mudg.base import checkpoint, geometry
 from mudg.base.errors import InputError, IntegrityError, ResourceError
 from mudg.base.palette import CLASSES, ID
 from mudg.core.complete import ray_elevation, visible_depth
-from mudg.models import street_net
-from mudg.models.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
-from mudg.models.labellers import TRAIN_ID_OF, labeller
-from mudg.models.street_labels import at_size, reduced, settled, settled_by_color
-from mudg.models.street_net import StreetNet, StreetNetConfig
+from mudg.models.labels import street_net
+from mudg.models.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
+from mudg.models.labels.labellers import TRAIN_ID_OF, labeller
+from mudg.models.labels.street_labels import at_size, reduced, settled, settled_by_color
+from mudg.models.labels.street_net import StreetNet, StreetNetConfig
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))

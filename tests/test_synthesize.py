@@ -9,13 +9,13 @@ from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
 from mudg.core import trajectory
-from mudg.data.clips import ConditionRules, build_conditions
+from mudg.data.clips.condition import ConditionRules, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import list_observation_sets, read_observations
-from mudg.data.scenefile import read_scene
-from mudg.models import mdm
-from mudg.models.mdm import MDM, MDMConfig
-from mudg.models.vae import CodecConfig
+from mudg.data.scene import read_scene
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import fit, fuse, synthesize
 from mudg.stages.config import FitConfig, FuseConfig, SynthesizeConfig
 

@@ -7,7 +7,7 @@ import torch
 
 from mudg.base import palette
 from mudg.base.errors import UsageError
-from mudg.models.vae import CodecConfig, build_codec, code_to_depth, depth_to_code, semantic_shares
+from mudg.models.mdm.codec import CodecConfig, build_codec, code_to_depth, depth_to_code, semantic_shares
 
 
 def smooth_images(count=6, height=16, width=24, seed=0):

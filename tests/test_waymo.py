@@ -19,16 +19,12 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.data.city import rig
-from mudg.data.importers import (
-    waymo_camera,
-    waymo_proto,
-    waymo_tfrecord,
-    waymo_tracks,
-)
-from mudg.data.importers.waymo_log import WaymoBox
-from mudg.data.importers.waymo_v1 import TfrecordLog
-from mudg.data.importers.waymo_v2 import Table
-from mudg.data.scenefile import read_image, read_label, read_points
+from mudg.data.importers.waymo import camera as waymo_camera
+from mudg.data.importers.waymo import proto, tfrecord, tracks
+from mudg.data.importers.waymo.records import WaymoBox
+from mudg.data.importers.waymo.v1 import TfrecordLog
+from mudg.data.importers.waymo.v2 import Table
+from mudg.data.scene import read_image, read_label, read_points
 
 # --- round trips ------------------------------------------------------------------------------------------------------
 
@@ -101,14 +97,14 @@ def test_points_count_for_the_moment_that_puts_them_inside() -> None:
     seen = np.linspace(0.03, 0.04, len(grid))
     for index, held in enumerate((0.035, 0.0, 0.05)):
         points = on_box + (seen - held)[:, None] * 20.0 * forward
-        counts = waymo_tracks.points_inside(box, 20.0 * forward, points, seen, 0.035, 0.05)
+        counts = tracks.points_inside(box, 20.0 * forward, points, seen, 0.035, 0.05)
         assert counts[index] == len(grid)
         assert counts.argmax() == index
         assert np.delete(counts, index).max() < 0.95 * len(grid)
-        assert waymo_tracks.choose_moment(counts) == waymo_tracks.MOMENTS[index]
+        assert tracks.choose_moment(counts) == tracks.MOMENTS[index]
     low = on_box - [0, 0, 0.75]
-    assert waymo_tracks.points_inside(box, np.zeros(3), low, seen, 0.0, 0.0).tolist() == [0, 0, 0]  # the road
-    assert waymo_tracks.choose_moment(np.array([100, 104, 90])) == "seen"
+    assert tracks.points_inside(box, np.zeros(3), low, seen, 0.0, 0.0).tolist() == [0, 0, 0]  # the road
+    assert tracks.choose_moment(np.array([100, 104, 90])) == "seen"
 
 
 @roundtrip.needs_native
@@ -237,16 +233,16 @@ def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> N
 
 def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_data: Callable[[str], Path]) -> None:
     path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
-    label = waymo_proto.Message(
-        "Label", {**waymo_proto.FRAME.fields[6].message.fields}  # type: ignore[union-attr]
+    label = proto.Message(
+        "Label", {**proto.FRAME.fields[6].message.fields}  # type: ignore[union-attr]
     )  # fmt: skip
-    per_camera = waymo_proto.Message(
-        "CameraLabels", {1: waymo_proto.Field("name", "int"), 2: waymo_proto.Field("labels", "messages", label)}
+    per_camera = proto.Message(
+        "CameraLabels", {1: proto.Field("name", "int"), 2: proto.Field("labels", "messages", label)}
     )
-    message = waymo_proto.Message("Frame", {9: waymo_proto.Field("projected", "messages", per_camera)})
-    (place,) = waymo_tfrecord.record_places(path)
+    message = proto.Message("Frame", {9: proto.Field("projected", "messages", per_camera)})
+    (place,) = tfrecord.record_places(path)
     with path.open("rb") as file:
-        projected = waymo_proto.parse_message(waymo_tfrecord.read_record(file, path, place), message, "real")[
+        projected = proto.parse_message(tfrecord.read_record(file, path, place), message, "real")[
             "projected"
         ]
     log = TfrecordLog(path)

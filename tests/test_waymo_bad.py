@@ -16,13 +16,11 @@ import write_waymo as made
 from waymo_logs import ingest, write
 
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.data.importers import (
-    RECOGNISERS,
-    waymo_log,
-    waymo_tfrecord,
-)
-from mudg.data.importers.waymo_v2 import Table
-from mudg.data.scenefile import read_points
+from mudg.data.importers import RECOGNISERS
+from mudg.data.importers.waymo import records as waymo_log
+from mudg.data.importers.waymo import tfrecord as waymo_tfrecord
+from mudg.data.importers.waymo.v2 import Table
+from mudg.data.scene import read_points
 
 
 @pytest.fixture

@@ -15,14 +15,10 @@ from hypothesis import strategies as st
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, yaw_matrix
-from mudg.data.importers import (
-    waymo_camera,
-    waymo_lidar,
-    waymo_proto,
-    waymo_tfrecord,
-    waymo_tracks,
-)
-from mudg.data.importers.waymo_log import CameraShot, LaserCalibration, LaserScan, WaymoBox
+from mudg.data.importers.waymo import camera as waymo_camera
+from mudg.data.importers.waymo import lidar, proto, tfrecord
+from mudg.data.importers.waymo import tracks as waymo_tracks
+from mudg.data.importers.waymo.records import CameraShot, LaserCalibration, LaserScan, WaymoBox
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -42,16 +38,16 @@ def random_pose(generator: np.random.Generator, reach_m: float = 3.0) -> np.ndar
     "data, crc", [(b"123456789", 0xE3069283), (bytes(32), 0x8A9136AA), (b"\xff" * 32, 0x62A8AB43), (b"", 0)]
 )
 def test_crc32c_has_the_published_values(data: bytes, crc: int) -> None:
-    assert waymo_tfrecord.crc32c(data) == crc
+    assert tfrecord.crc32c(data) == crc
 
 
 @pytest.mark.parametrize("length", [1, 63, 64, 65, 2319, 2320, 2321, 2328, 3571, 45479, 45480, 45488, 80064, 123457])
 def test_crc32c_folded_equals_byte_by_byte(length: int) -> None:
     data = rng(length).bytes(length)
-    assert waymo_tfrecord.crc32c(data) == made.crc32c_bitwise(data)
+    assert tfrecord.crc32c(data) == made.crc32c_bitwise(data)
 
 
-@pytest.mark.parametrize("degree, lower", waymo_tfrecord.SPARSE_MULTIPLES)
+@pytest.mark.parametrize("degree, lower", tfrecord.SPARSE_MULTIPLES)
 def test_sparse_multiples_are_multiples_of_the_polynomial(degree: int, lower: tuple[int, ...]) -> None:
     value = 1 << degree
     for exponent in lower:
@@ -66,22 +62,22 @@ def test_sparse_multiples_are_multiples_of_the_polynomial(degree: int, lower: tu
 def test_varints_at_once_equal_varints_one_by_one() -> None:
     values = np.concatenate([rng().integers(-(2**40), 2**40, 200), [0, -1, 127, 128, 2**62, -(2**63)], np.arange(300)])
     data = b"".join(made.varint(int(value)) for value in values)
-    assert (waymo_proto.unpack_varints(data, "x") == values).all()
+    assert (proto.unpack_varints(data, "x") == values).all()
     with pytest.raises(InputError, match="cut off"):
-        waymo_proto.unpack_varints(data + b"\x80", "x")
+        proto.unpack_varints(data + b"\x80", "x")
     with pytest.raises(InputError, match="ten bytes"):
-        waymo_proto.unpack_varints(b"\x80" * 10 + b"\x01", "x")
+        proto.unpack_varints(b"\x80" * 10 + b"\x01", "x")
 
 
-INNER = waymo_proto.Message(
-    "Inner", {1: waymo_proto.Field("values", "doubles"), 3: waymo_proto.Field("counts", "ints")}
+INNER = proto.Message(
+    "Inner", {1: proto.Field("values", "doubles"), 3: proto.Field("counts", "ints")}
 )
-OUTER = waymo_proto.Message(
+OUTER = proto.Message(
     "Outer",
     {
-        1: waymo_proto.Field("name", "text"),
-        2: waymo_proto.Field("number", "int"),
-        4: waymo_proto.Field("inner", "messages", INNER),
+        1: proto.Field("name", "text"),
+        2: proto.Field("number", "int"),
+        4: proto.Field("inner", "messages", INNER),
     },
 )
 
@@ -91,7 +87,7 @@ def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() 
     plain = made.doubles(1, [1.5, -2]) + made.number(3, 7) + made.number(3, -7)
     skipped = made.double(9, 1.0) + made.single(10, 1.0) + made.number(11, 300) + made.text(12, b"?")
     data = made.text(1, "Straße".encode()) + skipped + made.number(2, -5) + made.text(4, packed) + made.text(4, plain)
-    found = waymo_proto.parse_message(data, OUTER, "x")
+    found = proto.parse_message(data, OUTER, "x")
     assert (found["name"], found["number"], len(found["inner"])) == ("Straße", -5, 2)
     for inner in found["inner"]:
         assert inner["values"].tolist() == [1.5, -2]
@@ -108,16 +104,16 @@ def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() 
 )  # fmt: skip
 def test_broken_messages_are_named(data: bytes, word: str) -> None:
     with pytest.raises(InputError, match="message cannot be decoded") as caught:
-        waymo_proto.parse_message(data, OUTER, "file: record 3")
+        proto.parse_message(data, OUTER, "file: record 3")
     assert word in caught.value.got
     assert "record 3" in caught.value.where
 
 
 @given(st.binary(max_size=200))
 def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
-    for message in (waymo_proto.FRAME, waymo_proto.CONTEXT, waymo_proto.MATRIX_INT):
+    for message in (proto.FRAME, proto.CONTEXT, proto.MATRIX_INT):
         try:
-            waymo_proto.parse_message(data, message, "x")
+            proto.parse_message(data, message, "x")
         except InputError:
             continue
 
@@ -135,7 +131,7 @@ def test_points_equal_the_conversion_pixel_by_pixel(uneven: bool, posed: bool) -
     image = generator.uniform(-2, 60, (rows, columns, 4)).astype(np.float32)
     poses = generator.uniform(-1, 1, (rows, columns, 6)).astype(np.float32) if posed else None
     frame_pose = random_pose(generator)
-    points = waymo_lidar.points_of_scan(LaserScan([image], poses), laser, frame_pose, "x")
+    points = lidar.points_of_scan(LaserScan([image], poses), laser, frame_pose, "x")
     expected = []
     heading = np.arctan2(laser.vehicle_from_lidar[1, 0], laser.vehicle_from_lidar[0, 0])
     for row in range(rows):
@@ -163,7 +159,7 @@ def test_points_without_a_pose_are_left_out_and_counted() -> None:
     poses = np.full((2, 8, 6), 0.1, np.float32)
     poses[1, 3:] = 0
     laser = LaserCalibration("top", (), -0.2, 0.1, np.eye(4))
-    points = waymo_lidar.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
+    points = lidar.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
     assert (points.without_pose, len(points.xyz)) == (10, 22)
 
 
@@ -176,12 +172,12 @@ def test_the_turn_is_measured_from_pixel_poses(start: float, duration: float) ->
     poses[..., 3:] = place(start + (np.arange(100) + 0.5) / 100 * duration)
     poses[2:, 40:] = 0
     times = np.arange(-0.1, 0.25, 0.0125)
-    found = waymo_lidar.measure_turn(poses, 5.0, times + 5.0, place(times))
+    found = lidar.measure_turn(poses, 5.0, times + 5.0, place(times))
     assert found is not None
     assert np.abs(np.array(found) - [start, duration]).max() < 1e-5
-    assert waymo_lidar.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
-    nominal = waymo_lidar.TurnClock()
-    assert (waymo_lidar.median_clock([found]) == nominal) == (start == 0.0)
+    assert lidar.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
+    nominal = lidar.TurnClock()
+    assert (lidar.median_clock([found]) == nominal) == (start == 0.0)
 
 
 def test_a_view_is_that_of_the_middle_of_the_exposure() -> None:

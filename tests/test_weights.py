@@ -17,9 +17,10 @@ from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_chec
 from mudg import cli
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.data import weights
-from mudg.models.published import PublishedConfig
-from mudg.stages import convert, published_model
+from mudg.models.published.model import PublishedConfig
+from mudg.stages import convert
 from mudg.stages.config import ConvertConfig
+from mudg.stages.learning import published_model
 
 CONFIG = ConvertConfig(resolution="320x512")
 ENTER = "model.diffusion_model.input_blocks.0.0.weight"

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from mudg.base.types import Camera, Clip, Condition, View
-from mudg.data import clip_shards
-from mudg.data.city_clips import HELD_OUT
+from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.from_city import HELD_OUT
 from mudg.stages.config import LearnConfig
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4

@@ -8,11 +8,11 @@ import torch
 
 from mudg.core.noise import ScheduleConfig
 from mudg.data import weights
-from mudg.models.clip import TowerConfig
-from mudg.models.kl_vae import AutoencoderConfig
-from mudg.models.published import PublishedConfig, PublishedMDM
-from mudg.models.resampler import ResamplerConfig
-from mudg.models.video_unet import VideoUNetConfig
+from mudg.models.published.clip import TowerConfig
+from mudg.models.published.kl_vae import AutoencoderConfig
+from mudg.models.published.model import PublishedConfig, PublishedMDM
+from mudg.models.published.resampler import ResamplerConfig
+from mudg.models.published.video_unet import VideoUNetConfig
 from mudg.stages import convert
 from mudg.stages.config import ConvertConfig, LearnConfig
 

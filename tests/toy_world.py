@@ -27,7 +27,7 @@ from mudg.base.types import (
     Track,
     View,
 )  # fmt: skip
-from mudg.data.scenefile import SceneWriter
+from mudg.data.scene import SceneWriter
 
 CAR_SIZE = np.array([4.2, 1.8, 1.5])
 CAM_FROM_EGO = geometry.CAM_FROM_EGO_AXES

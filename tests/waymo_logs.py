@@ -18,7 +18,7 @@ from mudg.base.types import Scene, Track
 from mudg.data.city import rig
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scenefile import read_scene
+from mudg.data.scene import read_scene
 
 COLUMNS = 240
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
 from mudg.base.types import Scene
-from mudg.data.scenefile import read_image, read_points
+from mudg.data.scene import read_image, read_points
 
 EPOCH_S = 1_557_539_924.0
 SOURCE_FROM_WORLD = yaw_matrix(0.8, (12.0, -34.0, 1.5))

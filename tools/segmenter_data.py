@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from mudg.base import geometry, seeds, store
 from mudg.base.types import Track, View
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, measure_beam_gap, separate
-from mudg.data import city_logs
 from mudg.data.city import CityConfig, CityWorld
-from mudg.models.evidence import Evidence, gather
-from mudg.models.labellers import LabelInput
+from mudg.data.city import logs as city_logs
+from mudg.models.labels.evidence import Evidence, gather
+from mudg.models.labels.labellers import LabelInput
 
 FRAMES = 14
 VIEWS = 4

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mudg.base.errors import MudgError
     from mudg.base.types import Camera, Gaussians, Observation, PointCloud, Render, Scene, Track, Trajectory, View
-    from mudg.core.raster import rasterize
+    from mudg.core.raster.rasterize import rasterize
     from mudg.data.observations import read_observations
-    from mudg.data.scenefile import read_scene
+    from mudg.data.scene import read_scene
     from mudg.stages.run import run_chain
 
 __version__ = "0.1.0"
@@ -29,9 +29,9 @@ _HOMES = {
     "Track": "mudg.base.types",
     "Trajectory": "mudg.base.types",
     "View": "mudg.base.types",
-    "rasterize": "mudg.core.raster",
+    "rasterize": "mudg.core.raster.rasterize",
     "read_observations": "mudg.data.observations",
-    "read_scene": "mudg.data.scenefile",
+    "read_scene": "mudg.data.scene",
     "run_chain": "mudg.stages.run",
 }
 

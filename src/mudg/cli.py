@@ -126,7 +126,7 @@ def _name_and_folder(item: str) -> tuple[str, Path]:
 
 
 def _bench(args: f.Bench) -> dict[str, Any]:
-    from mudg.stages import bench
+    from mudg.bench import run as bench
 
     made = bench.run(args.name, args.settings, args.out, overwrite=args.overwrite)
     return {"bench": made / "bench.json", "text": (made / "bench.md").read_text(encoding="utf-8")}

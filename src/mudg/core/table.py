@@ -1,7 +1,7 @@
 """A row-aligned table of parameters: every column, its two Adam moments and every counter share one row order.
 
 Row operations (``take``, ``append``, ``permute`` as a take) move all of them together, so a moment can never belong to another
-row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of ``models/nodes.py``.
+row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of ``models/scene/nodes.py``.
 
 Some columns only a few rows need (the time-varying colour of moving objects). Such a *partial* column holds a value for
 every row whose label ``node`` is above 0, in row order, and nothing for the others: static rows pay neither memory nor a

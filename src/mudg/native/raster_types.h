@@ -47,7 +47,7 @@ struct TileItem {
   std::uint32_t blocks;
 };
 
-// extern "C" structs; native mirrors in core/raster_cpu.py. Pointers to float32 unless said otherwise.
+// extern "C" structs; native mirrors in core/raster/cpu.py. Pointers to float32 unless said otherwise.
 struct RasterScene {
   std::int32_t count, width, height, extra_channels, sh_coefficients, sh_degree, antialias, want_abs_gradient;
   float near_m, far_m, blur_px2, alpha_max;

@@ -28,15 +28,16 @@ from numpy.typing import NDArray
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.types import Frame, Scene
-from mudg.data.scenefile import SceneWriter, read_image, read_scene
-from mudg.models.ground import driven_path
-from mudg.models.labellers import LabelInput, Labels, labeller
-from mudg.stages import annotate_depth, batch
-from mudg.stages.annotate_ego import find_ego
-from mudg.stages.annotate_page import write_page
-from mudg.stages.annotate_points import NearbyReturns
+from mudg.data.scene import SceneWriter, read_image, read_scene
+from mudg.models.labels.ground import driven_path
+from mudg.models.labels.labellers import LabelInput, Labels, labeller
+from mudg.report.annotate_page import write_page
+from mudg.stages import batch
 from mudg.stages.config import AnnotateConfig
 from mudg.stages.ingest import add_frame_copy, add_rest
+from mudg.stages.labelling import depth as annotate_depth
+from mudg.stages.labelling.ego import find_ego
+from mudg.stages.labelling.points import NearbyReturns
 from mudg.stages.synthesize import quiet_openmp
 
 _VERSION = 4

@@ -24,7 +24,7 @@ from typing import Any, Final
 from mudg import native
 from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
-from mudg.data.scene_schema import NAME_PATTERN
+from mudg.data.scene.schema import NAME_PATTERN
 
 FAILED_BASE: Final = 10
 """Exit code of n failed scenes: this plus n, at most ``FAILED_MOST``; apart from all codes with a meaning of their own."""

@@ -20,11 +20,12 @@ from torch import Tensor
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.data import weights
-from mudg.models import clip
-from mudg.models.clip import TextTower
-from mudg.models.published import SCALE_ENTRIES, PublishedConfig, PublishedMDM
-from mudg.stages import confined, convert_depthlab, published_model
+from mudg.models.published import clip
+from mudg.models.published.clip import TextTower
+from mudg.models.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
+from mudg.stages import confined, convert_depthlab
 from mudg.stages.config import ConvertConfig
+from mudg.stages.learning import published_model
 
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"

@@ -23,8 +23,9 @@ from torch import Tensor
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.data import weights
-from mudg.models import depthlab, folders, marigold
-from mudg.models.depthlab import PARTS, UNETS
+from mudg.models import folders
+from mudg.models.depth import depthlab, marigold
+from mudg.models.depth.depthlab import PARTS, UNETS
 
 PICKLES = {
     "denoising_unet": "denoising_unet.pth",

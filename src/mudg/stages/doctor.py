@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
-    from mudg.data.scene_check import Finding
+    from mudg.data.scene.check import Finding
 
 _CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
@@ -26,7 +26,6 @@ _OPTIONAL: Mapping[str, tuple[str, str]] = {
     "gsplat": ("faster rasteriser on CUDA devices", "pip install 'mudg[gsplat]'"),
     "tensorboard": ("curves of learn --tensorboard", "pip install 'mudg[track]'"),
 }
-_ENCODERS = ("libx264", "h264_videotoolbox", "libopenh264")
 
 
 def report_machine() -> dict[str, Any]:
@@ -63,8 +62,8 @@ def report_scene(scene: Path) -> dict[str, Any]:
         scene, ``alignment`` tells for each camera whether LiDAR and image edges agree.
     """
     from mudg.data.importers import RECOGNISERS
-    from mudg.data.importers.custom import check_log
-    from mudg.data.scene_check import Finding, check_scene, worst_first
+    from mudg.data.importers.custom.importer import check_log
+    from mudg.data.scene.check import Finding, check_scene, worst_first
 
     kind = next((name for name, looks_like in RECOGNISERS.items() if looks_like(scene)), "")
     is_log = kind == "custom" and not (scene / "scene.json").is_file()
@@ -94,9 +93,8 @@ def report_scene(scene: Path) -> dict[str, Any]:
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
     """Records for JSON, sentences about cameras that fit or cannot be judged, and findings about those that do not."""
-    from mudg.data.scene_check import Finding
-    from mudg.data.scenefile import read_scene
-    from mudg.stages import alignment
+    from mudg.data.scene import alignment, read_scene
+    from mudg.data.scene.check import Finding
 
     found = alignment.camera_alignment(read_scene(path))
     records = {name: alignment.record(one) for name, one in found.items()}
@@ -177,23 +175,12 @@ def _optional() -> dict[str, str]:
     }
 
 
-def video_encoders() -> list[str]:
-    """Names of the H.264 encoders (what browsers play) that PyAV offers here, best first."""
-    import av
-
-    found = []
-    for name in _ENCODERS:
-        try:
-            av.codec.Codec(name, "w")
-        except av.codec.codec.UnknownCodecError:
-            continue
-        found.append(name)
-    return found
-
 
 def _video(problems: list[str]) -> dict[str, str]:
     if find_spec("av") is None:
         return {"encoders": "unknown (av is missing)"}
+    from mudg.data.exporters.video import video_encoders
+
     found = video_encoders()
     if not found:
         problems.append("PyAV has no H.264 encoder: reports will show pictures instead of videos")

@@ -34,20 +34,20 @@ from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import fused as kernels
 from mudg.core import losses, metrics
-from mudg.core.raster import RasterConfig, rasterize
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
-from mudg.data.scenefile import read_scene
-from mudg.models.appearance import Appearance
-from mudg.models.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
-from mudg.models.mcmc import McmcSettings, drift, relocate_and_grow
-from mudg.models.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky, sky_lift
+from mudg.data.scene import read_scene
+from mudg.models.scene.appearance import Appearance
+from mudg.models.scene.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
+from mudg.models.scene.mcmc import McmcSettings, drift, relocate_and_grow
+from mudg.models.scene.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky, sky_lift
 from mudg.stages.config import FitConfig
-from mudg.stages.fit_objects import boxes_in_view, objects_only
-from mudg.stages.fit_perception import Perception, perception_of
-from mudg.stages.fit_poses import refine_poses
-from mudg.stages.fit_start import StartSettings, start_model
-from mudg.stages.fit_trust import unseen_maps, unseen_rows
-from mudg.stages.fit_views import (
+from mudg.stages.fitting.objects import boxes_in_view, objects_only
+from mudg.stages.fitting.perception import Perception, perception_of
+from mudg.stages.fitting.poses import refine_poses
+from mudg.stages.fitting.start import StartSettings, start_model
+from mudg.stages.fitting.trust import unseen_maps, unseen_rows
+from mudg.stages.fitting.views import (
     Sample,
     StoredView,
     ViewSet,

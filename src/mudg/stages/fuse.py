@@ -20,7 +20,7 @@ from mudg.base.config import to_dict
 from mudg.base.types import Frame, FusedCloud, Scene
 from mudg.core.fusion import FusionReport, FusionRules, Shot, SweepShots, fuse_sweeps
 from mudg.data.cloudfile import write_fused
-from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.stages import batch
 from mudg.stages.config import FuseConfig
 

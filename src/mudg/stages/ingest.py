@@ -16,13 +16,14 @@ from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Frame, Scene
-from mudg.data import scene_check
 from mudg.data.importers import IMPORTERS, RECOGNISERS, files_of
 from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
-from mudg.data.scene_files import open_files
-from mudg.data.scenefile import SceneWriter, read_label, read_points, read_scene
-from mudg.stages import alignment, batch, contact_sheet
+from mudg.data.scene import SceneWriter, alignment, read_label, read_points, read_scene
+from mudg.data.scene import check as scene_check
+from mudg.data.scene.files import open_files
+from mudg.report import contact_sheet
+from mudg.stages import batch
 from mudg.stages.config import IngestConfig
 
 CITY = "city"

@@ -32,20 +32,34 @@ from torch.nn import functional
 from mudg.base import checkpoint, log, seeds, store
 from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError, UsageError
-from mudg.data import log_clips
-from mudg.data.clip_shards import Batch
-from mudg.data.log_clips import LogClipRules
-from mudg.models import mdm
-from mudg.models.mdm import MDM, Losses, MDMConfig
-from mudg.models.vae import PatchCodec
-from mudg.stages import learn_clips, learn_parallel, learn_published, learn_score, published_model
+from mudg.data.clips import from_log
+from mudg.data.clips.from_log import LogClipRules
+from mudg.data.clips.shards import Batch
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.codec import PatchCodec
+from mudg.models.mdm.model import MDM, Losses, MDMConfig
 from mudg.stages.config import LearnConfig
-from mudg.stages.learn_clips import class_weights, draw_batch
-from mudg.stages.learn_latents import cached_latents
-from mudg.stages.learn_models import Model, Part, kind_of
-from mudg.stages.learn_parallel import Interruption, Ranks, Spread, agreed, joined
-from mudg.stages.learn_state import TrainingState, mean_of, newest
-from mudg.stages.precision import choose_bf16
+from mudg.stages.learning import (
+    clips as learn_clips,
+)
+from mudg.stages.learning import (
+    parallel as learn_parallel,
+)
+from mudg.stages.learning import (
+    published as learn_published,
+)
+from mudg.stages.learning import (
+    published_model,
+)
+from mudg.stages.learning import (
+    score as learn_score,
+)
+from mudg.stages.learning.clips import class_weights, draw_batch
+from mudg.stages.learning.latents import cached_latents
+from mudg.stages.learning.models import Model, Part, kind_of
+from mudg.stages.learning.parallel import Interruption, Ranks, Spread, agreed, joined
+from mudg.stages.learning.precision import choose_bf16
+from mudg.stages.learning.state import TrainingState, mean_of, newest
 
 HOW = (
     "parallel",
@@ -99,7 +113,7 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> stor
     def open_it() -> bool:
         inputs = {"start": mdm.digest(config.start)} if config.start else {}
         for number, text in enumerate(config.scenes):
-            source = log_clips.log_source(text)
+            source = from_log.log_source(text)
             inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
         opened.append(store.RunDir.open(out, verb="learn", config=asked, inputs=inputs, overwrite=overwrite))
         if opened[0].complete:
@@ -118,7 +132,7 @@ def _run(model: Model, fresh: set[str], config: LearnConfig, directory: store.Ru
     rules: LogClipRules | None = None
     asked, kind = config, kind_of(model)
     if config.scenes:
-        sources = [log_clips.log_source(text) for text in config.scenes]
+        sources = [from_log.log_source(text) for text in config.scenes]
         rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple, kind.points_alone)
         counts = ranks.leader_does(lambda: learn_clips.make_log_clips(asked, rules, clips))
         config = learn_clips.for_logs(config, rules, *counts)

@@ -15,14 +15,14 @@ from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
 from mudg.core.edit import without_tracks
-from mudg.core.raster import RasterConfig
+from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.exporters.video import panels_of, side_by_side, write_mp4
 from mudg.data.observations import ObservationWriter, read_observations
-from mudg.data.scenefile import read_scene
-from mudg.models.nodes import SceneModel
+from mudg.data.scene import read_scene
+from mudg.models.scene.nodes import SceneModel
 from mudg.stages.config import RenderConfig
 from mudg.stages.fit import NEAR_M, load_model, render_view
-from mudg.stages.fit_views import resized_view
+from mudg.stages.fitting.views import resized_view
 
 VERSION = 1
 

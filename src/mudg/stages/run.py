@@ -52,7 +52,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         InputError: no such log. UsageError: ``out`` holds a run of other settings. Whatever a verb raises.
     """
     from mudg import native
-    from mudg.stages import report
+    from mudg.report import run_report
 
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
@@ -64,7 +64,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         for step in _steps(config, scene, out, overwrite):
             ledger.timed(step)
         key = _report_key(out)
-        reels = None if ledger.has_report(key) else ledger.timed(Step("report", "report.html", lambda: report.film(out)))
+        reels = None if ledger.has_report(key) else ledger.timed(Step("report", "report.html", lambda: run_report.film(out)))
     except KeyboardInterrupt:
         ledger.save("interrupted")
         raise
@@ -74,7 +74,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     ledger.digests = _digests(out)
     ledger.save("complete")
     if reels is not None:  # written last, when the seconds of all steps are known
-        report.write_page(out, reels)
+        run_report.write_page(out, reels)
         ledger.remember_report(key)
     page = out / "report.html"
     return {
@@ -102,15 +102,15 @@ def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Le
 
 
 def _has_semantics(scene: Path) -> bool:
-    from mudg.data.scenefile import read_scene
+    from mudg.data.scene import read_scene
 
     return all("semantics" in frame.labels for frame in read_scene(scene).frames)
 
 
 def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[Step, ...]:
     from mudg import native
+    from mudg.base.processes import Task, run_side_by_side
     from mudg.stages import fit, fuse, render, score, synthesize
-    from mudg.stages.side_by_side import Task, run_side_by_side
 
     fused, virtual = out / "fuse", out / "synthesize"
     plain = replace(config.fit, method=WITHOUT_DIFFUSION)

@@ -29,20 +29,19 @@ from mudg.base import log, palette, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project
+from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
-from mudg.data.scenefile import read_scene
-from mudg.models import mdm
+from mudg.data.scene import read_scene
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
-from mudg.stages import score_tables
+from mudg.models.mdm import model as mdm
+from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.score_truth import (
     SAME_PLACE_M,
     SAME_TIME_S,
     TrueView,
     Truth,
-    resize_nearest,
-    resize_rgb,
     stored_truth,
     truth_of,
 )
@@ -431,12 +430,6 @@ def pair_of(seen: Observation, true: Observation, moving: Tensor | None = None) 
     )  # fmt: skip
 
 
-def error_image(rgb: Tensor, truth: Tensor) -> np.ndarray:
-    """Mean absolute colour error as a picture u8[H, W, 3]: black = equal, through red to white = 0.35 or more."""
-    error = ((rgb.clamp(0, 1) - truth).abs().mean(0) / 0.35).clamp(0, 1).numpy()
-    channels = (np.clip(error * 2.2, 0, 1), np.clip(error * 2.2 - 0.8, 0, 1), np.clip(error * 3.2 - 2.2, 0, 1))
-    return (np.stack(channels, -1) * 255).round().astype(np.uint8)
-
 
 def _write_error_picture(path: Path, found: Mapping[str, Observation], true: Observation) -> None:
     """Truth and the methods beside each other, their colour errors below."""
@@ -449,8 +442,3 @@ def _write_error_picture(path: Path, found: Mapping[str, Observation], true: Obs
         picture[height:, column * width : (column + 1) * width] = error_image(rgb, true.rgb)
     with store.atomic_path(path) as temporary:
         Image.fromarray(picture).save(temporary, optimize=False, compress_level=1)
-
-
-def to_bytes(rgb: Tensor) -> np.ndarray:
-    """Colour f32[3, H, W] in [0, 1] as a picture u8[H, W, 3]."""
-    return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()

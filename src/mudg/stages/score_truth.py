@@ -19,10 +19,11 @@ from torch import Tensor
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
 from mudg.base.types import Frame, Observation, Scene, Trajectory, View
-from mudg.data import city_logs
+from mudg.core.pictures import resize_nearest, resize_rgb
 from mudg.data.city import CityWorld
+from mudg.data.city import logs as city_logs
 from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
-from mudg.data.scenefile import read_image, read_label, read_points, read_scene
+from mudg.data.scene import read_image, read_label, read_points, read_scene
 
 MOVING_FILE: Final = "moving.safetensors"
 SAME_SWEEP_S: Final = 0.05
@@ -152,7 +153,7 @@ def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
 
 def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
     """Depth f32[1, H, W] of the sweep taken with this frame (NaN where no point fell), or None without such a sweep."""
-    from mudg.stages.fit_views import visible_lidar
+    from mudg.stages.fitting.views import visible_lidar
 
     sweeps = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= SAME_SWEEP_S]
     if not sweeps:
@@ -162,19 +163,3 @@ def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
     depth = torch.full((view.camera.height * view.camera.width,), torch.nan)
     depth[seen.pixel] = seen.depth_m
     return depth.reshape(1, view.camera.height, view.camera.width)
-
-
-def resize_rgb(rgb: Tensor, height: int, width: int) -> Tensor:
-    """Colour f32[3, H, W] to another size, bilinear with antialiasing; unchanged if the size is right already."""
-    if rgb.shape[-2:] == (height, width):
-        return rgb
-    return torch.nn.functional.interpolate(rgb[None], size=(height, width), mode="bilinear", antialias=True)[0]
-
-
-def resize_nearest(values: Tensor, height: int, width: int) -> Tensor:
-    """Depth, labels or masks [C, H, W] to another size by the nearest pixel centre; nothing is mixed."""
-    if values.shape[-2:] == (height, width):
-        return values
-    rows = ((torch.arange(height) + 0.5) * values.shape[-2] / height).long()
-    columns = ((torch.arange(width) + 0.5) * values.shape[-1] / width).long()
-    return values[:, rows][:, :, columns]

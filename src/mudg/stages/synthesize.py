@@ -31,20 +31,20 @@ from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
 from mudg.core import trajectory
-from mudg.core.raster import RasterConfig
-from mudg.data.clips import ConditionRules, Recorded, Source, Sparse, build_conditions
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.data.clips.condition import ConditionRules, Recorded, Source, Sparse, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter
-from mudg.data.scenefile import read_image, read_scene, read_trusted_classes
-from mudg.models import mdm
-from mudg.models.mdm import MDM, Sample
-from mudg.models.published import PublishedMDM
-from mudg.models.vae import Modality
-from mudg.stages import published_model
+from mudg.data.scene import read_image, read_scene, read_trusted_classes
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.codec import Modality
+from mudg.models.mdm.model import MDM, Sample
+from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.fit import NEAR_M, load_model, render_view
-from mudg.stages.learn_score import class_image, depth_image, rgb_image
-from mudg.stages.precision import choose_bf16
+from mudg.stages.learning import published_model
+from mudg.stages.learning.precision import choose_bf16
+from mudg.stages.learning.score import class_image, depth_image, rgb_image
 
 SOURCE = "mudg_r"
 _VERSION = 1

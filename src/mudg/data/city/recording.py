@@ -12,7 +12,7 @@ from mudg.base.errors import UsageError
 from mudg.base.types import Scene, View
 from mudg.data.city.config import CityConfig
 from mudg.data.city.world import CityWorld
-from mudg.data.scenefile import SceneWriter
+from mudg.data.scene import SceneWriter
 
 SENSOR = "lidar"
 

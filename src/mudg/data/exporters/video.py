@@ -22,6 +22,7 @@ from mudg.base.types import Observation
 _DEPTH_STOPS = np.array(
     [[252, 253, 191], [254, 176, 120], [241, 96, 93], [183, 55, 121], [114, 31, 129], [45, 17, 96], [10, 8, 40]], np.float64
 )
+_H264_ENCODERS = ("libx264", "h264_videotoolbox", "libopenh264")
 _CODECS = ("libx264", "h264", "mpeg4")
 
 
@@ -164,3 +165,15 @@ def _titled(panel: NDArray[np.uint8], title: str) -> NDArray[np.uint8]:
     draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill=(0, 0, 0))
     draw.text((4, 2), title, fill=(255, 255, 255))
     return np.asarray(image)
+
+
+def video_encoders() -> list[str]:
+    """Names of the H.264 encoders (what browsers play) that PyAV offers here, best first."""
+    found = []
+    for name in _H264_ENCODERS:
+        try:
+            av.codec.Codec(name, "w")
+        except av.codec.codec.UnknownCodecError:
+            continue
+        found.append(name)
+    return found

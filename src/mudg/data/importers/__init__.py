@@ -34,15 +34,15 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
     """``looks_like_<name>``, ``import_<name>`` and ``files_of_<name>``."""
     match name:
         case "kitti360":
-            from mudg.data.importers.kitti360 import files_of_kitti360, import_kitti360, looks_like_kitti360
+            from mudg.data.importers.kitti360.importer import files_of_kitti360, import_kitti360, looks_like_kitti360
 
             return looks_like_kitti360, import_kitti360, files_of_kitti360
         case "waymo":
-            from mudg.data.importers.waymo import files_of_waymo, import_waymo, looks_like_waymo
+            from mudg.data.importers.waymo.importer import files_of_waymo, import_waymo, looks_like_waymo
 
             return looks_like_waymo, import_waymo, files_of_waymo
         case "nuscenes":
-            from mudg.data.importers.nuscenes import files_of_nuscenes, import_nuscenes, looks_like_nuscenes
+            from mudg.data.importers.nuscenes.importer import files_of_nuscenes, import_nuscenes, looks_like_nuscenes
 
             return looks_like_nuscenes, import_nuscenes, files_of_nuscenes
         case "argoverse2":
@@ -50,11 +50,11 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
 
             return looks_like_argoverse2, import_argoverse2, files_of_argoverse2
         case "pandaset":
-            from mudg.data.importers.pandaset import files_of_pandaset, import_pandaset, looks_like_pandaset
+            from mudg.data.importers.pandaset.importer import files_of_pandaset, import_pandaset, looks_like_pandaset
 
             return looks_like_pandaset, import_pandaset, files_of_pandaset
         case "nuplan":
-            from mudg.data.importers.nuplan import files_of_nuplan, import_nuplan, looks_like_nuplan
+            from mudg.data.importers.nuplan.importer import files_of_nuplan, import_nuplan, looks_like_nuplan
 
             return looks_like_nuplan, import_nuplan, files_of_nuplan
         case "dgp":
@@ -62,11 +62,11 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
 
             return looks_like_dgp, import_dgp, files_of_dgp
         case "custom":
-            from mudg.data.importers.custom import import_custom, looks_like_custom
+            from mudg.data.importers.custom.importer import import_custom, looks_like_custom
 
             return looks_like_custom, import_custom, _whole_source
         case "kitti":
-            from mudg.data.importers.kitti import files_of_kitti, import_kitti, looks_like_kitti
+            from mudg.data.importers.kitti.importer import files_of_kitti, import_kitti, looks_like_kitti
 
             return looks_like_kitti, import_kitti, files_of_kitti
         case _:

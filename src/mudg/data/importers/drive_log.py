@@ -27,8 +27,8 @@ from mudg.data.importers.common import for_each
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.layout import refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.scene_schema import ref_problem
-from mudg.data.scenefile import SceneWriter
+from mudg.data.scene import SceneWriter
+from mudg.data.scene.schema import ref_problem
 
 Matrix = NDArray[np.float64]
 

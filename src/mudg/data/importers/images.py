@@ -27,7 +27,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera
 from mudg.data.importers.options import ImportOptions, Resolution
-from mudg.data.scenefile import decode_image
+from mudg.data.scene import decode_image
 
 Floats = NDArray[np.float64]
 Lens = Callable[[Floats], Floats]

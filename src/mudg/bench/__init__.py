@@ -1,0 +1,1 @@
+"""``mudg bench``: methods and models measured against exact truth."""

@@ -1,0 +1,147 @@
+"""What of its condition the diffusion model lives on: the published ablation of conditions, on generated cities.
+
+Four small models are trained alike, on the same clips, draws and steps, with what the published system is given (projected
+points with nothing filled in, zeros where nothing was seen; one reference image), and differ in the condition only:
+
+reference only       the dense reference image as frame 0 of an otherwise empty colour condition; no points
+sparse only          points, no reference image
+concatenated         points; the reference as four further input channels of every frame
+frame 0              points; the reference takes the place of frame 0 of the colour condition (the published choice)
+
+and, for comparison, ours: points filled in, recorded images warped in, masks and given classes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mudg.base import log
+from mudg.base.errors import NumericsError
+from mudg.data.clips import from_city
+from mudg.data.clips.from_city import CityClipRules
+from mudg.data.clips.shards import Batch
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.stages import learn
+from mudg.stages.config import BenchConfig, LearnConfig
+from mudg.stages.learning import score as learn_score
+from mudg.stages.learning.models import mdm_loss
+from mudg.stages.learning.precision import choose_bf16
+from mudg.stages.learning.published import Part
+
+WIDTH, HEIGHT = 96, 64
+_SMALL: dict[str, Any] = {"widths": (48, 96, 160), "blocks": (1, 1, 2), "patch": 2}
+_PUBLISHED: dict[str, Any] = {
+    **_SMALL, "copy_condition": False, "backdrop": False, "mask_planes": "none", "given_classes": False,
+    "refine_widths": (), "refine_blocks": (),
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A row of the table: the model's configuration and what its batches are made into."""
+
+    config: MDMConfig
+    prepare: Callable[[Batch], Batch]
+
+
+def points_only(batch: Batch) -> Batch:
+    """The published condition: colour and depth of the points, 0 where none was seen; no class, no warped image."""
+    if batch.point_color is None:
+        raise ValueError("the clips were made without point colours")
+    seen = batch.valid.float()
+    color = batch.point_color * seen
+    return dataclasses.replace(
+        learn_score.without_classes(batch), color=color, sparse_depth=batch.sparse_depth * seen,
+        warped=torch.zeros_like(batch.warped), backdrop=color,
+    )  # fmt: skip
+
+
+def nothing_seen(batch: Batch) -> Batch:
+    """As `points_only`, without the points."""
+    empty = points_only(batch)
+    zeros = torch.zeros_like(empty.color)
+    return dataclasses.replace(
+        empty, color=zeros, backdrop=zeros, sparse_depth=torch.zeros_like(empty.sparse_depth), valid=torch.zeros_like(empty.valid)
+    )
+
+
+VARIANTS: dict[str, Variant] = {
+    "reference only": Variant(MDMConfig(**_PUBLISHED, reference="first_frame"), nothing_seen),
+    "sparse only": Variant(MDMConfig(**_PUBLISHED, reference="none"), points_only),
+    "concatenated": Variant(MDMConfig(**_PUBLISHED, reference="concatenated"), points_only),
+    "frame 0": Variant(MDMConfig(**_PUBLISHED, reference="first_frame"), points_only),
+    "ours": Variant(MDMConfig(**_SMALL, refine_widths=(32, 64)), lambda batch: batch),
+}
+
+
+def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
+    """Train and score all variants; returns the numbers and a table."""
+    folder, cities = out / "clips", from_city.LISTS[config.cities][: config.count]
+    training = _learn_config(config, folder)
+    rules = CityClipRules(WIDTH, HEIGHT, clips=4, seed=config.seed, point_colors=True)
+    from_city.write_missing(rules, [*cities, *range(config.ablation_cities)], folder)
+    bf16 = choose_bf16(config.precision)
+    rows: dict[str, Any] = {}
+    for name, variant in VARIANTS.items():
+        model = _trained(name, variant, training, bf16)
+        rows[name] = learn_score.score(
+            model, cities, folder, steps=4, seed=config.seed, bf16=bf16, prepare=variant.prepare,
+            picture=out / f"{name.replace(' ', '_')}.png",
+        )["average"]  # fmt: skip
+        log.info(f"{name}: PSNR {rows[name]['psnr']:.2f} dB, AbsRel {rows[name]['abs_rel']:.3f}, mIoU {rows[name]['miou']:.3f}")
+    return {"cities": list(cities), "training_steps": config.ablation_steps, "rows": rows}, _table(rows, config)
+
+
+def _learn_config(config: BenchConfig, folder: Path) -> LearnConfig:
+    return LearnConfig(
+        seed=config.seed, cities=config.ablation_cities, first_cities=config.ablation_cities, clips=str(folder), workers=0,
+        width=WIDTH, height=HEIGHT, steps=config.ablation_steps, lr=1e-3, full_window_share=0.2, refined_share=1.0, reference_dropout=0.0,
+    )  # fmt: skip
+
+
+def _trained(name: str, variant: Variant, config: LearnConfig, bf16: bool) -> MDM:
+    """A model of the variant after the training steps; codec of the shipped model, weights drawn from the seed."""
+    model = MDM(variant.config)
+    model.codec.load_state_dict(mdm.load("embedded").codec.state_dict())
+    model.codec.requires_grad_(False)
+    learn.draw_weights(model.net, config.seed, "ablation weights")
+    if model.refiner is not None:
+        learn.draw_weights(model.refiner, config.seed, "ablation refiner weights")
+        model.refiner.reset()
+    trained = [p for n, p in model.named_parameters() if not n.startswith("codec.")]
+    optimizer = torch.optim.AdamW(trained, lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01)
+    with log.task(name, config.steps) as bar:
+        for step in range(config.steps):
+            optimizer.param_groups[0]["lr"] = learn.learning_rate(config, step)
+            frames = learn.frames_at(config, step)
+            count = max(1, config.batch_frames // frames)
+            batch = variant.prepare(learn.draw_batch(config, Path(config.clips), step, count, frames, "ablation batch"))
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                losses = mdm_loss(model.loss, model, config, Part(batch, step, 0, count), torch.ones(mdm.CLASSES))
+            optimizer.zero_grad(set_to_none=True)
+            losses.total.backward()
+            norm = float(torch.nn.utils.clip_grad_norm_(trained, 1.0))
+            if not math.isfinite(norm):
+                raise NumericsError("the gradient is not finite", where=f"{name}, step {step}", got=str(norm))
+            optimizer.step()
+            bar.update(f"loss {float(losses.total.detach()):.3f}")
+            bar.advance()
+    return model.eval()
+
+
+def _table(rows: dict[str, Any], config: BenchConfig) -> str:
+    lines = [
+        f"# Conditions compared: {config.ablation_steps} training steps each, {WIDTH}x{HEIGHT}, {config.count} held-out cities", "",
+        "| condition | PSNR dB | SSIM | AbsRel | delta1 | mIoU | flicker |", "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name, row in rows.items():
+        values = (("psnr", ".2f"), ("ssim", ".3f"), ("abs_rel", ".3f"), ("delta1", ".3f"), ("miou", ".3f"), ("flicker", ".2f"))
+        lines.append(f"| {name} | " + " | ".join(format(row.get(key, math.nan), how) for key, how in values) + " |")
+    return "\n".join(lines) + "\n"

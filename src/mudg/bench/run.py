@@ -1,0 +1,151 @@
+"""``mudg bench``: measurements that print a table, each from one command.
+
+mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
+               without given classes, at several numbers of steps, and the seam between windows of a longer video
+mdm-ablation   what of its condition the model lives on (see `bench_ablation`)
+poses          how much of the error of tracked boxes a fit takes out (see `bench_poses`); needs no diffusion model
+shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
+
+OUT/clips/ the generated clips   OUT/bench.json   OUT/bench.md   OUT/*.png pictures
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mudg.base import log, store
+from mudg.base.config import to_dict
+from mudg.base.errors import UsageError
+from mudg.bench import mdm_ablation
+from mudg.bench import poses as bench_poses
+from mudg.bench import shift as bench_shift
+from mudg.core import flicker
+from mudg.data.clips import from_city
+from mudg.data.clips.condition import ConditionRules, Source, build_condition
+from mudg.data.clips.from_city import CityClipRules
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.model import MDM
+from mudg.stages.config import BenchConfig, SynthesizeConfig
+from mudg.stages.learning import score as learn_score
+from mudg.stages.learning.precision import choose_bf16
+from mudg.stages.synthesize import windows
+
+_VERSION = 1
+SHIFT = "shift"
+SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
+
+
+def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -> Path:
+    """Run one of `BENCHES`, or shift; returns the folder with `bench.json` and `bench.md`.
+
+    Raises:
+        UsageError: there is no such measurement.
+    """
+    if name == SHIFT:  # made of verbs that each keep their own folder
+        return bench_shift.run(config, out, overwrite=overwrite)
+    if name not in BENCHES:
+        raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
+    read = {"mdm": config.model, "mdm-ablation": "embedded"}.get(name)  # poses reads no diffusion model
+    inputs = {} if read is None else {"model": mdm.digest(read)}
+    directory = store.RunDir.open(out, f"bench {name}", to_dict(config), inputs, _VERSION, overwrite)
+    if directory.complete:
+        return directory.reused()
+    torch.set_num_threads(config.threads)
+    result, text = BENCHES[name](config, directory.path)
+    store.write_json(directory.path / "bench.json", result)
+    store.write_text(directory.path / "bench.md", text)
+    directory.finish({"measurement": name})
+    return directory.path
+
+
+def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
+    model = mdm.load(config.model)
+    bf16 = choose_bf16(config.precision)
+    cities, rules = from_city.LISTS[config.cities][: config.count], CityClipRules(window=model.config.window)
+    from_city.write_missing(rules, cities, out / "clips")
+    result: dict[str, Any] = {"cities": list(cities), "model": mdm.digest(config.model), "bf16": bf16, "rows": []}
+    lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
+    with log.task("scoring", 2 * len(config.steps)) as bar:
+        for given in (True, False):
+            for steps in config.steps:
+                picture = out / f"steps_{steps}_{'classes' if given else 'plain'}.png"
+                started = time.perf_counter()
+                scores = learn_score.score(
+                    model, cities, out / "clips", steps=steps, seed=config.seed, bf16=bf16, eta=config.eta,
+                    sampler=config.sampler, prepare=None if given else learn_score.without_classes, picture=picture,
+                )  # fmt: skip
+                seconds = (time.perf_counter() - started) / scores["clips"]
+                row = {"steps": steps, "given_classes": given, "seconds_per_clip": round(seconds, 2), "scores": scores}
+                result["rows"].append(row)
+                title = f"{steps} step{'s' if steps > 1 else ''}, classes {'given' if given else 'withheld'}"
+                lines += [f"## {title}, {seconds:.1f} s per clip with its scoring", "", "```", learn_score.table(scores), "```", ""]
+                bar.update(title)
+                bar.advance()
+    result["seam"] = seam(model, config, bf16)
+    lines += [_seam_text(result["seam"]), ""]
+    return result, "\n".join(lines)
+
+
+def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
+    """Change of static surfaces across the seams of overlapping windows, against that inside windows.
+
+    A video of `SEAM_FRAMES` frames 3 m beside the path of one city is made in windows as synthesize makes them by default. Returned
+    per place: the mean of (change made / change of the truth) over pairs of frames; and the pairs themselves.
+    """
+    city, usual = from_city.LISTS[config.cities][0], SynthesizeConfig()
+    rules = CityClipRules(window=model.config.window)
+    record = from_city.make_log(rules, city, frames=SEAM_FRAMES)
+    views = [from_city.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
+    truths = [record.world.render(v.resized(rules.width, rules.height)) for v in views]
+    sizes = (rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
+    sources: dict[int, Source] = {}
+    frames: list[torch.Tensor] = []
+    tail: dict[Any, torch.Tensor] = {}
+    spans = windows(len(views), model.config.window, usual.overlap)
+    for number, span in enumerate(spans):
+        condition = build_condition(
+            record.cloud, record.world.tracks(), [views[i] for i in span], record.recorded, ConditionRules(*sizes), sources
+        )
+        shared = len(frames) - span.start
+        known = {m: z[-shared:] for m, z in tail.items()} if tail else None
+        made = model.sample(condition, steps=usual.steps, seed=config.seed, index=number, known=known, bf16=bf16)
+        if made.rgb is None:
+            raise UsageError("the model makes no colour", where=config.model)
+        frames += list(made.rgb[shared if tail else 0 :])
+        tail = dict(made.latents)
+    rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
+    depth = torch.stack([torch.from_numpy(t.depth.copy())[None] for t in truths]).clamp(max=1000.0)
+    ids = torch.stack([torch.from_numpy(t.semantics.astype("int64")) for t in truths])
+    poses = torch.from_numpy(np.stack([v.world_from_cam for v in views]))
+    camera = views[0].resized(rules.width, rules.height).camera
+    lens = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]] * len(views), dtype=torch.float64)
+    pairs = flicker.changes(torch.stack(frames), rgb, depth, ids, poses, lens)
+    ratios = [m / t if t > 0 else math.nan for m, t in pairs]
+    seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
+    mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731
+    across = mean([r for i, r in enumerate(ratios) if i in seams])
+    within = mean([r for i, r in enumerate(ratios) if i not in seams])
+    return {"city": city, "across": round(across, 4), "inside": round(within, 4), "steps": usual.steps, "seams": sorted(seams),
+            "pairs": [round(r, 4) for r in ratios]}  # fmt: skip
+
+
+def _seam_text(found: dict[str, Any]) -> str:
+    return (
+        f"Seam: static surfaces change {found['across']:.3f} times as much as in the truth across the seams of windows, "
+        f"{found['inside']:.3f} times inside them (city {found['city']}, {SEAM_FRAMES} frames, 3 m, {found['steps']} steps)."
+    )
+
+
+BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
+    "mdm": _mdm,
+    "mdm-ablation": mdm_ablation.measure,
+    "poses": bench_poses.measure,
+}
+"""Every measurement that is one folder, by name."""

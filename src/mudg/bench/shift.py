@@ -1,0 +1,359 @@
+"""``mudg bench shift``: whole methods beside the recorded path, on lists of generated logs, against exact truth.
+
+Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the ordinary
+verbs, so that whatever is finished is reused and another variant costs only itself. Results do not depend on how many logs
+are worked on at a time: each has one thread.
+
+    OUT/<log>/scene  fuse  synthesize  truth  nearest_fill  fit/<method>  render/<method>  score/<method>  film
+    OUT/bench.json   every number        OUT/bench.md   the tables        OUT/page.html   tables and videos
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import math
+import multiprocessing
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+import yaml
+
+from mudg import native
+from mudg.base import config as configuration
+from mudg.base import log, store
+from mudg.base.errors import UsageError
+from mudg.base.types import Trajectory
+from mudg.bench import shift_page, shift_tables
+from mudg.data.city import logs as city_logs
+from mudg.data.city.logs import STANDARD, LogRules
+from mudg.data.cloudfile import read_fused
+from mudg.data.observations import ObservationWriter, read_observations
+from mudg.data.scene import read_scene
+from mudg.models.mdm import model as mdm
+from mudg.report.score_tables import title_of
+from mudg.stages import fit, fuse, ingest, render, score, score_truth, synthesize
+from mudg.stages.config import (
+    BenchConfig,
+    FitConfig,
+    FuseConfig,
+    IngestConfig,
+    RenderConfig,
+    ScoreConfig,
+    SynthesizeConfig,
+)
+from mudg.stages.synthesize import quiet_openmp
+
+TEST_EVERY: Final = 4
+PERCEPTUAL_VIEWS: Final = 12
+WITHOUT, WITH, DIFFUSION, FILL = "street_gaussians", "mudg_s", "mudg_r", score.BASELINE
+GENERATED: Final = (FILL, DIFFUSION)
+"""Methods without a fit."""
+_NO_DEPTH: Final = {"virtual_depth_weight": 0.0, "virtual_lidar_weight": 0.0}
+_NO_CLASSES: Final = {"virtual_semantic_weight": 0.0}
+ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
+    "only_I": ("virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
+    "only_I_D": ("virtual colour and depth", _NO_CLASSES),
+    "only_I_S": ("virtual colour and classes", _NO_DEPTH),
+    "exact": ("the truth in place of generated views", {}),
+}
+"""Rows beside street_gaussians (no virtual views) and mudg_s (all terms): three as in table 3 of the paper, and the most that
+virtual views can bring at this number of steps."""
+EXACT: Final = "exact"
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method to compare: its name in tables and folders, words for it, and the settings of its fit (None = no fit)."""
+
+    name: str
+    title: str
+    fit: FitConfig | None
+
+
+@dataclass(frozen=True)
+class LogJob:
+    """One log of the list, in terms that another process understands."""
+
+    seed: int
+    out: Path
+    rules: LogRules
+    shifts_m: tuple[float, ...]
+    rows: tuple[Row, ...]
+    synthesize: SynthesizeConfig
+    videos: bool
+    overwrite: bool
+
+
+def run(
+    config: BenchConfig, out: Path, *, overwrite: bool = False, rules: LogRules = STANDARD,
+    distances_m: Sequence[float] = (2.0, 3.0, 4.0),
+) -> Path:  # fmt: skip
+    """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
+
+    Args:
+        config: see ``BenchConfig``; fields marked shift, and model, precision and seed.
+        out: what lies there of the same settings is reused; other methods and variants may be added later.
+        overwrite: replace what other settings left there.
+        rules: frames, size and cameras of the logs. distances_m: lateral distances, each to both sides.
+
+    Raises:
+        UsageError: an unknown method, a malformed variant, or ``out`` holds logs of other settings. Whatever a verb raises.
+    """
+    rows = rows_of(config)
+    seeds = city_logs.LISTS[config.list][: config.logs]
+    shifts = tuple(sign * d for d in distances_m for sign in (1.0, -1.0))
+    painted = SynthesizeConfig(
+        cameras=("front",),
+        shifts_m=shifts,
+        model=config.model,
+        precision=config.precision,
+        processes=1,
+        seed=config.seed,
+    )
+    jobs = [
+        LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, painted, config.videos, overwrite)
+        for seed in seeds
+    ]
+    logs = _run_jobs(jobs, config.processes or os.cpu_count() or 1)
+    document = shift_tables.document(logs, rows_as_values(rows), list(distances_m), settings_of(config, rules))
+    store.write_json(Path(out) / "bench.json", document)
+    store.write_text(Path(out) / "bench.md", shift_tables.markdown(document))
+    store.write_text(Path(out) / "page.html", shift_page.page(document))
+    return Path(out)
+
+
+# ---- what is compared ----
+
+
+def rows_of(config: BenchConfig) -> tuple[Row, ...]:
+    """The methods, ablation rows and variants of a configuration, in the order of the tables.
+
+    Raises:
+        UsageError: an unknown method, or a malformed or repeated variant.
+    """
+    known = (FILL, "gs3d", WITHOUT, DIFFUSION, WITH)
+    wanted = set(config.methods) | ({WITHOUT, WITH} if config.ablation else set())
+    if not wanted or wanted - set(known):
+        raise UsageError(
+            "unknown method", where="--methods", expected=", ".join(known), got=", ".join(sorted(wanted - set(known)))
+        )
+    plain = FitConfig(method=WITH, iterations=config.iterations, seed=config.seed)
+    rows = [
+        Row(name, title_of(name), None if name in GENERATED else _with_method(plain, name))
+        for name in known
+        if name in wanted
+    ]
+    if config.ablation:
+        rows += [
+            Row(name, f"with {words}", replace(plain, **dict(weights))) for name, (words, weights) in ABLATION.items()
+        ]  # type: ignore[arg-type]
+    for text in config.variant:
+        rows.append(variant_of(text, plain))
+    names = [row.name for row in rows]
+    if len(set(names)) < len(names):
+        raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
+    return tuple(rows)
+
+
+def _with_method(plain: FitConfig, name: str) -> FitConfig:
+    return configuration.load(FitConfig, plain, overrides={"method": name})
+
+
+def variant_of(text: str, plain: FitConfig) -> Row:
+    """A row from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML. UsageError if malformed or no field of ``FitConfig``."""
+    name, separator, rest = text.partition("=")
+    fields: dict[str, Any] = {}
+    for part in rest.split(","):
+        field, colon, value = part.partition(":")
+        if not (separator and colon and field and _NAME.fullmatch(name)):
+            raise UsageError("malformed variant", where="--variant", expected="NAME=FIELD:VALUE,FIELD:VALUE", got=text)
+        try:
+            fields[field.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise UsageError("malformed value", where=f"--variant {name}: {field}", got=value) from error
+    changed = configuration.load(FitConfig, plain, overrides=fields)
+    return Row(name, f"{name}: {rest}", changed)
+
+
+def rows_as_values(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The rows for JSON."""
+    return [
+        {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.to_dict(r.fit)} for r in rows
+    ]
+
+
+def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
+    """What was asked for, for JSON."""
+    return {
+        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm.digest(config.model),
+        "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
+        "held_out_every": TEST_EVERY, "ablation": config.ablation,
+    }  # fmt: skip
+
+
+# ---- the logs ----
+
+
+def _run_jobs(jobs: Sequence[LogJob], processes: int) -> list[dict[str, Any]]:
+    """All logs, several at a time, in the order of the list."""
+    processes = min(processes, len(jobs))
+    with log.task("logs", len(jobs)) as bar:
+        if processes == 1:
+            found = []
+            for job in jobs:
+                bar.update(str(job.seed))
+                found.append(_with_one_thread(job))
+                bar.advance()
+            return found
+        context = multiprocessing.get_context("spawn")
+        with quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
+            futures = {pool.submit(_in_process, job): job.seed for job in jobs}
+            try:
+                for future in concurrent.futures.as_completed(futures):
+                    future.result()
+                    bar.update(str(futures[future]))
+                    bar.advance()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            return [future.result() for future in futures]
+
+
+def _in_process(job: LogJob) -> dict[str, Any]:
+    log.set_quiet(True)
+    torch.set_num_threads(1)
+    native.set_threads(1)
+    return make_log(job)
+
+
+def _with_one_thread(job: LogJob) -> dict[str, Any]:
+    """As in a process of its own; afterwards this process has its threads again."""
+    before = torch.get_num_threads(), native.threads()
+    torch.set_num_threads(1)
+    native.set_threads(1)
+    try:
+        return make_log(job)
+    finally:
+        torch.set_num_threads(before[0])
+        native.set_threads(before[1])
+
+
+def make_log(job: LogJob) -> dict[str, Any]:
+    """Everything of one log; returns its facts, the scores of each method by distance, and the seconds of each step."""
+    out = job.out
+    city = city_logs.log_config(job.seed, job.rules)
+    scene = out / "scene"
+    _made(job, lambda o: ingest.run(IngestConfig(test_every=TEST_EVERY, city=city), ingest.CITY, scene, overwrite=o))
+    fused, painted = out / "fuse", out / "synthesize"
+    _made(job, lambda o: fuse.run(FuseConfig(), scene, fused, overwrite=o))
+    if any(row.name == DIFFUSION or (row.fit is not None and fit.RECIPES[row.fit.method].virtual) for row in job.rows):
+        _made(job, lambda o: synthesize.run(job.synthesize, scene, fused, painted, overwrite=o))
+    drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False)
+    paths = render.trajectories(read_scene(scene), drawn)
+    truth = out / "truth"
+    _made(job, lambda o: score_truth.write_truth(scene, paths, truth, overwrite=o))
+    found: dict[str, Any] = {}
+    views: dict[str, Path] = {}
+    for row in job.rows:
+        views[row.name] = _views_of(job, row, drawn, paths)
+        found[row.name] = _scores_of(job, row, views[row.name])
+    films: list[str] = []
+    if job.videos:
+        shown = {
+            "truth": truth,
+            **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN},
+        }
+        # With another method the old films are out of date, whatever was asked.
+        _made(replace(job, overwrite=True), lambda o: shift_page.film(shown, paths, out / "film", overwrite=o))
+        films = [path.name for path in paths]
+    facts = city_logs.facts(job.seed, job.rules)
+    return {
+        "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.movers,
+        "mover_share": round(facts.mover_share, 4), "words": facts.words, "films": films, "values": found,
+        "seconds": _seconds(out),
+    }  # fmt: skip
+
+
+def _made(job: LogJob, make: Callable[[bool], Path]) -> Path:
+    """Make or reuse a folder; what other settings left there is replaced only if that was asked for."""
+    try:
+        return make(False)
+    except UsageError:
+        if not job.overwrite:
+            raise
+        return make(True)
+
+
+def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajectory]) -> Path:
+    """The folder with a method's views, made if need be."""
+    scene, fused, painted = job.out / "scene", job.out / "fuse", job.out / "synthesize"
+    if row.name == DIFFUSION:
+        return painted
+    if row.name == FILL:
+        return _made(job, lambda o: write_fill(scene, fused, paths, job.out / FILL, overwrite=o))
+    settings = row.fit
+    if settings is None:
+        raise UsageError("a method without views", got=row.name)
+    model, views = job.out / "fit" / row.name, job.out / "render" / row.name
+    if row.name == EXACT:
+        painted = _made(job, lambda o: write_exact(job.out / "truth", paths, job.out / EXACT, overwrite=o))
+    _made(job, lambda o: fit.run(settings, scene, fused, model, observations=painted, overwrite=o))
+    return _made(job, lambda o: render.run(drawn, scene, model, views, overwrite=o))
+
+
+def _scores_of(job: LogJob, row: Row, views: Path) -> dict[str, Any]:
+    """A method's values by distance, from a score of its own against the common truth."""
+    settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS)
+    scene, truth, scored = job.out / "scene", job.out / "truth", job.out / "score" / row.name
+    _made(job, lambda o: score.run(settings, scene, {row.name: views}, scored, truth=truth, overwrite=o))
+    return {
+        f"{entry['distance_m']:g}": entry["values"] for entry in store.read_json(scored / "metrics.json")["by_distance"]
+    }
+
+
+def write_fill(scene: Path, fused: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
+    """The scorer's baseline on some trajectories as folders of views, so that it is a method like the others."""
+    inputs = {"scene": store.digest(scene), "fused": store.digest(fused)}
+    folder = store.RunDir.open(out, FILL, {"trajectories": [path.name for path in paths]}, inputs, _VERSION, overwrite)
+    if folder.complete:
+        return folder.reused()
+    fill = score.baseline_of(read_scene(scene), read_fused(fused))
+    with log.task(FILL, sum(map(len, paths))) as bar:
+        for path in paths:
+            with ObservationWriter(out / path.name, path.name, FILL) as writer:
+                for index, view in enumerate(path.views):
+                    writer.skip(view) if index < writer.done else writer.add(fill(view))
+                    bar.advance()
+    folder.finish({"trajectories": [path.name for path in paths]})
+    return out
+
+
+def write_exact(truth: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
+    """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
+    shifted = [path.name for path in paths if path.origin == "shifted"]
+    folder = store.RunDir.open(out, EXACT, {"trajectories": shifted}, {"truth": store.digest(truth)}, _VERSION, overwrite)
+    if folder.complete:
+        return folder.reused()
+    for name in shifted:
+        views = read_observations(truth / name)
+        with ObservationWriter(out / name, name, EXACT) as writer:
+            for index in range(len(views)):
+                seen = views[index]
+                writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
+    folder.finish({"trajectories": shifted})
+    return out
+
+
+def _seconds(out: Path) -> dict[str, float]:
+    """Seconds of each finished step, by folder."""
+    steps = sorted(path for path in out.glob("**/run.json") if len(path.relative_to(out).parts) <= 3)
+    return {
+        path.parent.relative_to(out).as_posix(): float(store.read_json(path).get("seconds", math.nan)) for path in steps
+    }

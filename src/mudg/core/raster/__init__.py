@@ -1,0 +1,1 @@
+"""The Gaussian rasteriser: the front door in ``rasterize.py``, its backends, and the plain-torch twin that specifies them."""

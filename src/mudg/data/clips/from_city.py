@@ -1,0 +1,224 @@
+"""Training clips from generated cities: pure functions of (seed, city number).
+
+One city is a short log (12 frames) seen by the front camera and, sometimes, the two beside it. Its sweeps are fused as
+the `fuse` verb does, the condition is built as `synthesize` does, and the truth comes from the generator at exactly the
+views asked for. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded images
+given, as for frames that a log lacks.
+
+What varies from city to city besides the city itself: field of view, mounting height and pitch, number and elevation range
+of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of the LiDAR poses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mudg import native
+from mudg.base import geometry, seeds
+from mudg.base.log import progress
+from mudg.base.types import Clip, Condition, FusedCloud, View
+from mudg.core.fusion import FusionRules, Shot, SweepShots, fuse_sweeps
+from mudg.core.trajectory import ego_left_world
+from mudg.data.city import CityConfig, CityTruth, CityWorld
+from mudg.data.clips.condition import ConditionRules, Recorded, Source, build_condition
+from mudg.data.clips.shards import pack_clips, shard_path, write_shard
+
+HELD_OUT = 1_000_000
+"""Numbers of cities, and of clips of logs, from here on are for scoring, never for training. Such cities have the standard
+rig, all cameras, and shifts of exactly 2, 3 and 4 m, whatever the seed."""
+
+DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
+"""Cities to look at while choosing; also what `learn` watches."""
+REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
+"""Cities whose scores are reported and on which nothing is chosen."""
+
+LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
+
+FRAMES = 12
+FIRST = 2
+"""Clips start at this frame of the log, so that it reaches a little beyond them at both ends."""
+
+
+@dataclass(frozen=True)
+class CityClipRules:
+    """Size and number of clips per city; `seed` fixes everything together with the city's number."""
+
+    width: int = 192
+    height: int = 128
+    window: int = 8
+    seed: int = 0
+    clips: int = 4
+    fine: int = 2
+    """Recorded images are this many times larger than the clips; their colours are gathered at that size."""
+    point_colors: bool = False
+    """Also keep the colours of the nearest points, without images, in training clips (clips for scoring always do)."""
+    published: bool = False
+    """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at the time of
+    the first view, from where it was recorded."""
+
+    @property
+    def frames(self) -> int:
+        """Length of the log."""
+        return max(FRAMES, FIRST + self.window)
+
+
+@dataclass(frozen=True)
+class CityLog:
+    """A generated log as its training clips need it: world, fused cloud, recorded images of all frames and cameras."""
+
+    world: CityWorld
+    cloud: FusedCloud
+    recorded: tuple[Recorded, ...]
+
+
+def city_config(rules: CityClipRules, city: int) -> CityConfig:
+    """The city's configuration."""
+    seed = seeds.key(0 if city >= HELD_OUT else rules.seed, city, "city") & 0x7FFFFFFF
+    if city >= HELD_OUT:
+        return CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
+    rng = seeds.numpy_rng(rules.seed, city, "city configuration")
+    side_cameras = rng.random() < 0.4
+    return CityConfig(
+        seed=seed,
+        n_frames=FRAMES,
+        rate_hz=float(rng.choice([10.0, 10.0, 6.0])),
+        width=rules.width * rules.fine,
+        height=rules.height * rules.fine,
+        cameras=("front", "front_left", "front_right") if side_cameras else ("front",),
+        hfov_deg=float(rng.uniform(46, 76)),
+        rig_variation=1.0,
+        lidar_beams=int(rng.choice([64, 64, 64, 40])),
+        lidar_azimuth_step_deg=float(rng.choice([0.2, 0.2, 0.35])),
+        lidar_lower_deg=float(rng.uniform(-25, -17)),
+        lidar_upper_deg=float(rng.choice([15.0, rng.uniform(2, 15)])),
+        lidar_dropout=float(rng.uniform(0.02, 0.12)),
+        traffic=float(rng.uniform(0.4, 1.8)),
+        shift_margin_m=4.2,
+    )
+
+
+def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
+    """Lateral shift of each clip of a city, metres; 0 = the recorded path. Held-out cities: 2, 3, 4 m, sides alternating."""
+    if city >= HELD_OUT:
+        side = 1.0 if city % 2 == 0 else -1.0
+        return (2.0 * side, -3.0 * side, 4.0 * side, 0.0)[: rules.clips]
+    rng = seeds.numpy_rng(rules.seed, city, "shifts")
+    sides = [1.0, -1.0, *rng.choice([-1.0, 1.0], max(0, rules.clips - 3))]
+    shifted = [float(side * rng.uniform(0.5, 4.2)) for side in sides]
+    return tuple([*shifted, 0.0][-rules.clips :]) if rules.clips > 1 else (shifted[0],)
+
+
+def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
+    """Generate, record and fuse one city; `frames` long."""
+    config = dataclasses.replace(city_config(rules, city), n_frames=frames)
+    rng = seeds.numpy_rng(rules.seed, city, "log")
+    world = CityWorld(config)
+    truths: dict[str, list[CityTruth]] = {
+        name: [world.render(view, sensor_noise=True) for view in world.frame_views(name)] for name in config.cameras
+    }
+    used: Sequence[int] = range(frames)
+    jitter_m, jitter_rad = 0.0, 0.0
+    if city < HELD_OUT:
+        if rng.random() < 0.35:
+            used = sorted(rng.choice(frames, int(rng.integers(4, frames)), replace=False).tolist())
+        if rng.random() < 0.4:
+            jitter_m, jitter_rad = float(rng.uniform(0, 0.05)), float(np.deg2rad(rng.uniform(0, 0.15)))
+    sweeps = []
+    for index in used:
+        sweep = world.lidar_sweep(index)
+        error = geometry.yaw_matrix(float(rng.normal(0, jitter_rad)), rng.normal(0, jitter_m, 3))
+        shots = [
+            Shot(world.frame_views(n)[index], truths[n][index].rgb_u8, truths[n][index].semantics)
+            for n in config.cameras
+        ]
+        sweeps.append(SweepShots(sweep.time_s, sweep.world_from_lidar @ error, sweep.points, shots))
+    cloud, _ = fuse_sweeps(sweeps, world.tracks(), FusionRules(min_object_points=40))
+    recorded = tuple(
+        Recorded(view, truth.rgb_u8, truth.semantics)
+        for name in config.cameras
+        for view, truth in zip(world.frame_views(name), truths[name])
+    )
+    return CityLog(world, cloud, recorded)
+
+
+def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> tuple[list[Clip], tuple[float, ...]]:
+    """All clips of one city and their shifts in metres; `log` is the city's own from `make_log`, made here if not given."""
+    log = log or make_log(rules, city, rules.frames)
+    rng = seeds.numpy_rng(rules.seed, city, "clips")
+    size = (rules.width, rules.height)
+    recorded_views = log.world.frame_views("front")[FIRST : FIRST + rules.window]
+    fine = (rules.width * rules.fine, rules.height * rules.fine)
+    conditions = ConditionRules(*size, *fine, published=rules.published)
+    tracks = log.world.tracks()
+    clips = []
+    shifts = shifts_of(rules, city)
+    sources: dict[int, Source] = {}
+    known = _without_every_fourth(log.recorded, rng) if city < HELD_OUT and rng.random() < 0.5 else log.recorded
+    for shift_m in shifts:
+        views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
+        given, cache = (_thinned(log.recorded, rng), {}) if shift_m == 0.0 else (known, sources)
+        given = log.recorded if rules.published else given  # for the reference only
+        condition = build_condition(log.cloud, tracks, views, given, conditions, cache)
+        truths = [log.world.render(view.resized(*size)) for view in views]
+        clips.append(clip_from_truth(condition, truths))
+    return clips, shifts
+
+
+def _without_every_fourth(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
+    """As in a log whose every fourth moment is held out."""
+    times = sorted({r.view.time_s for r in recorded})
+    held_out = set(times[int(rng.integers(4)) :: 4])
+    return tuple(r for r in recorded if r.view.time_s not in held_out)
+
+
+def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
+    """The view moved sideways, positive to the left, as `core.trajectory.shifted` does."""
+    pose = world.ego_path().pose_at(view.time_s)
+    moved = view.world_from_cam.copy()
+    if pose is not None:
+        moved[:3, 3] += shift_m * ego_left_world(pose)
+    return View(view.camera, moved, view.time_s)
+
+
+def _thinned(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
+    """Every second to fourth moment's images only."""
+    gap = int(rng.integers(2, 5))
+    times = sorted({r.view.time_s for r in recorded})
+    kept = set(times[int(rng.integers(gap)) :: gap])
+    return tuple(r for r in recorded if r.view.time_s in kept)
+
+
+def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
+    """A clip from a condition and the generator's truth at its views; the sky has no valid depth."""
+    rgb = torch.stack([torch.from_numpy(np.ascontiguousarray(t.rgb)).permute(2, 0, 1) for t in truths])
+    depth = torch.stack([torch.from_numpy(np.ascontiguousarray(t.depth))[None] for t in truths])
+    ids = torch.stack([torch.from_numpy(t.semantics.astype(np.int64)) for t in truths])
+    return Clip(condition, rgb.float(), depth, torch.isfinite(depth), ids)
+
+
+def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path) -> None:
+    """Make the shards of those cities that have none in `folder` yet, one after another."""
+    missing = [city for city in cities if not shard_path(folder, city).is_file()]
+    for city in progress(missing, len(missing), "generating cities"):
+        write_city(rules, city, folder)
+
+
+def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
+    """Make one city's clips and write its shard; returns the number of clips. Runs in a process of its own."""
+    torch.set_num_threads(1)
+    native.set_threads(1)
+    log = make_log(rules, city, rules.frames)
+    clips, shifts = make_clips(rules, city, log)
+    points = None
+    if city >= HELD_OUT or rules.point_colors:
+        plain = ConditionRules(rules.width, rules.height, warp=False)
+        tracks = log.world.tracks()
+        points = [build_condition(log.cloud, tracks, c.condition.views, (), plain).color for c in clips]
+    write_shard(folder, city, pack_clips(clips, shifts, points))
+    return len(clips)

@@ -1,0 +1,345 @@
+"""Training clips from recorded logs: a scene, its fused cloud, and whatever labels it has.
+
+A clip is a window of consecutive frames of one camera, looked at from where they were recorded:
+
+* **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured (and the depth labels of
+  the scene, where there are such); classes where labels exist and are trusted;
+* **condition**: what `synthesize` would build for these views without their own images. Every view gets only images that
+  are at least some moments away, so that something is left to be done: between one and `farthest` moments, drawn per
+  window. Of the cloud a random share of the points is left out, so that depth is more than copying.
+
+The points of the cloud keep the colours that fusing gave them, also where those came from the very image that is the truth;
+so it is in the published system.
+
+Held-out frames of the scene are never read. Every n-th window is for scoring, and training windows that show a moment of
+one of these are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import geometry, palette, seeds, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Clip, Condition, Frame, FusedCloud, PointCloud, Scene, Sweep, View
+from mudg.core.project import project_points
+from mudg.data.clips.condition import (
+    ConditionRules,
+    Recorded,
+    Source,
+    build_condition,
+    nearest_valid,
+    remove_shine_through,
+    resize_image,
+)
+from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
+from mudg.data.cloudfile import read_fused
+from mudg.data.scene import read_image, read_label, read_points, read_scene, read_trusted_classes
+
+INDEX = "log_clips.json"
+SKY = palette.ID["sky"]
+
+
+@dataclass(frozen=True)
+class LogClipRules:
+    """How windows are cut from a log. Sizes are those of the clips."""
+
+    width: int
+    height: int
+    window: int = 8
+    stride: int = 4
+    """Frames from one window's start to the next one's."""
+    frame_step: int = 1
+    """Take every n-th frame only."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to look through (empty = all of the scene)."""
+    held_out_every: int = 5
+    """Every n-th window is for scoring (0 = none)."""
+    farthest: int = 4
+    """Nearest usable image of a view: up to so many moments away (held-out windows: always 2, or this if less)."""
+    least_points: float = 0.3
+    """Smallest share of the cloud's points that a training window keeps."""
+    label_confidence: float = 0.5
+    """Labels with less confidence than this are no truth."""
+    fine: int = 2
+    """Colours are gathered at so many times the clip's size."""
+    seed: int = 0
+    published: bool = False
+    """The published system's condition: points alone, 0 where nothing was seen, projected at the camera's size; the reference is
+    the window's first image."""
+
+
+@dataclass(frozen=True)
+class LogWindow:
+    """One clip to be: the frames of one camera (their ids), and whether it is for scoring."""
+
+    camera: str
+    frames: tuple[str, ...]
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class LogSource:
+    """A recorded log: where its scene and its fused cloud lie."""
+
+    scene: Path
+    fused: Path
+
+
+def log_source(text: str) -> LogSource:
+    """The log that SCENE=FUSED names, or the output folder of `mudg run` (labels of annotate are taken if there are some).
+
+    Raises:
+        InputError: no scene or no cloud there.
+    """
+    scene, separator, fused = text.partition("=")
+    if separator:
+        found = LogSource(Path(scene), Path(fused))
+    else:
+        run = Path(text)
+        labelled = run / "annotate"
+        found = LogSource(labelled if (labelled / "scene.json").is_file() else run / "scene", run / "fuse")
+    if not (found.fused / "fuse.json").is_file() or not found.scene.exists():
+        raise InputError("no scene with a fused cloud here", where=text, expected="SCENE=FUSED, or an output folder of mudg run",
+                         remedy="make the cloud with `mudg fuse`")  # fmt: skip
+    return found
+
+
+def log_windows(scene: Scene, rules: LogClipRules) -> list[LogWindow]:
+    """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene are passed over.
+
+    Raises:
+        InputError: unknown camera, or no camera has enough frames.
+    """
+    usable = {frame.id for frame in scene.frames_in("train")}
+    reach = (rules.window - 1) * rules.frame_step + 1
+    found: list[LogWindow] = []
+    for camera in rules.cameras or tuple(scene.cameras):
+        frames = sorted((f for f in scene.frames_of(camera) if f.id in usable), key=lambda f: f.view.time_s)
+        for start in range(0, len(frames) - reach + 1, rules.stride):
+            number = start // rules.stride
+            kept = rules.held_out_every > 0 and number % rules.held_out_every == rules.held_out_every // 2
+            chosen = frames[start : start + reach : rules.frame_step]
+            found.append(LogWindow(camera, tuple(f.id for f in chosen), kept))
+    if not found:
+        raise InputError("a log is too short for a training clip", where=scene.root, expected=f"{reach} frames of a camera",
+                         remedy="give a shorter --window, or ingest with --test-every 0")  # fmt: skip
+    time_of = {frame.id: frame.view.time_s for frame in scene.frames}
+    shown = {time_of[name] for window in found if window.held_out for name in window.frames}
+    return [w for w in found if w.held_out or not shown & {time_of[name] for name in w.frames}]
+
+
+class OpenLog:
+    """A log from which clips are made: scene, cloud, and the images around the window that is being made."""
+
+    def __init__(self, source: LogSource, rules: LogClipRules) -> None:
+        self.scene, self.cloud, self.rules = read_scene(source.scene), read_fused(source.fused), rules
+        self._frames = sorted(self.scene.frames_in("train"), key=lambda f: f.view.time_s)
+        self.place = {frame.id: number for number, frame in enumerate(self._frames)}
+        times = np.array([f.view.time_s for f in self._frames])
+        apart = np.diff(times) > ConditionRules(1, 1).same_time_s
+        self.moment: list[int] = np.concatenate([[0], np.cumsum(apart)]).tolist()
+        self._read: dict[int, Recorded] = {}
+
+    def frame(self, frame_id: str) -> Frame:
+        """The frame with this id."""
+        return self._frames[self.place[frame_id]]
+
+    def images(self, first: int, last: int) -> dict[int, Recorded]:
+        """The recorded images of the moments `first` to `last`, by place in time; others are forgotten."""
+        wanted = [n for n, moment in enumerate(self.moment) if first <= moment <= last]
+        self._read = {n: self._read[n] if n in self._read else self._recorded(n) for n in wanted}
+        return self._read
+
+    def _recorded(self, number: int) -> Recorded:
+        frame = self._frames[number]
+        classes = read_trusted_classes(self.scene, frame, self.rules.label_confidence)
+        return Recorded(frame.view, read_image(self.scene, frame), classes)
+
+
+def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
+    """The clip of one window; what is left out of its condition is drawn from (seed of the rules, `number`)."""
+    rules = log.rules
+    rng = seeds.numpy_rng(rules.seed, number, "log clip")
+    gap = min(2, rules.farthest) if window.held_out else int(rng.integers(1, rules.farthest + 1))
+    cloud = log.cloud if window.held_out else thinned(log.cloud, rng.uniform(rules.least_points, 1.0), rng)
+    conditions = ConditionRules(rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
+    places = [log.place[name] for name in window.frames]
+    if rules.published:
+        return _published_clip(log, window, cloud, places)
+    margin = gap + conditions.images_per_view  # at a log's end all images come from one side
+    images = log.images(log.moment[places[0]] - margin, log.moment[places[-1]] + margin)
+    sources: dict[int, Source] = {}
+    parts = []
+    for place in places:
+        far = [n for n in images if abs(log.moment[n] - log.moment[place]) >= gap]
+        given = {index: sources[n] for index, n in enumerate(far) if n in sources}
+        view = images[place].view
+        parts.append(build_condition(cloud, log.scene.tracks, [view], [images[n] for n in far], conditions, given))
+        sources |= {far[index]: source for index, source in given.items()}
+    condition = _in_one(parts)
+    truths = [
+        _truth(log.scene, log.frame(name), images[place], view)
+        for name, place, view in zip(window.frames, places, condition.views)
+    ]
+    rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
+    depth = torch.where(known, depth, condition.depth)  # a plausible filling: the noisy input shows it
+    return Clip(condition, rgb, depth, known, ids)
+
+
+def _published_clip(log: OpenLog, window: LogWindow, cloud: FusedCloud, places: Sequence[int]) -> Clip:
+    """A clip with the condition that the published model is given; no image but the reference has a part in it."""
+    rules = log.rules
+    images = log.images(log.moment[places[0]], log.moment[places[-1]])
+    views = [images[place].view for place in places]
+    camera = views[0].camera
+    conditions = ConditionRules(rules.width, rules.height, camera.width, camera.height, published=True)
+    condition = build_condition(cloud, log.scene.tracks, views, [images[places[0]]], conditions)
+    truths = [
+        _truth(log.scene, log.frame(name), images[place], view)
+        for name, place, view in zip(window.frames, places, condition.views)
+    ]
+    rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
+    depth = torch.where(known, depth, _nearest_depth(condition.depth, conditions.far_m))
+    return Clip(condition, rgb, depth, known, ids)
+
+
+def _nearest_depth(depth: Tensor, far_m: float) -> Tensor:
+    """Depth f32[T,1,H,W] with its zeros replaced by the nearest pixel's that has some; `far_m` in a frame without any."""
+    filled = []
+    for image in depth[:, 0].numpy():
+        rows, columns = nearest_valid(image > 0)
+        filled.append(torch.from_numpy(image[rows, columns] if (image > 0).any() else np.full_like(image, far_m)))
+    return torch.stack(filled)[:, None]
+
+
+def thinned(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:
+    """A random `share` of the points of every cloud."""
+
+    def part(points: PointCloud) -> PointCloud:
+        keep = rng.random(len(points)) < share
+        semantics = None if points.semantics is None else points.semantics[keep]
+        return PointCloud(points.xyz[keep], points.rgb[keep], points.frame, semantics)
+
+    return FusedCloud(part(cloud.static), {name: part(points) for name, points in cloud.objects.items()})
+
+
+def _in_one(parts: Sequence[Condition]) -> Condition:
+    """Conditions of one view each as one of all views; the reference is that of the first."""
+
+    def stack(name: str) -> Tensor | None:
+        values = [getattr(p, name) for p in parts]
+        return None if any(v is None for v in values) else torch.cat(values)
+
+    views = tuple(v for p in parts for v in p.views)
+    optional = {name: stack(name) for name in ("warped", "backdrop", "semantics", "backdrop_semantics")}
+    color, depth, valid = (torch.cat([getattr(p, name) for p in parts]) for name in ("color", "depth", "valid"))
+    return Condition(views, color, depth, valid, parts[0].reference, **optional)
+
+
+def _truth(scene: Scene, frame: Frame, recorded: Recorded, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """rgb f32[3,H,W], depth f32[1,H,W] metres, where it is known bool[1,H,W], classes i64[H,W], all at the size of `view`."""
+    width, height = view.camera.width, view.camera.height
+    rgb = torch.from_numpy(resize_image(recorded.rgb, width, height).copy()).permute(2, 0, 1).float() / 255
+    rows = ((np.arange(height) + 0.5) * recorded.rgb.shape[0] / height).astype(int)[:, None]
+    columns = ((np.arange(width) + 0.5) * recorded.rgb.shape[1] / width).astype(int)[None]
+    ids = np.full((height, width), palette.UNLABELLED, np.uint8)
+    if recorded.semantics is not None:
+        ids = recorded.semantics[rows, columns]
+    depth, known = _measured(scene, view)
+    if "depth" in frame.labels and "depth_confidence" not in frame.labels:  # else a labeller guessed it
+        labelled = read_label(scene, frame, "depth")[rows, columns]
+        depth = np.where(~known & np.isfinite(labelled), labelled, depth)
+        known = known | np.isfinite(labelled)
+    sky = (ids == SKY) & ~known
+    depth, known = np.where(sky, np.float32(FAR_M), depth), known | sky
+    image = torch.from_numpy(depth.astype(np.float32))[None]
+    return rgb, image, torch.from_numpy(known)[None], torch.from_numpy(ids.astype(np.int64))
+
+
+def _measured(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Depth f32[H,W] of the sweep taken with an image and where it measured; points seen through gaps are left out."""
+    near = ConditionRules(1, 1).same_time_s
+    sweeps: list[Sweep] = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= near]
+    if not sweeps:
+        empty = np.zeros((view.camera.height, view.camera.width), np.float32)
+        return empty, empty > 0
+    nearest: dict[str, Sweep] = {}
+    for sweep in sweeps:  # one of each sensor
+        other = nearest.get(sweep.sensor)
+        if other is None or abs(sweep.time_s - view.time_s) < abs(other.time_s - view.time_s):
+            nearest[sweep.sensor] = sweep
+    places = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in nearest.values()]
+    seen = project_points(np.concatenate(places).astype(np.float32), None, view, near_m=1.0, far_m=100.0)
+    depth = seen.depth[0].numpy()
+    return depth, remove_shine_through(depth, seen.valid[0].numpy())
+
+
+# files ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LogClips:
+    """Clips of logs on disk: training shards are numbered from 0, those for scoring from `first_held_out`; one clip each."""
+
+    train: int
+    held_out: int
+
+
+def plan(
+    sources: Sequence[LogSource], rules: LogClipRules, first_held_out: int
+) -> tuple[list[tuple[int, LogSource, LogWindow]], LogClips]:
+    """What shards there will be: (number, log, window) each, and how many of both kinds.
+
+    Raises:
+        InputError: a log is too short, or holding out leaves nothing to train on.
+    """
+    rows: list[tuple[int, LogSource, LogWindow]] = []
+    counts = {False: 0, True: 0}
+    for source in sources:
+        for window in log_windows(read_scene(source.scene), rules):
+            number = counts[window.held_out] + (first_held_out if window.held_out else 0)
+            counts[window.held_out] += 1
+            rows.append((number, source, window))
+    if not counts[False] or (rules.held_out_every and not counts[True]):
+        raise InputError(
+            "the logs are too short to hold out windows", where=", ".join(str(s.scene) for s in sources),
+            got=f"{counts[False]} windows to train on, {counts[True]} to score",
+            remedy="give a smaller --stride or --window, or --held-out-every 0 (scores are then of clips trained on)",
+        )  # fmt: skip
+    return rows, LogClips(counts[False], counts[True])
+
+
+def write_log(source: LogSource, rules: LogClipRules, windows: Sequence[tuple[int, LogWindow]], folder: Path) -> int:
+    """Write the shards of one log that are not there yet; returns how many were made."""
+    missing = [(n, w) for n, w in windows if not shard_path(folder, n).is_file()]
+    if missing:
+        log = OpenLog(source, rules)
+        for number, window in missing:
+            clip = make_clip(log, window, number)
+            write_shard(folder, number, pack_clips([clip], [0.0], gaps=True))
+    return len(missing)
+
+
+def claim(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]) -> None:
+    """Write down what the shards of a folder are made of; UsageError if they are made of something else."""
+    inputs = [[store.digest(s.scene), store.digest(s.fused)] for s in sources]
+    stated = {name: value for name, value in asdict(rules).items() if name != "published" or value}
+    wanted = {"rules": store.parse_json(store.json_text(stated), INDEX), "logs": inputs}
+    path = folder / INDEX
+    if path.is_file():
+        found = store.read_json(path)
+        if found != wanted:
+            raise UsageError("the folder holds training clips of other logs or settings", where=str(folder),
+                             got="; ".join(store.differences(found, wanted)[:4]), remedy="give another --clips")  # fmt: skip
+        return
+    if folder.is_dir() and any(folder.glob("*.safetensors")):
+        raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --clips")
+    store.write_json(path, wanted)

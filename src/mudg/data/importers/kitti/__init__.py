@@ -1,0 +1,1 @@
+"""KITTI: raw, odometry, tracking and object layouts."""

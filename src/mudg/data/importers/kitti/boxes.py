@@ -1,0 +1,227 @@
+"""KITTI boxes: tracking and object label text, raw-data tracklets; all become boxes in the velodyne frame per frame number."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix
+from mudg.base.types import Track
+from mudg.data.importers.box_tracks import check_sides, unknown_words
+from mudg.data.importers.kitti.poses import read_lines
+
+Matrix = NDArray[np.float64]
+MAX_TRACKLET_BYTES = 256 * 1024 * 1024
+TURN_PERIOD_S = 0.1
+LABELS = frozenset(
+    ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
+)
+"""Classes of the benchmarks, in lower case."""
+MAX_GAP_S = 0.55
+"""A track that is not seen for longer than this is split: interpolating across would invent its path."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiBox:
+    """One annotated box.
+
+    Args:
+        frame: frame number.
+        track: track number; object labels count lines.
+        label: lower-case class, e.g. ``car``.
+        size_m: length, width, height.
+        sensor_from_box: box frame (x forward, y left, z up, origin in the centre) to the velodyne, f64[4, 4].
+        box2d_px: annotated rectangle (left, top, right, bottom) in KITTI's pixels, or None.
+    """
+
+    frame: int
+    track: int
+    label: str
+    size_m: tuple[float, float, float]
+    sensor_from_box: Matrix
+    box2d_px: tuple[float, float, float, float] | None = None
+
+
+def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y: float) -> Matrix:
+    """Box frame to rectified camera 0 from KITTI's bottom centre (y down) and turn about the camera's y axis, f64[4, 4]."""
+    c, s = np.cos(rotation_y), np.sin(rotation_y)
+    forward, left, up = (c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)
+    centre = np.asarray(bottom_centre_m, np.float64) - [0, height_m / 2, 0]
+    return from_rotation_translation(np.array([forward, left, up]).T, centre)
+
+
+def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
+    """Boxes of a tracking label file (17 columns and optionally a score), or of an object label file.
+
+    Args:
+        path: label text. ``DontCare`` regions are left out.
+        rect0_from_velo: boxes are given in rectified camera 0 and returned in the velodyne frame.
+        frame: frame number for an object label file (15 columns and optionally a score); None for a tracking file.
+    """
+    velo_from_rect0 = invert(rect0_from_velo)
+    boxes = []
+    skip = 2 if frame is None else 0
+    for index, line in enumerate(read_lines(path)):
+        words, where = line.split(), f"{path}: line {index + 1}"
+        if len(words) - skip not in (15, 16):
+            raise InputError(
+                "label line has the wrong number of columns",
+                where=where,
+                got=str(len(words)),
+                expected=f"{15 + skip} (or {16 + skip} with a score)",
+                remedy="is this a tracking or an object label file?",
+            )
+        if words[skip] == "DontCare":
+            continue
+        try:
+            number = frame if frame is not None else int(words[0])
+            track = int(words[1]) if frame is None else index
+            values = [float(word) for word in words[skip + 1 :]]
+        except ValueError as error:
+            raise InputError("label value is not a number", where=where, got=str(error)) from error
+        if not np.isfinite(values).all():
+            raise InputError("label value is not finite", where=where, got=line.strip()[:100])
+        height, width, length = values[7:10]
+        if min(height, width, length) <= 0:
+            raise InputError(
+                "box size is not positive",
+                where=where,
+                expected="height, width, length in metres",
+                got=str(values[7:10]),
+            )
+        pose = velo_from_rect0 @ rect0_from_box(values[10:13], height, values[13])
+        left, top, right, bottom = values[3:7]
+        boxes.append(
+            KittiBox(number, track, words[skip].lower(), (length, width, height), pose, (left, top, right, bottom))
+        )
+    return boxes
+
+
+def read_tracklets(path: Path) -> list[KittiBox]:
+    """Boxes of a raw-data ``tracklet_labels.xml``: velodyne frame, bottom centre, turn about z."""
+    content = store.read_bytes(path)
+    if len(content) > MAX_TRACKLET_BYTES:
+        raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
+    if b"<!ENTITY" in content:
+        raise InputError(
+            "tracklet file declares XML entities, which no KITTI file does",
+            where=str(path),
+            remedy="use the file from the data set",
+        )
+    try:
+        root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
+    except ElementTree.ParseError as error:
+        raise InputError("tracklet file is not valid XML (is it cut off?)", where=str(path), got=str(error)) from error
+    boxes = []
+    for track, item in enumerate(root.findall("./tracklets/item")):
+        where = f"{path}: tracklet {track}"
+        height, width, length = (_xml_number(item, key, where) for key in ("h", "w", "l"))
+        if min(height, width, length) <= 0:
+            raise InputError("box size is not positive", where=where, got=f"h={height} w={width} l={length}")
+        first = int(_xml_number(item, "first_frame", where))
+        label = (item.findtext("objectType") or "").strip().lower()
+        for step, pose in enumerate(item.findall("./poses/item")):
+            here = f"{where} pose {step}"
+            tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
+            boxes.append(
+                KittiBox(first + step, track, label, (length, width, height), yaw_matrix(rz, (tx, ty, tz + height / 2)))
+            )
+    return boxes
+
+
+def _xml_number(element: ElementTree.Element, key: str, where: str) -> float:
+    text = element.findtext(key)
+    try:
+        value = float(text) if text is not None else float("nan")
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InputError(f"tracklet field {key!r} is missing or not a number", where=where, got=repr(text))
+    return value
+
+
+def build_tracks(
+    boxes: Sequence[KittiBox],
+    world_from_velo: Mapping[int, Matrix],
+    times_s: Mapping[int, float],
+    where: str,
+    velo_at: Callable[[float], Matrix] | None = None,
+) -> tuple[list[Track], list[str]]:
+    """Tracks in the world from boxes per frame.
+
+    Boxes of frames that are not imported are left out. A track with a gap longer than ``MAX_GAP_S`` is split into
+    ``7``, ``7.1``, ... The size is the median over the track.
+
+    Args:
+        world_from_velo: pose of the velodyne by frame number.
+        times_s: time of the scan by frame number.
+        where: the file the boxes come from, for messages.
+        velo_at: pose of the velodyne at any time, when boxes were drawn into scans that were still twisted: each box then
+            belongs to the moment its azimuth was measured, and is moved to the scan's time with the track's velocity.
+
+    Returns:
+        The tracks, and notes for people (splits, boxes left out).
+    """
+    by_track: dict[int, dict[int, KittiBox]] = {}
+    outside = 0
+    for box in boxes:
+        if box.frame not in world_from_velo:
+            outside += 1
+            continue
+        if box.frame in by_track.setdefault(box.track, {}):
+            raise InputError(
+                "a track has two boxes in one frame", where=where, got=f"track {box.track}, frame {box.frame}"
+            )
+        by_track[box.track][box.frame] = box
+    notes = [f"{outside} boxes lie in frames that were not imported and were left out"] if outside else []
+    tracks = []
+    for number, members in sorted(by_track.items()):
+        frames = sorted(members, key=lambda n: times_s[n])
+        times = np.array([times_s[n] for n in frames])
+        pieces = np.split(np.arange(len(frames)), np.flatnonzero(np.diff(times) > MAX_GAP_S) + 1)
+        size = np.median([members[n].size_m for n in frames], axis=0)
+        if len(pieces) > 1:
+            notes.append(
+                f"track {number} is not seen for more than {MAX_GAP_S} s and was split into {len(pieces)} tracks"
+            )
+        for part, piece in enumerate(pieces):
+            chosen = [frames[i] for i in piece]
+            if velo_at is None:
+                poses = np.stack([world_from_velo[n] @ members[n].sensor_from_box for n in chosen])
+            else:
+                poses = _at_scan_times([members[n].sensor_from_box for n in chosen], times[piece], velo_at)
+            tracks.append(
+                Track(f"{number}.{part}" if part else str(number), members[chosen[0]].label, size, times[piece], poses)
+            )
+    check_sides(tracks, where)
+    unknown = Counter(box.label for box in boxes if box.frame in world_from_velo and box.label not in LABELS)
+    if unknown:
+        notes.append(unknown_words(unknown))
+    return tracks, notes
+
+
+def _at_scan_times(
+    sensor_from_box: Sequence[Matrix], times_s: NDArray[np.float64], velo_at: Callable[[float], Matrix]
+) -> Matrix:
+    """World-from-box at the scans' times from boxes in twisted scans, f64[n, 4, 4]."""
+    late_s = np.array([azimuth_delay_s(float(np.arctan2(pose[1, 3], pose[0, 3]))) for pose in sensor_from_box])
+    poses = np.stack(
+        [velo_at(float(t + late)) @ pose for t, late, pose in zip(times_s, late_s, sensor_from_box, strict=True)]
+    )
+    if len(poses) > 1:
+        velocity = np.gradient(poses[:, :3, 3], times_s + late_s, axis=0)
+        poses[:, :3, 3] -= velocity * late_s[:, None]
+    return poses
+
+
+def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
+    """When a turning sensor looks to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi), seconds after looking forward."""
+    return azimuth_rad / (2 * np.pi) * TURN_PERIOD_S

@@ -1,0 +1,483 @@
+"""KITTI-360 importer: one drive of the data set's folder.
+
+========================== =========================================================================================
+``calibration/``           cameras, velodyne, SICK (``kitti360_calib``)
+``data_2d_raw/<drive>/``   ``image_00|01/data_rect`` (rectified stereo), ``image_02|03/data_rgb`` (fisheyes)
+``data_3d_raw/<drive>/``   ``velodyne_points/data``, ``sick_points/data``, each with ``timestamps.txt``
+``data_poses/<drive>/``    ``poses.txt`` (vehicle) or ``cam0_to_world.txt`` (rectified camera 0), for part of the frames
+``data_3d_bboxes/``        ``train_full/<drive>.xml``, else ``train/<drive>.xml`` (``kitti360_boxes``)
+``data_2d_semantics/``     ``train/<drive>/image_00|01/semantic`` and ``confidence``, where there are any
+========================== =========================================================================================
+
+Frames. World: z up, origin and x axis at the vehicle of the first imported frame (the data set's own world lies kilometres
+away). The vehicle is the GPS/IMU. ``image_00`` is called ``front``.
+
+Time. All sensors of a frame share one moment, as the data set's own tools have it: the velodyne's time stamp. Poses are missing
+where the vehicle hardly moves; they are interpolated there. Frames before the first and after the last pose are left out.
+
+Scans are distorted by the vehicle's motion; they are untwisted here. The sensor turns clockwise seen from above in 0.1 s and
+looks forward at the frame's moment (as the data set's tools have it). Lines of the SICK scanners, about four a frame, become
+one sweep per frame.
+
+Fisheye cameras are taken when they are asked for (``--cameras side_left side_right``): rectified to a pinhole camera that
+looks along the lens' axis and is 90 degrees wide and high, with the lens' own resolution in its centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
+from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.clouds import read_float_rows
+from mudg.data.importers.common import deskew, for_each, pose_near, rigid_pose, seconds
+from mudg.data.importers.images import ImageFit
+from mudg.data.importers.kitti import poses as kitti_poses
+from mudg.data.importers.kitti.importer import read_scan
+from mudg.data.importers.kitti360.boxes import WORDS, read_boxes
+from mudg.data.importers.kitti360.calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
+from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames
+from mudg.data.importers.options import ImportOptions, holdout_split
+from mudg.data.scene import SceneWriter, decode_image
+
+Matrix = NDArray[np.float64]
+LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
+CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "side_left", "image_03": "side_right"}
+USUAL: Final = ("image_00", "image_01")
+SENSOR: Final = "velodyne"
+SICK: Final = "sick"
+FRAME_PERIOD_S: Final = 0.1
+MAX_GAP_M: Final = 3.0
+"""Frames without a pose are interpolated where the vehicle moved less than this between the poses around them."""
+_SICK_REACH_S: Final = 0.055
+_TRAIN_IDS: Final = {
+    7: 0, 8: 1, 11: 2, 12: 3, 13: 4, 17: 5, 19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12, 26: 13, 27: 14, 28: 15,
+    31: 16, 32: 17, 33: 18, 34: 2, 35: 4, 37: 5,
+}  # fmt: skip
+"""The data set's class ids -> Cityscapes train ids (garage = building, gate = fence, small pole = pole); others unlabelled."""
+_LAST_ID: Final = 44
+
+
+@dataclass(frozen=True, slots=True)
+class _Folders:
+    """The data set's folder and the drive."""
+
+    root: Path
+    drive: str
+
+    def images(self, camera: str) -> Path:
+        return self.root / "data_2d_raw" / self.drive / camera / ("data_rect" if camera in USUAL else "data_rgb")
+
+    def raw(self, sensor: str) -> Path:
+        return self.root / "data_3d_raw" / self.drive / sensor
+
+    def semantics(self, camera: str, kind: str, number: int) -> Path:
+        return self.root / "data_2d_semantics" / "train" / self.drive / camera / kind / f"{number:010d}.png"
+
+
+def looks_like_kitti360(source: Path) -> bool:
+    """Whether ``source`` is the data set's folder (``data_2d_raw`` and ``calibration`` in it), or a drive's in ``data_2d_raw``."""
+    if not source.is_dir():
+        return False
+    root = source.absolute().parent.parent if source.absolute().parent.name == "data_2d_raw" else source
+    return (root / "data_2d_raw").is_dir() and (root / "calibration" / "calib_cam_to_pose.txt").is_file()
+
+
+def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one KITTI-360 drive into the scene directory ``out``; see the module text for what is understood.
+
+    Args:
+        source: the data set's folder, or ``data_2d_raw/<drive>`` in it.
+        out: destination.
+        options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the stereo
+            pair; all others are used too.
+
+    Raises:
+        UsageError: there are several drives and none was chosen, or an option does not apply.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
+    folders = _find(source, options)
+    calibration = read_calibration(folders.root / "calibration")
+    images = {name: numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
+    available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
+    chosen = chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
+    scans = numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
+    streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
+    notes: list[str] = []
+    clock = _clock(folders, streams, notes)
+    motion = _Motion.read(folders, calibration, clock, options, notes)
+    placed = {name: [n for n in found if motion.known(clock[n])] for name, found in streams.items()}
+    frames = whole_frames(placed, options, str(folders.root), "kitti360")
+    _say_left_out(streams, placed, options, notes)
+    start_s, world_from_source = float(clock[frames[0]]), motion.level_at(clock[frames[0]])
+    scene_s = seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
+    motion = motion.moved(start_s, world_from_source)
+    fits = {name: _fit(calibration, name, images[name][frames[0]], options) for name in chosen}
+    untwist = bool(scans) and options.untwist != "no"
+    if not scans:
+        log.warn("kitti360: no scans found: the scene has images only, and there is nothing to fuse")
+    elif untwist:
+        notes.append("scans untwisted: clockwise turn of 0.1 s, forward at the frame's moment")
+    notes += [fit.words for fit in fits.values() if fit.words]
+    notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
+    sick = _Sick.find(folders, calibration, motion, start_s, notes)
+    tracks = _read_tracks(folders, options, dict(zip(frames, scene_s, strict=True)), world_from_source, notes)
+    for note in notes:
+        log.info(f"kitti360: {note}")
+
+    def convert(index: int) -> None:
+        number, time_s = frames[index], float(scene_s[index])
+        world_from_ego = motion.at(time_s)
+        for name in chosen:
+            view = View(fits[name].camera, world_from_ego @ calibration.ego_from_camera[name], time_s)
+            path, labels = images[name][number], _labels(folders, name, number, fits[name])
+            writer.add_frame(f"{CAMERAS[name]}/{index:06d}", view, fits[name].image(path, str(path)), labels)
+        world_from_velo = world_from_ego @ calibration.ego_from_velo
+        if number in scans:
+            points = read_scan(scans[number])
+            if untwist:
+                points = _untwisted(points, motion, calibration, time_s)
+            writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, time_s, world_from_velo, points)
+        if sick is not None:
+            pose, lines = sick.sweep(time_s)
+            if len(lines.xyz):
+                writer.add_sweep(f"{SICK}/{index:06d}", SICK, time_s, pose, lines)
+
+    with SceneWriter(out, folders.drive, Source("kitti360", LICENCE, None, tuple(notes))) as writer:
+        for fit in fits.values():
+            writer.add_camera(fit.camera)
+        for_each(
+            range(len(frames)), convert, title="importing KITTI-360", workers=options.workers,
+            name=lambda index: f"frame {frames[index]}",
+        )  # fmt: skip
+        for track in tracks:
+            writer.add_track(track)
+        writer.set_ego(motion.path(scene_s))
+        moments = [[f"{CAMERAS[name]}/{index:06d}" for name in chosen] for index in range(len(frames))]
+        writer.set_split(holdout_split(moments, options.test_every))
+        return writer.finish()
+
+
+def _find(source: Path, options: ImportOptions) -> _Folders:
+    if not source.is_dir():
+        raise InputError("KITTI-360 folder does not exist", where=str(source), expected="a folder")
+    if source.absolute().parent.name == "data_2d_raw":
+        return _Folders(source.absolute().parent.parent, source.absolute().name)
+    raw = source / "data_2d_raw"
+    if not raw.is_dir():
+        raise InputError(
+            "no KITTI-360 recording found", where=str(source), expected="data_2d_raw, data_poses and calibration in it",
+            got=", ".join(sorted(path.name for path in source.iterdir())[:12]) or "an empty folder",
+        )  # fmt: skip
+    drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
+    wanted = options.sequence or (drives[0] if len(drives) == 1 else "")
+    matching = [d for d in drives if wanted and (d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}"))]
+    if len(matching) != 1:
+        raise UsageError(
+            "there is no such drive" if wanted else "the folder holds several drives", where=str(raw),
+            expected="--sequence with one of " + ", ".join(drives[:12]), got=wanted or "none chosen",
+        )  # fmt: skip
+    return _Folders(source, matching[0])
+
+
+def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
+    """The calibration and the parts of the chosen drive."""
+    folders = _find(source, options)
+    root, drive = folders.root, folders.drive
+    parts = [root / "calibration", *(root / name / drive for name in ("data_2d_raw", "data_3d_raw", "data_poses"))]
+    parts += [root / "data_2d_semantics" / "train" / drive]
+    parts += [root / "data_3d_bboxes" / part / f"{drive}.xml" for part in ("train_full", "train")]
+    return LogFiles(tuple(part for part in parts if part.exists()))
+
+
+def _fit(calibration: Kitti360Calibration, camera: str, first: Path, options: ImportOptions) -> ImageFit:
+    height, width = decode_image(store.read_bytes(first), str(first)).shape[:2]
+    return calibration.fit(camera, CAMERAS[camera], (width, height), options)
+
+
+def _say_left_out(
+    streams: Mapping[str, Mapping[int, Path]],
+    placed: Mapping[str, Sequence[int]],
+    options: ImportOptions,
+    notes: list[str],
+) -> None:
+    everything = {n for found in streams.values() for n in found}
+    if options.frames is not None:
+        everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
+    lost = sorted(everything - {n for found in placed.values() for n in found})
+    if lost:
+        notes.append(f"frames without a pose or time stamp were left out: {some_numbers(lost)}")
+
+
+# --- time and motion ------------------------------------------------------------------------------------------------
+
+
+def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: list[str]) -> NDArray[np.float64]:
+    """Seconds by frame number, NaN where there is no stamp: the velodyne's, else camera 0's, else 10 Hz."""
+    last = max(max(found) for found in streams.values())
+    for path, files in (
+        (folders.raw("velodyne_points") / "timestamps.txt", streams.get(SENSOR, {})),
+        (folders.root / "data_2d_raw" / folders.drive / "image_00" / "timestamps.txt", streams.get("image_00", {})),
+    ):
+        if path.is_file():
+            return _stamps(path, files, last)
+    notes.append("no timestamps in the source: 10 Hz assumed")
+    return np.arange(last + 1, dtype=np.float64) * FRAME_PERIOD_S
+
+
+def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:
+    """Seconds by number, f64[last + 1]. Line k is number k; a file with just one line per recorded file counts those instead.
+
+    Empty lines are numbers without a stamp (NaN).
+    """
+    given = [bool(line.strip()) for line in store.read_bytes(path).decode("utf-8", "replace").splitlines()]
+    times = np.full(max(len(given), last + 1), np.nan)
+    stamps = kitti_poses.read_timestamps(path)
+    if len(given) > last:
+        times[: len(given)][given] = stamps
+    elif len(stamps) == len(files) > 0:
+        times[list(files)] = stamps
+    else:
+        raise InputError(
+            "timestamps do not cover the frames", where=str(path), got=f"{len(given)} lines, {len(files)} files",
+            expected=f"at least {last + 1} lines (line k = frame k), or one per file", remedy="is the file cut off?",
+        )  # fmt: skip
+    return times
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """The vehicle at the frames that have a pose."""
+
+    ego: EgoPath
+
+    @classmethod
+    def read(
+        cls,
+        folders: _Folders,
+        calibration: Kitti360Calibration,
+        clock: NDArray[np.float64],
+        options: ImportOptions,
+        notes: list[str],
+    ) -> _Motion:
+        here = folders.root / "data_poses" / folders.drive
+        found = [options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]
+        path = next((p for p in found if p is not None and p.is_file()), None)
+        if path is None:
+            raise InputError(
+                "no vehicle poses found", where=str(options.poses or here), expected="poses.txt or cam0_to_world.txt",
+                remedy="download the data set's vehicle poses",
+            )  # fmt: skip
+        notes.append(f"poses from {path.name}")
+        numbers, poses, before = [], [], -1
+        for index, line in enumerate(kitti_poses.read_lines(path)):
+            where = f"{path}: line {index + 1}"
+            row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
+            number = int(row[0])
+            if number != row[0] or number <= before:
+                raise InputError(
+                    "first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
+                    remedy="is the file of another kind?",
+                )  # fmt: skip
+            before = number
+            if number < len(clock) and np.isfinite(clock[number]):
+                pose = rigid_pose(row[1:].reshape(-1, 4), where)
+                numbers.append(number)
+                poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
+        if not poses:
+            raise InputError(
+                "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
+            )
+        times = clock[numbers]
+        if (np.diff(times) <= 0).any():
+            at = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
+            raise InputError("timestamps do not increase", where=f"{folders.root}: {folders.drive}, frame {at}")
+        return cls(EgoPath(times, np.stack(poses) @ IMU_FROM_EGO))
+
+    def known(self, time_s: float) -> bool:
+        """Whether there is a pose at a time, or it can be interpolated. NaN: no."""
+        times = self.ego.times_s
+        if not np.isfinite(time_s):
+            return False
+        after = int(np.searchsorted(times, time_s))
+        if after < len(times) and times[after] - time_s < 1e-9:
+            return True
+        if after in (0, len(times)):
+            return False
+        moved = self.ego.world_from_ego[after, :3, 3] - self.ego.world_from_ego[after - 1, :3, 3]
+        return bool(np.linalg.norm(moved) < MAX_GAP_M)
+
+    def at(self, time_s: float) -> Matrix:
+        """World-from-ego; a little beyond the ends the vehicle goes on as before (half a turn of the sensor needs it)."""
+        return pose_near(self.ego, time_s)
+
+    def level_at(self, time_s: float) -> Matrix:
+        """The scene's world from the data set's: origin and heading of the vehicle at a time, upright."""
+        pose = self.at(time_s)
+        return yaw_matrix(-yaw_of(pose)) @ from_rotation_translation(np.eye(3), -pose[:3, 3])
+
+    def moved(self, start_s: float, world_from_source: Matrix) -> _Motion:
+        """The same motion in another clock and world."""
+        return _Motion(EgoPath(self.ego.times_s - start_s, world_from_source @ self.ego.world_from_ego))
+
+    def path(self, times_s: NDArray[np.float64]) -> EgoPath:
+        """The vehicle at the imported frames."""
+        return EgoPath(times_s, np.stack([self.at(float(time)) for time in times_s]))
+
+
+def _untwisted(points: SweepPoints, motion: _Motion, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:
+    """A scan as seen at its frame's moment: a point at azimuth a was measured a / 2 pi turns before it."""
+    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+    dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
+    xyz = deskew(points.xyz, dt_s, lambda t: motion.at(t) @ calibration.ego_from_velo, time_s)
+    return SweepPoints(xyz, points.intensity, dt_s)
+
+
+# --- SICK lines -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sick:
+    """Line scans beside the frames: files, their times in the scene's clock, and where the scanner sits."""
+
+    files: Mapping[int, Path]
+    times_s: NDArray[np.float64]
+    ego_from_sick: Matrix
+    motion: _Motion
+
+    @classmethod
+    def find(
+        cls, folders: _Folders, calibration: Kitti360Calibration, motion: _Motion, start_s: float, notes: list[str]
+    ) -> _Sick | None:
+        files = numbered_files(folders.raw("sick_points") / "data", (".bin",))
+        stamps = folders.raw("sick_points") / "timestamps.txt"
+        if not files:
+            return None
+        if calibration.velo_from_sick is None or not stamps.is_file():
+            notes.append("SICK lines were left out: calib_sick_to_velo.txt or their timestamps.txt is missing")
+            return None
+        times = _stamps(stamps, files, max(files)) - start_s
+        return cls(files, times, calibration.ego_from_velo @ calibration.velo_from_sick, motion)
+
+    def sweep(self, time_s: float) -> tuple[Matrix, SweepPoints]:
+        """Pose of the scanner at a frame and the lines within half a frame of it, brought to that moment."""
+        pose = self.motion.at(time_s) @ self.ego_from_sick
+        parts, delays = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.float32)]
+        for number in np.flatnonzero(np.abs(self.times_s - time_s) < _SICK_REACH_S):
+            late = float(self.times_s[number] - time_s)
+            nearer = late >= FRAME_PERIOD_S / 2 or late < -FRAME_PERIOD_S / 2
+            if int(number) not in self.files or nearer:
+                continue
+            line = _read_line(self.files[int(number)])
+            moved = invert(pose) @ self.motion.at(time_s + late) @ self.ego_from_sick
+            parts.append(transform_points(moved, line))
+            delays.append(np.full(len(line), late, np.float32))
+        xyz = np.concatenate(parts)
+        return pose, SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays))
+
+
+def _read_line(path: Path) -> NDArray[np.float32]:
+    """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane; source: the data set's reader."""
+    pairs = read_float_rows(path, 2, "SICK line")
+    pairs = pairs[np.any(pairs != 0, axis=1)]
+    return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1)
+
+
+# --- labels and boxes -------------------------------------------------------------------------------------------------
+
+
+def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[str, NDArray[Any]]:
+    """Semantics and their confidence, where the data set has them."""
+    path = folders.semantics(camera, "semantic", number)
+    if not path.is_file():
+        return {}
+    ids = _grey(path)
+    if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
+        raise InputError(
+            "semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits"
+        )
+    table = np.full(256, UNLABELLED, np.uint8)
+    table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
+    labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
+    path = folders.semantics(camera, "confidence", number)
+    if path.is_file():
+        grey = _grey(path)
+        scale = np.float32(255 if grey.dtype == np.uint8 else 65535)
+        labels["semantics_confidence"] = fit.ids(grey.astype(np.float32) / scale)
+    return labels
+
+
+def _grey(path: Path) -> NDArray[Any]:
+    """A PNG of one channel, u8 or u16 [H, W]."""
+    try:
+        with Image.open(path, formats=("PNG",)) as image:
+            if image.mode not in ("L", "P", "I;16", "I"):
+                raise InputError(
+                    "label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits"
+                )
+            array = np.array(image)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
+        raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
+    return array if array.dtype == np.uint8 else array.astype(np.uint16)
+
+
+def _read_tracks(
+    folders: _Folders,
+    options: ImportOptions,
+    time_of: Mapping[int, float],
+    world_from_source: Matrix,
+    notes: list[str],
+) -> list[Track]:
+    """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn in."""
+    found = [folders.root / "data_3d_bboxes" / part / f"{folders.drive}.xml" for part in ("train_full", "train")]
+    path = options.boxes or next((p for p in found if p.is_file()), None)
+    if path is None:
+        notes.append("no boxes found: everything counts as static")
+        return []
+    notes.append(f"boxes from {path.parent.name}/{path.name}")
+    numbers = np.array(sorted(time_of))
+    tracks, left_out, outside = BoxTracks(str(path), WORDS), {}, 0
+    spans: dict[str, list[Any]] = {}
+    moving: dict[str, set[int]] = {}
+    for box in read_boxes(path, left_out):
+        pose = world_from_source @ box.world_from_box
+        if box.frame >= 0:
+            seen = moving.setdefault(box.object_id, set())
+            if box.frame in seen:  # the parts of a drive overlap; the data set's own reader keeps one box, too
+                left_out["that an object has twice in a frame"] = (
+                    left_out.get("that an object has twice in a frame", 0) + 1
+                )
+            elif box.frame in time_of:
+                seen.add(box.frame)
+                tracks.add(box.object_id, tracks.word(box.label), time_of[box.frame], box.size_m, pose)
+            else:
+                outside += 1
+            continue
+        inside = numbers[(numbers >= box.window[0]) & (numbers <= box.window[1])]
+        if not len(inside):
+            outside += 1
+            continue
+        span = spans.setdefault(box.object_id, [box, pose, int(inside[0]), int(inside[-1])])
+        span[2], span[3] = min(span[2], int(inside[0])), max(span[3], int(inside[-1]))
+    for name, (box, pose, first, last) in spans.items():
+        for number in dict.fromkeys((first, last)):
+            tracks.add(
+                f"s-{name}" if name in moving else name, tracks.word(box.label), time_of[number], box.size_m, pose, standing=True
+            )
+    if outside:
+        notes.append(f"{outside} boxes lie outside the imported frames and were left out")
+    notes += [f"{count} boxes {words} were left out" for words, count in left_out.items()]
+    result, track_notes = tracks.tracks()
+    notes += track_notes
+    return result

@@ -1,0 +1,380 @@
+"""nuPlan importer: one log (a ``.db`` file) with its sensor blobs, or one scene (up to 20 s) of it.
+
+================================================ ===========================================================================
+``<log>.db``                                     SQLite: poses at 100 Hz, calibration, images, clouds, tracked boxes
+``sensor_blobs/<log>/CAM_F0`` ...                eight cameras, JPEG, 10 Hz, distorted (k1 k2 p1 p2 k3)
+``sensor_blobs/<log>/MergedPointCloud/*.pcd``    points of five LiDARs in one cloud, 20 Hz
+================================================ ===========================================================================
+
+``sensor_blobs`` is looked for beside the database and up to four folders above it.
+
+Frames. World: z up, origin and x axis at the vehicle of the first imported cloud (the log's own world lies thousands of
+kilometres from its origin). Frame numbers (``--frames``) count the clouds of the log or scene. A moment is an image time of
+the cameras; all clouds in between are taken.
+
+Clouds are motion-compensated in the source; ``dt_s`` is 0. Image times are the start of a read-out of about 1/30 s; the
+middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offline tracker, at every cloud.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import from_rotation_translation, yaw_matrix, yaw_of
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, View
+from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.clouds import read_cloud
+from mudg.data.importers.common import for_each, seconds
+from mudg.data.importers.images import ImageFit, brown_conrady, fit_images
+from mudg.data.importers.layout import LogFiles, chosen_cameras, refuse_options
+from mudg.data.importers.nuplan.database import NuplanCamera, NuplanCloud, NuplanLog, open_log
+from mudg.data.importers.options import ImportOptions, holdout_split
+from mudg.data.scene import SceneWriter
+
+Matrix = NDArray[np.float64]
+LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
+CAMERAS: Final = {
+    "CAM_F0": "front", "CAM_L0": "front_left", "CAM_R0": "front_right", "CAM_L1": "side_left", "CAM_R1": "side_right",
+    "CAM_L2": "back_left", "CAM_R2": "back_right", "CAM_B0": "back",
+}  # fmt: skip
+SENSOR: Final = "merged"
+WORDS: Final = {
+    "vehicle": "vehicle", "bicycle": "bicycle", "pedestrian": "pedestrian", "traffic_cone": "traffic_cone",
+    "barrier": "barrier", "czone_sign": "sign", "generic_object": "generic_object",
+}  # fmt: skip
+IMAGE_DELAY_US: Final = 16_667
+"""From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it found this."""
+_MARGIN_US: Final = 100_000
+_REACH_US: Final = 60_000
+_PERIOD_US: Final = 100_000
+_SQLITE: Final = b"SQLite format 3\0"
+
+
+def looks_like_nuplan(source: Path) -> bool:
+    """Whether ``source`` is a log database, or a folder that holds some (also as ``splits/*`` or ``nuplan-v1.1/splits/*``)."""
+    if source.is_file():
+        return _is_database(source)
+    return source.is_dir() and any(_is_database(path) for path in _databases(source)[:1])
+
+
+def _is_database(path: Path) -> bool:
+    if path.suffix != ".db":
+        return False
+    with path.open("rb") as handle:
+        return handle.read(len(_SQLITE)) == _SQLITE
+
+
+def _databases(folder: Path) -> list[Path]:
+    patterns = ("*.db", "splits/*/*.db", "nuplan-v1.1/splits/*/*.db")
+    return sorted(path for pattern in patterns for path in folder.glob(pattern))
+
+
+def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one nuPlan log, or one scene of it, into the scene directory ``out``; see the module text.
+
+    Args:
+        source: the log's ``.db`` file, or a folder of such files.
+        out: destination.
+        options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``. ``cameras``
+            default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused; all others are used.
+
+    Raises:
+        UsageError: there are several logs and none was chosen, or an option does not apply.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
+    refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
+    path, scene = _find(source, options)
+    with open_log(path) as opened:
+        plan = _Plan.make(opened, scene, options)
+        return _write(opened, plan, out, options)
+
+
+def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
+    """The database, and the name of a scene or an empty text."""
+    if source.is_file():
+        log_name, _, scene = options.sequence.rpartition("/")
+        if log_name and log_name != source.stem:
+            raise UsageError("the file is another log", where=str(source), expected=source.stem, got=log_name)
+        return source, "" if scene == source.stem else scene
+    if not source.is_dir():
+        raise InputError("nuPlan log does not exist", where=str(source), expected="a .db file or a folder of them")
+    databases = {path.stem: path for path in _databases(source)}
+    if not databases:
+        raise InputError(
+            "no nuPlan log found", where=str(source), expected="*.db here or in splits/*",
+            got=", ".join(sorted(entry.name for entry in source.iterdir())[:12]) or "an empty folder",
+        )  # fmt: skip
+    log_name, _, scene = options.sequence.partition("/")
+    if log_name in databases:
+        return databases[log_name], scene
+    if len(databases) == 1 and not scene:
+        return next(iter(databases.values())), log_name
+    raise UsageError(
+        "the folder holds several logs" if not log_name else "there is no such log", where=str(source),
+        expected="--sequence with one of " + ", ".join(list(databases)[:8]), got=log_name or "none chosen",
+    )  # fmt: skip
+
+
+def files_of_nuplan(source: Path, options: ImportOptions) -> LogFiles:
+    """The log's database, and which sensor blobs there are."""
+    path, _ = _find(source, options)
+    found = (folder / "sensor_blobs" / path.stem for folder in path.resolve().parents[:5])
+    blobs = next((folder for folder in found if folder.is_dir()), None)
+    return LogFiles((path,), tuple(sorted(blobs.iterdir())) if blobs is not None else ())
+
+
+def _blobs(path: Path, name: str) -> Path:
+    """The folder ``sensor_blobs`` that holds this log."""
+    for folder in path.resolve().parents[:5]:
+        if (folder / "sensor_blobs" / name).is_dir():
+            return folder / "sensor_blobs"
+    raise InputError(
+        "sensor blobs of the log were not found", where=str(path),
+        expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
+        remedy="download the camera and LiDAR blobs of this log; the database alone holds no images",
+    )  # fmt: skip
+
+
+# --- what is imported -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """One image: camera's channel, file, time (us)."""
+
+    channel: str
+    file: Path
+    time_us: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plan:
+    """Files, times and poses of an import, before anything large is read.
+
+    Args:
+        name: the scene's id.
+        cameras: channel -> camera, the chosen ones.
+        clouds: in order of time.
+        files: cloud token -> file.
+        moments: images of one moment, in order of time.
+        ego_us, world_from_ego: the vehicle over the whole span, in the log's world.
+    """
+
+    name: str
+    cameras: Mapping[str, NuplanCamera]
+    clouds: Sequence[NuplanCloud]
+    files: Mapping[bytes, Path]
+    moments: Sequence[Sequence[_Shot]]
+    ego_us: NDArray[np.int64]
+    world_from_ego: Matrix
+    notes: tuple[str, ...]
+
+    @classmethod
+    def make(cls, opened: NuplanLog, scene: str, options: ImportOptions) -> _Plan:
+        name = opened.name()
+        blobs = _blobs(opened.path, name)
+        if scene and scene not in opened.scenes():
+            raise UsageError(
+                "the log has no such scene", where=str(opened.path), got=scene,
+                expected=", ".join(opened.scenes()[:12]) or "no scenes",
+            )  # fmt: skip
+        every = list(opened.clouds(scene))
+        first, end = options.frames or (0, len(every))
+        chosen = every[first:end]
+        if not chosen:
+            raise InputError("no clouds to import", where=str(opened.path), expected=f"frames 0 to {len(every)}",
+                             got=f"{first}:{end}")  # fmt: skip
+        seconds(np.array([time_us for _, time_us in chosen]), "us", f"{opened.path}: lidar_pc.timestamp", chosen[0][1])
+        lidars = opened.lidars()
+        clouds = [opened.cloud(token, lidars) for token, _ in chosen]
+        lacking = [cloud for cloud in clouds if not (blobs / cloud.file).is_file()]
+        if lacking and not options.skip_missing:
+            _refuse_missing("point cloud", blobs / lacking[0].file, len(lacking), len(clouds))
+        clouds = [cloud for cloud in clouds if (blobs / cloud.file).is_file()] if lacking else clouds
+        notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
+        if lacking:
+            notes.append(f"{len(lacking)} clouds whose files are missing were left out")
+        by_token = opened.cameras()
+        folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
+        available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}
+        names = chosen_cameras(available, options, f"{opened.path}: camera", tuple(CAMERAS))
+        span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
+        shots = [
+            _Shot(by_token[token].channel, blobs / file, time_us)
+            for token, file, time_us in opened.images(*span)
+            if token in by_token and by_token[token].channel in names
+        ]
+        moments, moment_notes = _moments(shots, names, options, str(opened.path))
+        ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
+        cameras = {camera.channel: camera for camera in by_token.values() if camera.channel in names}
+        ordered = {channel: cameras[channel] for channel in names}
+        return cls(
+            f"{name}_{scene}" if scene else name, ordered, clouds, {c.token: blobs / c.file for c in clouds}, moments,
+            ego_us, poses, (*notes, *moment_notes),
+        )  # fmt: skip
+
+
+def _refuse_missing(what: str, path: Path, count: int, total: int) -> None:
+    raise InputError(
+        f"file of a {what} is missing", where=str(path), got=f"{count} of {total} are missing",
+        remedy="download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing",
+    )  # fmt: skip
+
+
+def _moments(
+    shots: Sequence[_Shot], names: Sequence[str], options: ImportOptions, where: str
+) -> tuple[list[list[_Shot]], list[str]]:
+    """The images of each moment at which all cameras fired, and notes; see ``_by_moment``."""
+    groups = _by_moment(shots, names)
+    lacking = [shot for group in groups for shot in group if not shot.file.is_file()]
+    if lacking and not options.skip_missing:
+        _refuse_missing("camera image", lacking[0].file, len(lacking), len(shots))
+    whole = [g for g in groups if {s.channel for s in g} == set(names) and all(s.file.is_file() for s in g)]
+    cut = len(groups) - len(whole)
+    inner = [g for g in groups[1:-1] if {s.channel for s in g} != set(names)]
+    if inner and not options.skip_missing:
+        absent = sorted(set(names) - {shot.channel for shot in inner[0]})
+        raise InputError(
+            "a moment lacks images of some cameras", where=f"{where}: image at {inner[0][0].time_us}",
+            got=f"no {', '.join(absent)}; {len(inner)} such moments", expected="every chosen camera",
+            remedy="choose cameras with --cameras, or add --skip-missing",
+        )  # fmt: skip
+    if not whole:
+        raise InputError(
+            "no moment has images of all cameras", where=where, got=f"{len(shots)} images", expected=", ".join(names),
+            remedy="choose cameras with --cameras, or other frames with --frames",
+        )  # fmt: skip
+    return whole, [f"{cut} moments without images of all cameras were left out"] if cut else []
+
+
+def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]]:
+    """Images put together by time, in order of time.
+
+    Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the camera
+    that has most of them, after its own camera's median delay is taken off. What lies half a period from all is alone.
+    """
+    by_camera = {name: [shot for shot in shots if shot.channel == name] for name in names}
+    leading = max(by_camera.values(), key=len)
+    if not leading:
+        return []
+    beats = np.array([shot.time_us for shot in leading])
+    half_us = float(np.median(np.diff(beats))) / 2 if len(beats) > 1 else _PERIOD_US / 2
+    groups: dict[int, list[_Shot]] = {index: [] for index in range(len(beats))}
+    alone = []
+    for found in by_camera.values():
+        times = np.array([shot.time_us for shot in found], np.int64)
+        late = times - beats[_nearest(beats, times)]
+        usual = float(np.median(late[np.abs(late) <= half_us])) if (np.abs(late) <= half_us).any() else 0.0
+        for shot, index in zip(found, _nearest(beats, times - usual), strict=True):
+            taken = any(other.channel == shot.channel for other in groups[int(index)])
+            if taken or abs(shot.time_us - usual - beats[index]) >= half_us:
+                alone.append([shot])
+            else:
+                groups[int(index)].append(shot)
+    return sorted([*groups.values(), *alone], key=lambda group: min(shot.time_us for shot in group))
+
+
+def _nearest(beats: NDArray[np.int64], times: NDArray[Any]) -> NDArray[np.intp]:
+    """Index of the nearest of growing ``beats`` for each time."""
+    after = np.searchsorted(beats, times).clip(1, len(beats) - 1) if len(beats) > 1 else np.zeros(len(times), int)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(times - beats[before]) <= np.abs(times - beats[after]), before, after)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def _write(opened: NuplanLog, plan: _Plan, out: Path, options: ImportOptions) -> Scene:
+    start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
+    ego = _ego_path(plan, start_us, str(opened.path))
+    first = ego.pose_at(0.0)
+    if first is None:
+        raise InputError(
+            "vehicle poses do not cover the log", where=f"{opened.path}: ego_pose", expected=f"a pose at {start_us} us",
+            got=f"{len(plan.ego_us)} poses near it", remedy="are pose and cloud times both in microseconds?",
+        )  # fmt: skip
+    world_from_source = yaw_matrix(-yaw_of(first)) @ from_rotation_translation(np.eye(3), -first[:3, 3])
+    ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
+    fits = {channel: _fit(camera, options) for channel, camera in plan.cameras.items()}
+    notes = [*plan.notes, *(fit.words for fit in fits.values() if fit.words)]
+    notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
+    tracks = BoxTracks(f"{opened.path}: lidar_box", WORDS)
+    time_of = {cloud.token: (cloud.time_us - start_us) / 1e6 for cloud in plan.clouds}
+    span = (plan.clouds[0].time_us, plan.clouds[-1].time_us) if plan.clouds else (0, -1)
+    for token, track, label, (x, y, z, yaw, *size) in opened.boxes(*span):
+        if token in time_of:
+            pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
+            tracks.add(track, tracks.word(label), time_of[token], (size[0], size[1], size[2]), pose)
+    found, track_notes = tracks.tracks()
+    notes += track_notes
+    for note in notes:
+        log.info(f"nuplan: {note}")
+
+    def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> None:
+        index, what = item
+        if isinstance(what, NuplanCloud):
+            time_s = (what.time_us - start_us) / 1e6
+            pose = world_from_source @ what.world_from_lidar
+            writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, time_s, pose, _read_points(plan.files[what.token]))
+            return
+        for shot in what:
+            time_s = (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
+            world_from_ego = ego.pose_at(time_s)
+            if world_from_ego is None:
+                raise InputError("vehicle poses do not cover an image", where=str(shot.file), got=f"{time_s:.3f} s")
+            fit = fits[shot.channel]
+            view = View(fit.camera, world_from_ego @ plan.cameras[shot.channel].ego_from_cam, time_s)
+            writer.add_frame(f"{CAMERAS[shot.channel]}/{index:06d}", view, fit.image(shot.file, str(shot.file)))
+
+    items = [*enumerate(plan.clouds), *enumerate(plan.moments)]
+    with SceneWriter(out, plan.name, Source("nuplan", LICENCE, None, tuple(notes))) as writer:
+        for fit in fits.values():
+            writer.add_camera(fit.camera)
+        for_each(items, convert, title="importing nuPlan", workers=options.workers, name=_name)
+        for track in found:
+            writer.add_track(track)
+        writer.set_ego(ego)
+        moments = [
+            [f"{CAMERAS[shot.channel]}/{index:06d}" for shot in group] for index, group in enumerate(plan.moments)
+        ]
+        writer.set_split(holdout_split(moments, options.test_every))
+        return writer.finish()
+
+
+def _name(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> str:
+    return f"cloud {item[0]}" if isinstance(item[1], NuplanCloud) else f"moment {item[0]}"
+
+
+def _ego_path(plan: _Plan, start_us: int, where: str) -> EgoPath:
+    """The vehicle in the log's world and the scene's clock."""
+    if not len(plan.ego_us):
+        raise InputError(
+            "no vehicle poses at the time of the clouds", where=f"{where}: ego_pose.timestamp",
+            expected="microseconds, as lidar_pc.timestamp", remedy="are the two in different units?",
+        )  # fmt: skip
+    return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
+
+
+def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
+    fx, fy, cx, cy = camera.intrinsics
+    lens = brown_conrady(*camera.distortion) if any(camera.distortion) else None
+    # the calibration counts pixels from the centre of the top-left one, as OpenCV does
+    recorded = Camera(CAMERAS[camera.channel], *camera.size, fx, fy, cx + 0.5, cy + 0.5, camera.distortion)
+    return fit_images(recorded, options, lens)
+
+
+def _read_points(path: Path) -> SweepPoints:
+    cloud = read_cloud(path)
+    if not len(cloud.xyz):
+        log.warn(f"nuplan: {path} has no points")
+    intensity = cloud.fields.get("intensity")
+    grey = np.zeros(len(cloud.xyz)) if intensity is None else np.clip(intensity.astype(np.float64) / 255, 0, 1)
+    return SweepPoints(cloud.xyz.astype(np.float32), grey.astype(np.float32), np.zeros(len(cloud.xyz), np.float32))

@@ -1,0 +1,492 @@
+"""PandaSet importer: one sequence folder (``001``, ``002``, ...) of 80 frames at 10 Hz.
+
+========================================= ================================================================================
+``camera/<name>/NN.jpg``                   six cameras, rectified; ``intrinsics.json``, ``poses.json``, ``timestamps.json``
+``lidar/NN.pkl.gz``                        points of both LiDARs in the world: x y z, i (0..255), t (s), d (which LiDAR)
+``lidar/poses.json``, ``timestamps.json``  pose of the vehicle (x right, y forward, z up), not of a LiDAR
+``annotations/cuboids/NN.pkl.gz``          boxes in the world
+========================================= ================================================================================
+
+The tables are pickled pandas frames. They are read by ``pandas_frame``, which runs nothing of them and needs no pandas.
+
+Frames. World: z up, origin and x axis at the vehicle of the first frame. The given points are motion-compensated: each lies
+where it was at its own time ``t``; ``dt_s`` keeps that time. The two LiDARs become two sensors, ``pandar64`` (d = 0) and
+``pandar_gt`` (d = 1, solid state, looks forward). Their places on the vehicle follow from the front camera's recorded
+poses and the published static calibration.
+
+Boxes. ``yaw`` 0 looks along the world's y axis, and ``dimensions.y`` is the length. Moving objects where both LiDARs look
+carry two boxes that name each other as siblings; they are one track here, and in a frame with both the turning LiDAR's box is
+kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s apart: 1 m at 20 m/s);
+it is moved to the frame's time with its track's velocity.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, View
+from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.common import for_each, pose_from_quaternion, seconds
+from mudg.data.importers.images import ImageFit, fit_images
+from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, refuse_options, whole_frames
+from mudg.data.importers.options import ImportOptions, holdout_split
+from mudg.data.importers.pandaset.pandas_frame import read_frame
+from mudg.data.scene import SceneWriter, decode_image
+
+Matrix = NDArray[np.float64]
+LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
+CAMERAS: Final = {
+    "front_camera": "front",
+    "front_left_camera": "front_left",
+    "front_right_camera": "front_right",
+    "left_camera": "left",
+    "right_camera": "right",
+    "back_camera": "back",
+}
+SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
+OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
+"""Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
+WORDS: Final = {
+    "Car": "car", "Pickup Truck": "car", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Towed Object": "trailer",
+    "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Bicycle": "bicycle", "Bus": "bus", "Train": "train",
+    "Trolley": "tram", "Tram / Subway": "tram", "Emergency Vehicle": "vehicle", "Pedestrian": "pedestrian",
+    "Pedestrian with Object": "pedestrian", "Personal Mobility Device": "personal_mobility_device",
+    "Other Vehicle - Construction Vehicle": "vehicle", "Other Vehicle - Uncommon": "vehicle",
+    "Other Vehicle - Pedicab": "pedicab", "Animals - Bird": "animal", "Animals - Other": "animal", "Pylons": "pylon",
+    "Road Barriers": "barrier", "Cones": "traffic_cone", "Signs": "sign", "Construction Signs": "sign",
+    "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
+}  # fmt: skip
+"""The data set's classes -> words of the product; pickup trucks count as cars, as in Cityscapes."""
+FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
+"""Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
+MAX_POINT_DELAY_S: Final = 0.25
+MAX_CAMERA_DELAY_S: Final = 1.0
+_MIN_BOX_POINTS: Final = 5
+_POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
+_CUBOID_COLUMNS: Final = (
+    "uuid", "label", "yaw", "stationary", "position.x", "position.y", "position.z",
+    "dimensions.x", "dimensions.y", "dimensions.z",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Cuboid:
+    """One row of a cuboid table; ``sibling`` is empty where there is none."""
+
+    uuid: str
+    label: str
+    time_s: float
+    late_s: float
+    size_m: tuple[float, float, float]
+    world_from_box: Matrix
+    standing: bool
+    sensor: int
+    sibling: str
+
+
+def looks_like_pandaset(source: Path) -> bool:
+    """Whether ``source`` is a sequence of PandaSet, or a folder of such sequences."""
+    if not source.is_dir():
+        return False
+    return _is_sequence(source) or bool(_sequences(source))
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / "lidar" / "poses.json").is_file() and any((folder / "camera" / name).is_dir() for name in CAMERAS)
+
+
+def _sequences(source: Path) -> list[str]:
+    return sorted(f.name for f in source.iterdir() if f.name.isdigit() and f.is_dir() and _is_sequence(f))
+
+
+def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one PandaSet sequence into the scene directory ``out``; see the module text for what is understood.
+
+    Args:
+        source: a sequence's folder, or the folder of sequences with ``options.sequence``.
+        out: destination.
+        options: ``frames``, ``cameras`` (default all six), ``sequence``, ``skip_missing``, ``test_every``, ``resolution`` and
+            ``workers`` are used; ``poses``, ``boxes`` and ``untwist`` are refused.
+
+    Raises:
+        UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
+    refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
+    folder = _chosen_sequence(source, options)
+    cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}
+    chosen = chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
+    images = {name: numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
+    clouds = numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
+    frames = whole_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
+    log_ = _Log.read(folder, frames, chosen)
+    fits = {name: _fit(folder / "camera" / name, cameras[name], images[name][frames[0]], options) for name in chosen}
+    cuboids = numbered_files(folder / "annotations" / "cuboids", (".pkl.gz", ".pkl"))
+    notes = [f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here"]
+    notes += [fit.words for fit in fits.values() if fit.words]
+    if "front_camera" not in log_.world_from_cam:
+        notes.append("front camera's poses are missing: the LiDARs' places are those of sequence 002")
+    if not cuboids:
+        notes.append("no boxes found: everything counts as static")
+    elif any(n not in cuboids for n in frames) and not options.skip_missing:
+        lacks = next(n for n in frames if n not in cuboids)
+        raise InputError(
+            "a frame has no boxes", where=str(folder / "annotations" / "cuboids"), expected=f"{lacks:02d}.pkl.gz",
+            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
+        )  # fmt: skip
+    boxes: dict[int, list[_Cuboid]] = {}
+    lock = threading.Lock()
+
+    def convert(index: int) -> None:
+        number = frames[index]
+        for name in chosen:
+            view = View(fits[name].camera, log_.world_from_cam[name][index], float(log_.camera_s[name][index]))
+            path = images[name][number]
+            writer.add_frame(f"{cameras[name]}/{index:06d}", view, fits[name].image(path, str(path)))
+        points = _read_points(clouds[number], log_.raw_s[index])
+        for d, sensor in SENSORS.items():
+            mine = points["d"] == d
+            if d == 0 or mine.any():
+                pose = log_.world_from_lidar[d][index]
+                sweep = _sweep_points(points, mine, invert(pose) @ log_.world_from_source)
+                writer.add_sweep(f"{sensor}/{index:06d}", sensor, float(log_.ego.times_s[index]), pose, sweep)
+        if number in cuboids:
+            rows = _read_cuboids(cuboids[number], points, log_, index)
+            with lock:
+                boxes[index] = rows
+
+    with SceneWriter(out, folder.resolve().name, Source("pandaset", LICENCE, None, ())) as writer:
+        for fit in fits.values():
+            writer.add_camera(fit.camera)
+        for_each(
+            range(len(frames)), convert, title="importing PandaSet", workers=options.workers,
+            name=lambda index: f"frame {frames[index]}",
+        )  # fmt: skip
+        tracks = BoxTracks(str(folder / "annotations" / "cuboids"), WORDS)
+        notes += _add_boxes(tracks, boxes)
+        found, track_notes = tracks.tracks()
+        for track in found:
+            writer.add_track(track)
+        notes += track_notes
+        for note in notes:
+            log.info(f"pandaset: {note}")
+        writer.set_ego(log_.ego)
+        moments = [[f"{cameras[name]}/{index:06d}" for name in chosen] for index in range(len(frames))]
+        writer.set_split(holdout_split(moments, options.test_every))
+        writer.add_notes(notes)
+        return writer.finish()
+
+
+def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
+    if not source.is_dir():
+        raise InputError("PandaSet folder does not exist", where=str(source), expected="a folder")
+    if options.sequence:
+        folder = source / options.sequence
+        if not options.sequence.isdigit() or not _is_sequence(folder):
+            raise UsageError(
+                "there is no such sequence", where=str(source), got=options.sequence,
+                expected=", ".join(_sequences(source)[:12]) or "a folder of sequences 001, 002, ...",
+            )  # fmt: skip
+        return folder
+    if _is_sequence(source):
+        return source
+    sequences = _sequences(source)
+    if sequences:
+        raise UsageError(
+            "the folder holds several sequences", where=str(source), got="none chosen",
+            expected="--sequence with one of " + ", ".join(sequences[:12]),
+        )  # fmt: skip
+    inside = sorted(path.name for path in source.iterdir())[:12]
+    raise InputError(
+        "no PandaSet sequence found", where=str(source), got=", ".join(inside) or "an empty folder",
+        expected="lidar/poses.json and camera/front_camera and so on",
+    )  # fmt: skip
+
+
+def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen sequence's folder."""
+    return LogFiles((_chosen_sequence(source, options),))
+
+
+# --- poses and times ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Log:
+    """Times and poses of the chosen frames, in the scene's world and clock.
+
+    Args:
+        world_from_source: the scene's world from the data set's, f64[4, 4].
+        raw_s: the data set's time of each frame's cloud.
+        camera_s: camera -> seconds of the scene's clock, f64[n].
+        world_from_cam: camera -> f64[n, 4, 4].
+        world_from_lidar: 0 and 1 (``d``) -> f64[n, 4, 4].
+        ego: the vehicle, x forward, y left, z up, at the clouds' times.
+    """
+
+    world_from_source: Matrix
+    raw_s: NDArray[np.float64]
+    camera_s: Mapping[str, NDArray[np.float64]]
+    world_from_cam: Mapping[str, Matrix]
+    world_from_lidar: Mapping[int, Matrix]
+    ego: EgoPath
+
+    @classmethod
+    def read(cls, folder: Path, frames: Sequence[int], cameras: Sequence[str]) -> _Log:
+        raw_s = _times(folder / "lidar" / "timestamps.json", frames)
+        start_s = float(raw_s[0])
+        forward = _poses(folder / "lidar" / "poses.json", frames) @ yaw_matrix(np.pi / 2)
+        first = forward[0]
+        world_from_source = yaw_matrix(-yaw_of(first)) @ from_rotation_translation(np.eye(3), -first[:3, 3])
+        ego = EgoPath(
+            seconds(raw_s, "s", str(folder / "lidar" / "timestamps.json"), start_s), world_from_source @ forward
+        )
+        needed = dict.fromkeys((*cameras, "front_camera"))
+        camera_s, world_from_cam = {}, {}
+        for name in needed:
+            here = folder / "camera" / name
+            if name not in cameras and not (here / "poses.json").is_file():
+                continue
+            path = here / "timestamps.json"
+            times = _times(path, frames)
+            late = np.abs(times - raw_s)
+            if late.max() > MAX_CAMERA_DELAY_S:
+                raise InputError(
+                    "camera and LiDAR do not share a clock", where=f"{path}: entry {frames[int(late.argmax())]}",
+                    expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json", got=f"{late.max():.3f} s apart",
+                    remedy="are the times in seconds, and of this sequence?",
+                )  # fmt: skip
+            camera_s[name] = seconds(times, "s", str(path), start_s)
+            world_from_cam[name] = world_from_source @ _poses(here / "poses.json", frames)
+        places = _lidar_places(ego, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
+        world_from_lidar = {
+            d: ego.world_from_ego @ from_rotation_translation(np.eye(3), place) for d, place in places.items()
+        }
+        return cls(world_from_source, raw_s, camera_s, world_from_cam, world_from_lidar, ego)
+
+
+def _lidar_places(
+    ego: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None
+) -> dict[int, Matrix]:
+    """Where the LiDARs sit on the vehicle: median place of the front camera, plus the static calibration."""
+    camera = np.array(FRONT_CAMERA_M)
+    if times_s is not None and world_from_cam is not None:
+        seen = []
+        for time_s, pose in zip(times_s, world_from_cam, strict=True):
+            world_from_ego = ego.pose_at(float(np.clip(time_s, ego.times_s[0], ego.times_s[-1])))
+            if world_from_ego is not None:
+                seen.append(transform_points(invert(world_from_ego), pose[None, :3, 3])[0])
+        camera = np.median(seen, axis=0)
+    return {d: camera + np.array(offset) for d, offset in OFFSET_FROM_FRONT_CAMERA_M.items()}
+
+
+def _entries(path: Path, frames: Sequence[int]) -> list[Any]:
+    """The entries of a JSON list that belong to ``frames``."""
+    values = store.read_json(path)
+    if not isinstance(values, list) or len(values) <= frames[-1]:
+        got = f"{len(values)} entries" if isinstance(values, list) else type(values).__name__
+        raise InputError(
+            "list does not cover the frames", where=str(path), got=got,
+            expected=f"a list with an entry per frame, at least {frames[-1] + 1}",
+            remedy="is the file cut off, or of another sequence?",
+        )  # fmt: skip
+    return [values[n] for n in frames]
+
+
+def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
+    values = _entries(path, frames)
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        raise InputError("timestamps are not numbers", where=str(path), got=str(values)[:80])
+    times = np.array(values, np.float64)
+    seconds(times, "s", str(path))
+    if times[0] > 1e11:
+        raise InputError(
+            "timestamps are in another unit than expected", where=str(path), expected="seconds of the epoch",
+            got=f"{times[0]:.6g}", remedy="divide them by 1000 or 1000000",
+        )  # fmt: skip
+    return times
+
+
+def _poses(path: Path, frames: Sequence[int]) -> Matrix:
+    poses = []
+    for number, entry in zip(frames, _entries(path, frames), strict=True):
+        where = f"{path}: entry {number}"
+        try:
+            heading = [entry["heading"][key] for key in "wxyz"]
+            position = [entry["position"][key] for key in "xyz"]
+            poses.append(pose_from_quaternion(heading, position, where))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                "pose is incomplete", where=where, got=repr(error)[:80],
+                expected="position x y z (metres) and heading w x y z (quaternion)",
+            ) from error  # fmt: skip
+    return np.stack(poses)
+
+
+def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageFit:
+    path = folder / "intrinsics.json"
+    values = store.read_json(path)
+    try:
+        fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            "intrinsics are incomplete", where=str(path), got=repr(error), expected="fx fy cx cy"
+        ) from error
+    height, width = decode_image(store.read_bytes(image), str(image)).shape[:2]
+    # the data set counts pixels from the centre of the top-left one, as OpenCV does
+    return fit_images(Camera(name, width, height, fx, fy, cx + 0.5, cy + 0.5), options)
+
+
+# --- points -----------------------------------------------------------------------------------------------------------
+
+
+def _columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    frame = read_frame(path)
+    missing = [name for name in names if name not in frame]
+    if missing:
+        raise InputError(
+            "table lacks columns", where=str(path), expected=", ".join(names), got=", ".join(frame) or "no columns",
+            remedy="is it the file of another kind of annotation?",
+        )  # fmt: skip
+    return frame
+
+
+def _numbers(frame: Mapping[str, NDArray[Any]], name: str, path: Path) -> NDArray[np.float64]:
+    try:
+        values = frame[name].astype(np.float64)
+    except (ValueError, TypeError) as error:
+        raise InputError("column is not of numbers", where=f"{path}: {name}", got=str(error)[:80]) from error
+    if not np.isfinite(values).all():
+        at = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise InputError("column holds a value that is not finite", where=f"{path}: {name}, row {at}")
+    return values
+
+
+def _read_points(path: Path, frame_s: float) -> dict[str, NDArray[np.float64]]:
+    """Columns of one cloud: ``xyz`` f64[N, 3] in the data set's world, ``i`` 0..1, ``dt`` seconds, ``d`` 0 or 1."""
+    frame = _columns(path, _POINT_COLUMNS)
+    if not len(frame["x"]):
+        log.warn(f"pandaset: {path} has no points")
+    columns = {name: _numbers(frame, name, path) for name in _POINT_COLUMNS}
+    dt_s = columns["t"] - frame_s
+    if len(dt_s) and np.abs(dt_s).max() > MAX_POINT_DELAY_S:
+        raise InputError(
+            "points do not belong to their frame's time", where=f"{path}: t",
+            expected=f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})",
+            got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}", remedy="is the file of another frame or sequence?",
+        )  # fmt: skip
+    if not np.isin(columns["d"], list(SENSORS)).all():
+        raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
+    xyz = np.stack([columns[axis] for axis in "xyz"], 1)
+    return {"xyz": xyz, "i": (columns["i"] / 255).clip(0, 1), "dt": dt_s, "d": columns["d"]}
+
+
+def _sweep_points(
+    points: Mapping[str, NDArray[np.float64]], mine: NDArray[np.bool_], lidar_from_source: Matrix
+) -> SweepPoints:
+    xyz = transform_points(lidar_from_source, points["xyz"][mine]).astype(np.float32)
+    return SweepPoints(xyz, points["i"][mine].astype(np.float32), points["dt"][mine].astype(np.float32))
+
+
+# --- boxes ------------------------------------------------------------------------------------------------------------
+
+
+def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], log_: _Log, index: int) -> list[_Cuboid]:
+    frame = _columns(path, _CUBOID_COLUMNS)
+    centre = np.stack([_numbers(frame, f"position.{axis}", path) for axis in "xyz"], 1)
+    width, length, height = (_numbers(frame, f"dimensions.{axis}", path) for axis in "xyz")
+    yaw = _numbers(frame, "yaw", path)
+    count = len(yaw)
+    sensor = np.full(count, -1.0)
+    if "cuboids.sensor_id" in frame:
+        given = {"id": np.where(_missing(frame["cuboids.sensor_id"]), -1, frame["cuboids.sensor_id"])}
+        sensor = _numbers(given, "id", path)
+    siblings = frame.get("cuboids.sibling_id", np.full(count, "", object))
+    when = _BoxTimes(points, log_, index)
+    rows = []
+    for row in range(count):
+        box = yaw_matrix(yaw[row] + np.pi / 2, centre[row])
+        size = (float(length[row]), float(width[row]), float(height[row]))
+        standing = bool(frame["stationary"][row])
+        late_s = 0.0 if standing else when.delay_s(box, size, int(sensor[row]))
+        sibling = siblings[row] if isinstance(siblings[row], str) and len(siblings[row]) > 1 else ""
+        rows.append(
+            _Cuboid(
+                str(frame["uuid"][row]),
+                str(frame["label"][row]),
+                float(log_.ego.times_s[index]),
+                late_s,
+                size,
+                log_.world_from_source @ box,
+                standing,
+                int(sensor[row]),
+                sibling,
+            )  # fmt: skip
+        )
+    return rows
+
+
+def _missing(column: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a column has no value: None or NaN."""
+    return np.array([value is None or value != value for value in column], bool)
+
+
+class _BoxTimes:
+    """When the boxes of one frame were measured."""
+
+    def __init__(self, points: Mapping[str, NDArray[np.float64]], log_: _Log, index: int) -> None:
+        self._points = points
+        self._source_from_lidar = invert(log_.world_from_source) @ log_.world_from_lidar[0][index]
+        self._turning: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
+
+    def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
+        """Seconds from the frame's time: the median of the points inside; with few of them, of the points in that direction."""
+        xyz, dt_s, d = self._points["xyz"], self._points["dt"], self._points["d"]
+        centre, reach = source_from_box[:3, 3], float(np.linalg.norm(size_m)) / 2
+        near = np.flatnonzero((np.abs(xyz[:, :2] - centre[:2]) < reach).all(1) & (d == max(sensor, 0)))
+        inside = np.abs(transform_points(invert(source_from_box), xyz[near])) < np.array(size_m) / 2
+        near = near[inside.all(1)]
+        if len(near) < _MIN_BOX_POINTS:
+            near = self._towards(centre)
+        return float(np.median(dt_s[near])) if len(near) else 0.0
+
+    def _towards(self, centre: Matrix) -> NDArray[np.intp]:
+        """Points of the turning LiDAR within a degree of the direction to ``centre``."""
+        place = self._source_from_lidar[:3, 3]
+        if self._turning is None:
+            ids = np.flatnonzero(self._points["d"] == 0)
+            seen = self._points["xyz"][ids, :2] - place[:2]
+            self._turning = ids, np.arctan2(seen[:, 1], seen[:, 0])
+        ids, azimuth = self._turning
+        turn = azimuth - np.arctan2(centre[1] - place[1], centre[0] - place[0])
+        return ids[np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.deg2rad(1.0)]
+
+
+def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> list[str]:
+    """Give the boxes to their tracks, siblings to one; returns notes."""
+    one_of: dict[str, str] = {}
+    for index in sorted(boxes):
+        for box in boxes[index]:
+            if box.sibling and box.sensor in (0, 1):
+                turning, solid = (box.uuid, box.sibling) if box.sensor == 0 else (box.sibling, box.uuid)
+                one_of.setdefault(solid, turning)
+    doubled = 0
+    for index in sorted(boxes):
+        kept: dict[str, _Cuboid] = {}
+        for box in sorted(boxes[index], key=lambda b: b.sensor == 1):
+            name = one_of.get(box.uuid, box.uuid)
+            doubled += name in kept
+            kept.setdefault(name, box)
+        for name, box in kept.items():
+            tracks.add(name, tracks.word(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s)
+    return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []

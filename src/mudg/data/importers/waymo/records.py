@@ -1,0 +1,267 @@
+"""What a Waymo log holds, whichever form it comes in: calibrations, one record of facts per frame, and the bulky parts on demand.
+
+Poses and transforms are f64[4, 4]. ``global`` is the data set's own world, which may lie tens of kilometres from the car. The
+data set's camera frame is x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base.errors import InputError
+from mudg.data.importers.common import rigid_pose
+from mudg.data.importers.waymo.proto import MATRIX_FLOAT, MATRIX_INT, Message, parse_message
+
+Matrix = NDArray[np.float64]
+
+CAMERAS: Final[Mapping[int, str]] = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
+LASERS: Final[Mapping[int, str]] = {1: "top", 2: "front", 3: "side_left", 4: "side_right", 5: "rear"}
+LABELS: Final[Mapping[int, str]] = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
+"""Numbers of the data set -> names. Whatever has another number is left out (sensors) or called ``unknown`` (boxes)."""
+
+TOP: Final = "top"
+VELOCITY: Final = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
+MAX_UNPACKED_BYTES: Final = 128 * 1024 * 1024
+"""A range image of the top LiDAR has 3 MB; what unpacks to more than this is refused."""
+
+MAX_CLOCK_GAP_S: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """A camera: ``intrinsic`` is f_u, f_v, c_u, c_v (pixels, the image's left edge is 0), k1, k2, p1, p2, k3."""
+
+    name: str
+    intrinsic: tuple[float, ...]
+    vehicle_from_camera: Matrix = field(compare=False)
+    width: int
+    height: int
+    direction: int
+
+
+@dataclass(frozen=True, slots=True)
+class LaserCalibration:
+    """A LiDAR: beam ``inclinations`` in radians from the lowest up, or () where they are even between the two limits."""
+
+    name: str
+    inclinations: tuple[float, ...]
+    inclination_min: float
+    inclination_max: float
+    vehicle_from_lidar: Matrix = field(compare=False)
+
+    def beam_inclinations(self, rows: int, where: str) -> NDArray[np.float64]:
+        """Inclination of every row of a range image, f64[rows] radians; the top row looks highest."""
+        if self.inclinations:
+            if len(self.inclinations) != rows:
+                raise InputError(
+                    "range image does not have a row for every beam",
+                    where=where,
+                    expected=f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})",
+                    got=f"{rows} rows",
+                )
+            return np.array(self.inclinations)[::-1]
+        step = (self.inclination_max - self.inclination_min) / rows
+        return self.inclination_max - (np.arange(rows, dtype=np.float64) + 0.5) * step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraShot:
+    """When and where an image was taken.
+
+    Args:
+        global_from_vehicle: at ``pose_time_s``, seconds of the epoch.
+        velocity: linear m/s and angular rad/s, both in the global frame, f64[6]; None if not recorded.
+        shutter_s, trigger_s, done_s: exposure of a column, start of the exposure and end of the readout; 0 if not recorded.
+    """
+
+    global_from_vehicle: Matrix
+    pose_time_s: float
+    velocity: NDArray[np.float64] | None
+    shutter_s: float
+    trigger_s: float
+    done_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WaymoBox:
+    """A box in the vehicle frame of its frame: centre, (length, width, height) in metres, heading in radians about z."""
+
+    id: str
+    label: str
+    centre: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    heading: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRecord:
+    """The facts of a frame that fit into memory for a whole log.
+
+    Args:
+        number: place in the log, counted from 0.
+        timestamp_us: microseconds of the epoch at which the top LiDAR began its turn.
+        global_from_vehicle: the pose that boxes and compensated points refer to; not the pose at ``timestamp_us``.
+        shots: camera name -> its shot; cameras without an image are not listed.
+        lasers: names of the LiDARs with a range image.
+        where: file and record, for errors.
+    """
+
+    number: int
+    timestamp_us: int
+    global_from_vehicle: Matrix
+    shots: Mapping[str, CameraShot]
+    lasers: tuple[str, ...]
+    boxes: tuple[WaymoBox, ...]
+    where: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserScan:
+    """One turn of a LiDAR.
+
+    Args:
+        returns: range images f32[H, W, 4]: range in metres (not above 0: none), intensity, elongation, no-label flag.
+        poses: of the top LiDAR, f32[H, W, 6]: roll, pitch, yaw, x, y, z of global from vehicle when the pixel was measured.
+        projections: for each return, i64[H, W, 6]: camera number, x, y of the first two images a point falls into; or empty.
+    """
+
+    returns: Sequence[NDArray[np.float32]]
+    poses: NDArray[np.float32] | None = None
+    projections: Sequence[NDArray[np.int64]] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panoptic:
+    """A panoptic label: a 16-bit PNG of class * divisor + instance."""
+
+    divisor: int
+    png: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameContent:
+    """The bulky parts of a frame: JPEG bytes and labels by camera name, scans by LiDAR name."""
+
+    images: Mapping[str, bytes]
+    panoptic: Mapping[str, Panoptic]
+    scans: Mapping[str, LaserScan]
+
+
+class WaymoLog(Protocol):
+    """A log in one of its two forms."""
+
+    name: str
+    form: str
+    cameras: Mapping[str, CameraCalibration]
+    lasers: Mapping[str, LaserCalibration]
+    frames: Sequence[FrameRecord]
+    conditions: str
+
+    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> FrameContent:
+        """The bulky parts of a frame, for the chosen cameras."""
+        ...
+
+    def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
+        """Poses of the top LiDAR's pixels, or None where there are none."""
+        ...
+
+
+def checked_transform(values: NDArray[np.float64], where: str) -> Matrix:
+    """A rigid 4x4 from its sixteen numbers, row by row.
+
+    Raises:
+        InputError: another count of numbers, or no rigid motion.
+    """
+    if len(values) != 16:
+        raise InputError("transform is incomplete", where=where, expected="16 numbers", got=str(len(values)))
+    return rigid_pose(np.asarray(values, np.float64).reshape(4, 4), where)
+
+
+def checked_shot(shot: CameraShot, timestamp_us: int, where: str) -> CameraShot:
+    """The shot, its clock compared with the frame's: seconds and microseconds of one epoch.
+
+    Raises:
+        InputError: times are not finite, or more than a second apart.
+    """
+    times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
+    gap = max(abs(time - timestamp_us / 1e6) for time in times)
+    if not gap <= MAX_CLOCK_GAP_S:
+        raise InputError(
+            "image and frame are not of one time",
+            where=where,
+            expected=f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds",
+            got=", ".join(f"{time!r}" for time in times),
+            remedy="are the units seconds (images) and microseconds (frames)?",
+        )
+    if shot.done_s and not 0 <= shot.shutter_s <= shot.done_s - shot.trigger_s < MAX_CLOCK_GAP_S:
+        raise InputError(
+            "exposure times contradict each other",
+            where=where,
+            expected="0 <= shutter <= readout end - trigger, seconds",
+            got=f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}",
+        )
+    return shot
+
+
+def checked_box(box: WaymoBox, where: str) -> WaymoBox:
+    """The box, if its numbers are finite and its size is positive."""
+    if not np.isfinite([*box.centre, *box.size_m, box.heading]).all() or min(box.size_m) <= 0:
+        raise InputError(
+            "box makes no sense",
+            where=f"{where}: box {box.id}",
+            expected="finite numbers, positive length, width and height",
+            got=f"centre {box.centre}, size {box.size_m}, heading {box.heading}",
+        )
+    return box
+
+
+def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, where: str) -> NDArray[Any]:
+    """A zlib-packed matrix message as an array [H, W, channels].
+
+    Raises:
+        InputError: damaged, too large, or of another shape.
+    """
+    unpacker = zlib.decompressobj()
+    try:
+        content = unpacker.decompress(packed, MAX_UNPACKED_BYTES)
+    except zlib.error as error:
+        raise InputError("range image cannot be unpacked", where=where, got=str(error)) from error
+    if not unpacker.eof:
+        cut_off = not unpacker.unconsumed_tail
+        raise InputError(
+            "range image is cut off" if cut_off else "range image unpacks to more than any has",
+            where=where,
+            expected=f"at most {MAX_UNPACKED_BYTES} bytes",
+            got=f"{len(content)} bytes",
+        )
+    values = parse_message(content, message, where)
+    return shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
+
+
+def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channels: int, where: str) -> NDArray[Any]:
+    """``data`` [H * W * channels] as [H, W, channels], if its declared shape says so."""
+    shape = tuple(int(n) for n in dims)
+    if len(shape) != 3 or min(shape) < 1 or shape[2] != channels or int(np.prod(shape)) != len(data):
+        raise InputError(
+            "range image has the wrong shape",
+            where=where,
+            expected=f"[rows, columns, {channels}], as many values as that",
+            got=f"{list(shape)} with {len(data)} values",
+        )
+    return data.reshape(shape)
+
+
+def float_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
+    """A packed float matrix f32[H, W, channels]."""
+    return unpack_matrix(packed, MATRIX_FLOAT, channels, where)
+
+
+def int_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.int64]:
+    """A packed integer matrix i64[H, W, channels]."""
+    return unpack_matrix(packed, MATRIX_INT, channels, where)

@@ -1,0 +1,391 @@
+"""Writing scenes: built beside their destination, moved into place when complete; and packed into one stored zip."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import shutil
+import threading
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mudg.base import store
+from mudg.base.errors import InputError, ResourceError
+from mudg.base.geometry import rigid_problem
+from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
+from mudg.data.scene import schema
+from mudg.data.scene.files import open_files
+from mudg.data.scene.read import MASK_LABELS, all_refs, check_image, checked_points, label_ref, read_scene
+
+_MAX_PENDING_WRITES: Final = 8
+
+
+class SceneWriter:
+    """Writes a scene; use it as a context manager so that a failure leaves nothing behind.
+
+    Images and labels are encoded and written by two threads while the caller goes on; ``add_*`` may be called from
+    several threads. Frames and sweeps are stored in the order of their times. Example::
+
+        with SceneWriter(root, "city-7", source) as writer:
+            writer.add_camera(camera)
+            writer.add_frame("front/000000", view, rgb, labels={"depth": depth, "semantics": ids})
+            writer.add_sweep("lidar/000000", "lidar", time_s, world_from_lidar, points)
+            writer.set_ego(ego)
+            scene = writer.finish()
+
+    Args:
+        root: destination directory; it must not hold a scene yet. Other files there (a run's bookkeeping) are left alone.
+        scene_id: name of the scene.
+        source: where the log comes from and under which licence.
+        jpeg_quality: store images given as arrays as JPEG of this quality instead of lossless PNG.
+    """
+
+    def __init__(self, root: Path | str, scene_id: str, source: Source, jpeg_quality: int | None = None) -> None:
+        self.root = Path(root)
+        self._scene_id, self._source, self._jpeg_quality = scene_id, source, jpeg_quality
+        if (self.root / "scene.json").exists():
+            raise InputError(
+                "there is a scene here already", where=str(self.root), remedy="choose another folder or remove it"
+            )
+        self._partial = _partial_folder(self.root)
+        try:
+            self._partial.mkdir(parents=True)
+        except OSError as error:
+            raise ResourceError(
+                "cannot create the scene's folder", where=str(self.root), got=str(error), remedy="choose another --out"
+            ) from error
+        self._cameras: dict[str, Camera] = {}
+        self._frames: dict[str, Frame] = {}
+        self._sweeps: dict[str, Sweep] = {}
+        self._tracks: dict[str, Track] = {}
+        self._ego: EgoPath | None = None
+        self._split: dict[str, Literal["train", "test"]] = {}
+        self._hashes: dict[str, dict[str, Any]] = {}
+        self._grey: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._slots = threading.Semaphore(_MAX_PENDING_WRITES)
+        self._pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="scene-writer")
+        self._futures: list[Future[None]] = []
+        self._finished = False
+
+    def __enter__(self) -> SceneWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._finished:
+            self.discard()
+
+    def discard(self) -> None:
+        """Give up: nothing of the scene stays on disk."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        shutil.rmtree(self._partial, ignore_errors=True)
+        self._finished = True
+
+    def add_camera(self, camera: Camera) -> None:
+        """Add a camera; frames may use it from then on."""
+        schema.check_name(camera.name, f"SceneWriter: camera {camera.name!r}")
+        schema.check_intrinsics(
+            (camera.width, camera.height),
+            (camera.fx, camera.fy),
+            (camera.cx, camera.cy),
+            camera.readout_s,
+            f"SceneWriter: camera {camera.name}",
+        )
+        if self._cameras.setdefault(camera.name, camera) != camera:
+            raise InputError("two cameras have one name", where=f"SceneWriter: camera {camera.name}")
+
+    def add_frame(
+        self,
+        frame_id: str,
+        view: View,
+        image: NDArray[np.uint8] | Path | bytes,
+        labels: Mapping[str, NDArray[Any]] | None = None,
+    ) -> None:
+        """Add one image.
+
+        Args:
+            frame_id: ``<camera>/<digits>``, e.g. ``front/000012``.
+            view: its camera (equal to the one added) and pose.
+            image: u8[H, W, 3] RGB; or the path or the bytes of a PNG or JPEG file, kept as they are after a check that
+                they can be decoded. Grey ones are counted in the scene's notes.
+            labels: see ``add_label``.
+        """
+        camera = self._cameras.get(view.camera.name)
+        where = f"SceneWriter: frame {frame_id}"
+        if camera is None or camera != view.camera:
+            raise InputError(
+                "frame uses a camera that was not added like this",
+                where=where,
+                got=view.camera.name,
+                expected=", ".join(self._cameras) or "add_camera first",
+            )
+        schema.check_frame_id(frame_id, camera.name, where)
+        _check_pose(view.world_from_cam, where)
+        content = image if isinstance(image, bytes) else store.read_bytes(image) if isinstance(image, Path) else None
+        if isinstance(image, np.ndarray) and (
+            image.dtype != np.uint8 or image.shape != (camera.height, camera.width, 3)
+        ):
+            raise InputError(
+                "image array has the wrong form",
+                where=where,
+                got=f"{image.dtype} {image.shape}",
+                expected=f"uint8 ({camera.height}, {camera.width}, 3)",
+            )
+        if content is not None:
+            source = str(image) if isinstance(image, Path) else where
+            grey = check_image(content, source, camera)
+            suffix = "png" if content[:4] == b"\x89PNG" else "jpg"
+        else:
+            grey = False
+            suffix = "png" if self._jpeg_quality is None else "jpg"
+        ref = f"images/{frame_id}.{suffix}"
+        with self._lock:
+            if frame_id in self._frames:
+                raise InputError("frame was added twice", where=where)
+            self._frames[frame_id] = Frame(frame_id, view, Ref(ref), {})
+            self._grey[camera.name] += grey
+        if content is not None:
+            self._submit(ref, lambda: content)
+        else:
+            pixels = np.ascontiguousarray(image)
+            self._submit(ref, lambda: _png(pixels) if self._jpeg_quality is None else _jpeg(pixels, self._jpeg_quality))
+        for name, array in (labels or {}).items():
+            self.add_label(frame_id, name, array)
+
+    def add_label(self, frame_id: str, name: str, array: NDArray[Any]) -> None:
+        """Add a label [H, W] to a frame; names, types and meaning as in ``read_label``."""
+        where = f"SceneWriter: frame {frame_id}"
+        with self._lock:
+            frame = self._frames.get(frame_id)
+        if frame is None:
+            raise InputError("label for a frame that was not added", where=where, got=name)
+        content = encode_label(name, array, frame.view.camera, where)
+        ref = label_ref(name, frame_id)
+        with self._lock:
+            frame = self._frames[frame_id]
+            self._frames[frame_id] = Frame(frame.id, frame.view, frame.image, {**frame.labels, name: Ref(ref)})
+        self._submit(ref, lambda: content)
+
+    def add_sweep(
+        self, sweep_id: str, sensor: str, time_s: float, world_from_lidar: NDArray[np.float64], points: SweepPoints
+    ) -> None:
+        """Add a LiDAR sweep: points in the LiDAR frame at ``time_s``. Ids are ``<sensor>/<digits>``."""
+        where = f"SceneWriter: sweep {sweep_id}"
+        schema.check_name(sensor, where)
+        schema.check_frame_id(sweep_id, sensor, where)
+        _check_pose(world_from_lidar, where)
+        checked_points(points.xyz, points.intensity, points.dt_s, where)
+        ref = f"lidar/{sweep_id}.safetensors"
+        with self._lock:
+            if sweep_id in self._sweeps:
+                raise InputError("sweep was added twice", where=where)
+            self._sweeps[sweep_id] = Sweep(
+                sweep_id, sensor, float(time_s), np.asarray(world_from_lidar, np.float64), Ref(ref)
+            )
+        content = _safetensors({"xyz": points.xyz, "intensity": points.intensity, "dt_s": points.dt_s})
+        self._submit(ref, lambda: content)
+
+    def add_track(self, track: Track) -> None:
+        """Add a tracked box."""
+        where = f"SceneWriter: track {track.id}"
+        for index, pose in enumerate(track.world_from_object):
+            _check_pose(pose, f"{where}: world_from_object[{index}]")
+        if track.id in self._tracks:
+            raise InputError("track was added twice", where=where)
+        self._tracks[track.id] = track
+
+    def set_ego(self, ego: EgoPath) -> None:
+        """Set the path of the vehicle."""
+        self._ego = ego
+
+    def add_notes(self, notes: Iterable[str]) -> None:
+        """Add sentences to the source's notes: what was learnt while the log was read."""
+        self._source = replace(self._source, notes=(*self._source.notes, *notes))
+
+    def set_split(self, split: Mapping[str, Literal["train", "test"]]) -> None:
+        """Set which frames are held out: frame id -> ``train`` or ``test``. Frames not named are for training."""
+        self._split = dict(split)
+
+    def finish(self) -> Scene:
+        """Check the whole, write the index and move the scene into place."""
+        for future in self._futures:
+            future.result()
+        self._pool.shutdown(wait=True)
+        where = f"SceneWriter: {self.root}"
+        if self._ego is None:
+            raise InputError("ego path was not set", where=where, remedy="call set_ego")
+        grey = [f"{count} images of camera {name} are grey" for name, count in self._grey.items() if count]
+        self.add_notes(note for note in grey if note not in self._source.notes)
+        order = {name: index for index, name in enumerate(self._cameras)}
+        frames = sorted(self._frames.values(), key=lambda f: (f.view.time_s, order[f.view.camera.name]))
+        split: dict[str, Literal["train", "test"]] = {f.id: self._split.get(f.id, "train") for f in frames}
+        scene = Scene(
+            id=self._scene_id,
+            root=str(self.root),
+            cameras=dict(self._cameras),
+            frames=tuple(frames),
+            sweeps=tuple(sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))),
+            tracks=tuple(self._tracks.values()),
+            ego=self._ego,
+            split={**split, **self._split},
+            source=self._source,
+        )
+        schema.check_relations(scene, where)
+        self._write("tracks.json", schema.tracks_to_json_text(scene.tracks).encode())
+        self._write("scene.json", schema.scene_to_json_text(scene).encode())
+        store.write_json(self._partial / store.MANIFEST, {"schema": 1, "files": dict(sorted(self._hashes.items()))})
+        store.sync_tree(self._partial)
+        checked = read_scene(self._partial)  # nothing is moved into place that could not be read back
+        self._move_into_place()
+        self._finished = True
+        return replace(checked, root=str(self.root.absolute()))
+
+    def _move_into_place(self) -> None:
+        try:
+            if not self.root.exists():
+                self._partial.rename(self.root)
+                return
+            entries = sorted(self._partial.iterdir(), key=lambda entry: entry.name == "scene.json")
+            for entry in entries:  # scene.json last: without it the folder is no scene
+                target = self.root / entry.name
+                if target.is_dir():
+                    shutil.rmtree(target)
+                entry.replace(target)
+            self._partial.rmdir()
+        except OSError as error:
+            raise ResourceError("scene cannot be moved into place", where=str(self.root), got=str(error)) from error
+
+    def _submit(self, ref: str, encode: Callable[[], bytes]) -> None:
+        self._raise_failed()
+        self._slots.acquire()
+
+        def job() -> None:
+            try:
+                self._write(ref, encode())
+            finally:
+                self._slots.release()
+
+        with self._lock:
+            self._futures.append(self._pool.submit(job))
+
+    def _raise_failed(self) -> None:
+        with self._lock:
+            done = [future for future in self._futures if future.done()]
+            self._futures = [future for future in self._futures if not future.done()]
+        for future in done:
+            future.result()
+
+    def _write(self, ref: str, content: bytes) -> None:
+        store.write_in_tree(self._partial / ref, content)
+        with self._lock:
+            self._hashes[ref] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def _partial_folder(root: Path) -> Path:
+    """Where to build a scene: inside its folder where that exists (a run's folder, a mounted one), else beside it.
+
+    What a killed writer left there is removed; another live process's work is not touched.
+    """
+    root = root.absolute()
+    parent, prefix = (root, ".scene.") if root.is_dir() else (root.parent, f".{root.name}.")
+    for stale in parent.iterdir() if parent.is_dir() else ():
+        if stale.name.startswith(prefix) and stale.name.endswith(".part") and stale.is_dir():
+            pid = stale.name.removeprefix(prefix).split("-")[0]
+            if pid.isdigit() and not store.process_alive(int(pid)):
+                shutil.rmtree(stale, ignore_errors=True)
+    return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
+
+
+def _check_pose(pose: NDArray[np.float64], where: str) -> None:
+    problem = rigid_problem(pose, schema.RIGID_TOLERANCE)
+    if problem is not None:
+        raise InputError(
+            "pose is not a rigid motion", where=where, expected="rotation and translation, f64[4, 4]", got=problem
+        )
+
+
+def _png(array: NDArray[np.uint8]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(array).save(buffer, "PNG", compress_level=1)
+    return buffer.getvalue()
+
+
+def _jpeg(array: NDArray[np.uint8], quality: int) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(array).save(buffer, "JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue()
+
+
+def _safetensors(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    from safetensors.numpy import save
+
+    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
+
+
+def write_zip(scene_dir: Path | str, zip_path: Path | str) -> Path:
+    """Pack a scene directory into one stored zip (no compression: members are read by offset); returns ``zip_path``.
+
+    The scene is read first, so that a broken one is refused. Bookkeeping of the run that made it is left out.
+    """
+    scene_dir, zip_path = Path(scene_dir), Path(zip_path)
+    if not scene_dir.is_dir():
+        raise InputError("only a scene directory can be packed", where=str(scene_dir))
+    scene = read_scene(scene_dir)
+    names = ["scene.json", *sorted({ref.path for _, ref in all_refs(scene)})]
+    names[1:1] = ["tracks.json"] if (scene_dir / "tracks.json").is_file() else []
+    files = open_files(scene_dir)
+    listed: dict[str, dict[str, Any]] = {}
+    with store.atomic_path(zip_path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        for name in names:
+            content = files.read(name)
+            listed[name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            archive.writestr(zipfile.ZipInfo(name), content)
+        archive.writestr(zipfile.ZipInfo(store.MANIFEST), store.json_text({"schema": 1, "files": listed}))
+    return zip_path
+
+
+def encode_label(name: str, array: NDArray[Any], camera: Camera, where: str) -> bytes:
+    """File bytes of a label; see ``read_label`` for the arrays. Depth that is not finite or not positive is missing."""
+    array = np.asarray(array)
+    if name not in schema.LABEL_NAMES:
+        raise InputError("there is no such label", where=where, expected=", ".join(schema.LABEL_NAMES), got=name)
+    if array.shape != (camera.height, camera.width):
+        raise InputError(
+            "label does not have its camera's size",
+            where=f"{where}: {name}",
+            expected=f"[{camera.height}, {camera.width}]",
+            got=str(list(array.shape)),
+        )
+    if name == "semantics":
+        if not np.isin(np.unique(array), [*range(19), 255]).all():
+            raise InputError(
+                "semantics hold values that are no train id",
+                where=where,
+                expected="0..18 or 255 (unlabelled)",
+                got=str([int(v) for v in np.unique(array) if v not in range(19) and v != 255][:8]),
+            )
+        return _png(array.astype(np.uint8))
+    if name in MASK_LABELS:
+        return _png(array.astype(bool).astype(np.uint8) * np.uint8(255))
+    if name == "instance":
+        return _safetensors({name: array.astype(np.int32)})
+    if name == "depth":
+        with np.errstate(invalid="ignore"):
+            valid = np.isfinite(array) & (array > 0)
+        return _safetensors({name: np.where(valid, array, 0).astype(np.float32), "valid": valid.astype(np.uint8)})
+    if not ((array >= 0) & (array <= 1)).all():
+        raise InputError("confidence lies outside 0..1", where=f"{where}: {name}")
+    return _safetensors({name: array.astype(np.float32)})

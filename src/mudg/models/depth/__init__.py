@@ -1,0 +1,1 @@
+"""Depth networks that complete LiDAR depth."""

@@ -1,0 +1,457 @@
+"""Dense depth from an image and LiDAR by a DepthLab folder, as ``mudg convert`` writes it: depth inpainting by latent diffusion.
+
+Liu et al., "DepthLab: from partial to complete" (2024). Two U-Nets of one layout: the reference U-Net sees the image's latent once, and
+what its self-attentions read is kept; each self-attention of the denoising U-Net reads that beside its own features. The denoising
+U-Net sees the noisy latent of depth, the latent of the mask (1 = missing) and the latent of known depth, interpolated. Both are
+conditioned on one vector: the image's CLIP embedding through a linear layer.
+
+Depth is scaled by the least and greatest known depth to -1..1. Denoising starts part of the way (``strength``) at known depth filled by
+the nearest; after every step but the last, latent cells that are known get that depth's latent with the noise of the step
+(Avrahami et al., "Blended diffusion", 2022). So the last step alone is free of them: known depth is kept nearly, not exactly.
+
+The published code runs every step twice, with and without image, and mixes the two with weight 1, which is the one with the image: only
+that one is computed here. The noise is the same for every image.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from scipy import ndimage
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import QhullError
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mudg.base import seeds, store
+from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.models import folders
+from mudg.models.depth.marigold import ddim_scheduler
+from mudg.models.depth.networks import DepthInput, Prediction
+from mudg.models.folders import CPU, Place
+
+KIND: Final = "depthlab"
+SCHEMA: Final = 1
+DESCRIPTION: Final = "model.json"
+LATENT_SCALE: Final = 0.18215
+"""Factor of the autoencoder's latents, for image, mask and depth alike."""
+UNETS: Final = ("denoising_unet", "reference_unet")
+PARTS: Final = (*UNETS, "mapping_layer", "vae", "image_encoder")
+_VISION: Final = (
+    "hidden_size", "intermediate_size", "projection_dim", "num_hidden_layers", "num_attention_heads", "num_channels", "image_size",
+    "patch_size", "hidden_act", "layer_norm_eps",
+)  # fmt: skip
+_CLIP_MEAN, _CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """How depth is denoised; the defaults are those of MuDG's depth ground truth.
+
+    Args:
+        processing_px: longest side at which the networks work.
+        steps: of the whole schedule.
+        strength: share of the steps that is done, from known depth with noise; 1 = all, from noise.
+        normalize_scale: known depth spans -scale..scale; below 1 it leaves room for what is farther.
+    """
+
+    processing_px: int = 768
+    steps: int = 50
+    strength: float = 0.8
+    normalize_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.processing_px < 8 or not 0 < self.strength <= 1 or not 0 < self.normalize_scale <= 1:
+            raise InputError("sampling of DepthLab is out of range", where="sampling", got=str(self),
+                             expected="processing_px >= 8, 0 < strength <= 1, 0 < normalize_scale <= 1")  # fmt: skip
+        if int(self.steps * self.strength) < 1:
+            raise UsageError("too few denoising steps: none is left of them", where="--depth-steps", got=str(self.steps),
+                             expected=f"at least {int(np.ceil(1 / self.strength))}")  # fmt: skip
+
+
+# --- the networks -----------------------------------------------------------------------------------------------------
+
+
+def part_configs(
+    unet: Mapping[str, Any], vae: Mapping[str, Any], vision: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Configurations of all parts, from those of Marigold's U-Net and autoencoder and of the image encoder.
+
+    Raises:
+        InputError: a number is missing, or one that DepthLab's sampling takes for granted differs.
+    """
+    plain = {name: value for name, value in unet.items() if not name.startswith("_")}
+    encoder = {name: vision[name] for name in _VISION if name in vision}
+    try:
+        latent, width, embedding = vae["latent_channels"], plain["cross_attention_dim"], encoder["projection_dim"]
+    except KeyError as error:
+        raise InputError("a network's description lacks a number", where="DepthLab", expected=str(error)) from error
+    if abs(float(vae.get("scaling_factor", LATENT_SCALE)) - LATENT_SCALE) > 1e-9:
+        raise InputError("the autoencoder scales its latents otherwise than DepthLab does", where="vae: scaling_factor",
+                         expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))  # fmt: skip
+    return {
+        "denoising_unet": {**plain, "in_channels": 3 * latent},
+        "reference_unet": {**plain, "in_channels": latent},
+        "mapping_layer": {"in_features": embedding, "out_features": width},
+        "vae": {name: value for name, value in vae.items() if not name.startswith("_")},
+        "image_encoder": encoder,
+    }
+
+
+def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module]:
+    """The networks of ``PARTS`` without values (on the meta device): they say which tensors a folder must hold.
+
+    The reference U-Net ends with its last block: what follows there is neither published nor used.
+
+    Raises:
+        InputError: a configuration that the packages refuse. ResourceError: a package is missing.
+    """
+    diffusers, transformers = folders.package("diffusers"), folders.package("transformers")
+    unet = folders.member(diffusers, "UNet2DConditionModel")
+    vision = folders.member(transformers, "CLIPVisionConfig")
+    made: dict[str, nn.Module] = {}
+    name = ""
+    try:
+        with torch.device("meta"):
+            for name in UNETS:
+                made[name] = unet.from_config(dict(configs[name]))
+            name = "mapping_layer"
+            made[name] = nn.Linear(**configs[name])
+            name = "vae"
+            made[name] = folders.member(diffusers, "AutoencoderKL").from_config(dict(configs[name]))
+            name = "image_encoder"
+            network_class = folders.member(transformers, "CLIPVisionModelWithProjection")
+            made[name] = network_class(vision(**configs[name]))
+    except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, NotImplementedError) as error:
+        raise InputError(
+            "a network cannot be made as it is described", where=f"DepthLab: {name}", got=str(error)[:300]
+        ) from error
+    reference: Any = made["reference_unet"]
+    reference.conv_norm_out, reference.conv_out = None, nn.Identity()
+    return made
+
+
+def shapes_of(network: nn.Module) -> dict[str, tuple[int, ...]]:
+    """Name -> shape of every tensor that a network needs."""
+    return {name: tuple(value.shape) for name, value in network.state_dict().items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """The networks, ready to be asked, and the noise schedule of diffusers (DDIM)."""
+
+    denoising_unet: Any
+    reference_unet: Any
+    mapping_layer: Any
+    vae: Any
+    image_encoder: Any
+    scheduler: Any
+
+
+def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -> Parts:
+    """The networks of a converted folder in float32 on their device, every file checked against its sha256.
+
+    Raises:
+        InputError: the description is not whole, or tensors do not fit it. IntegrityError: a file is missing or altered.
+        ResourceError: a package or the device is missing.
+    """
+    device, where = place.ready(), folder / DESCRIPTION
+    try:
+        configs = {name: dict(described["parts"][name]["config"]) for name in PARTS}
+        files = {name: {str(f): str(d) for f, d in described["parts"][name]["files"].items()} for name in PARTS}
+        schedule = dict(described["scheduler"])
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise InputError("the description of a DepthLab model is not whole", where=str(where), got=repr(error)[:200],
+                         remedy="convert the published files again") from error  # fmt: skip
+    made = blank_parts(configs)
+    for name, network in made.items():
+        state = _tensors(folder / name, files[name])
+        wanted = shapes_of(network)
+        wrong = sorted(set(wanted) ^ set(state)) or [n for n in wanted if tuple(state[n].shape) != wanted[n]]
+        if wrong:
+            raise InputError("weights do not fit the configuration", where=str(folder / name), got=", ".join(wrong[:6]))
+        network.load_state_dict({n: value.float() for n, value in state.items()}, assign=True)
+        _fill_tables(network, name)
+        network.to(device).eval().requires_grad_(False)
+    scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
+    return Parts(**made, scheduler=ddim_scheduler(scheduler_class, schedule, f"{where}: scheduler"))
+
+
+def _tensors(folder: Path, files: Mapping[str, str]) -> dict[str, Tensor]:
+    """All tensors of a part's files; IntegrityError for a file that is missing or altered."""
+    found: dict[str, Tensor] = {}
+    for name, digest in files.items():
+        path = folder / Path(name).name
+        if not path.is_file() or store.sha256_file(path) != digest:
+            raise IntegrityError("a weight file is missing or altered", where=str(path), expected=f"sha256 {digest[:16]}...",
+                                 remedy="convert the published files again")  # fmt: skip
+        try:
+            found |= load_file(path)
+        except (SafetensorError, OSError) as error:
+            raise InputError("not a valid safetensors file", where=str(path), got=str(error)) from error
+    return found
+
+
+def _fill_tables(network: nn.Module, part: str) -> None:
+    """Numbers the places of the image encoder's patches: the one table that a network has and its file does not hold."""
+    for name, table in list(network.named_buffers()):
+        if not table.is_meta:
+            continue
+        owner, _, short = name.rpartition(".")
+        if short != "position_ids":
+            raise InputError("the installed package's network has a table that is not known", where=part, got=name)
+        setattr(network.get_submodule(owner), short, torch.arange(table.shape[-1]).expand(table.shape).clone())
+
+
+# --- what one U-Net hands to the other --------------------------------------------------------------------------------
+
+
+class _Kept:
+    """What the self-attention of one block of the reference U-Net has read, [N, L, C]."""
+
+    features: Tensor
+
+
+class _Sharing(abc.ABC):
+    """An attention processor: the given one, told what to read by ``read``."""
+
+    def __init__(self, attend: Any, kept: _Kept) -> None:
+        self._attend, self._kept = attend, kept
+
+    def __call__(
+        self, attn: Any, hidden_states: Tensor, encoder_hidden_states: Tensor | None = None,
+        attention_mask: Tensor | None = None, temb: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        return self._attend(attn, hidden_states, self.read(hidden_states), attention_mask, temb)
+
+    @abc.abstractmethod
+    def read(self, hidden_states: Tensor) -> Tensor | None:
+        """What keys and values come from; None: from the block's own features."""
+
+
+class _Writing(_Sharing):
+    """In the reference U-Net: keeps what is read, and changes nothing."""
+
+    def read(self, hidden_states: Tensor) -> None:
+        self._kept.features = hidden_states
+
+
+class _Reading(_Sharing):
+    """In the denoising U-Net: reads the kept features beside its own."""
+
+    def read(self, hidden_states: Tensor) -> Tensor:
+        return torch.cat([hidden_states, self._kept.features.to(hidden_states.dtype)], 1)
+
+
+def hand_over(reference_unet: Any, denoising_unet: Any) -> None:
+    """Let every self-attention of the denoising U-Net read, beside its own, the features of the same block of the reference U-Net.
+
+    From then on a pass of the reference U-Net must come before those of the denoising U-Net, with the same size and batch.
+
+    Raises:
+        InputError: the two differ in their blocks, or have none.
+    """
+    writers, readers = (
+        {name: module for name, module in unet.named_modules() if name.rpartition(".")[2] == "attn1"}
+        for unet in (reference_unet, denoising_unet)
+    )
+    if set(writers) != set(readers) or not writers:
+        raise InputError("the two U-Nets differ in their self-attentions", where="DepthLab",
+                         got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all")  # fmt: skip
+    for name, writer in writers.items():
+        kept = _Kept()
+        writer.set_processor(_Writing(writer.processor, kept))
+        readers[name].set_processor(_Reading(readers[name].processor, kept))
+
+
+# --- what the networks are given --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """One image and its known depth at the size of the networks, padded to whole latent cells by the last row and column.
+
+    Args:
+        image: f32[1, 3, H, W] in -1..1.
+        crop: f32[1, 3, S, S], the middle of the image as CLIP wants it.
+        nearest, linear: f32[1, 1, H, W], known depth in -scale..scale, filled by the nearest known and by linear interpolation
+            (0 outside the triangles between the known).
+        missing: f32[1, 1, H, W], 1 where depth is not known.
+        size: height and width without the padding.
+        low_m, high_m: least and greatest known depth.
+    """
+
+    image: Tensor
+    crop: Tensor
+    nearest: Tensor
+    linear: Tensor
+    missing: Tensor
+    size: tuple[int, int]
+    low_m: float
+    high_m: float
+
+
+def prepare(given: DepthInput, sampling: Sampling, cell: int, crop_px: int) -> Prepared:
+    """What the networks are given for an image; ``cell``: pixels per latent cell and side, ``crop_px``: side of CLIP's image.
+
+    Raises:
+        InputError: no depth is known.
+    """
+    height, width = given.rgb.shape[:2]
+    longest = max(height, width)
+    size = (max(1, height * sampling.processing_px // longest), max(1, width * sampling.processing_px // longest))
+    depth = known_depth(np.where(given.sky, np.float32(np.nan), given.measured), size)
+    known = np.isfinite(depth)
+    if not known.any():
+        raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
+    low, high = float(depth[known].min()), float(depth[known].max())
+    values = ((depth - low) / (high - low + 1e-6) - 0.5) * (2 * sampling.normalize_scale)
+    index: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    scaled = np.array(Image.fromarray(given.rgb).resize((size[1], size[0]), Image.Resampling.BICUBIC))
+    fill = (0, -size[1] % cell, 0, -size[0] % cell)
+
+    def padded(planes: NDArray[Any]) -> Tensor:
+        return functional.pad(torch.from_numpy(planes.astype(np.float32))[None], fill, mode="replicate")
+
+    image = padded(scaled.transpose(2, 0, 1)) / 127.5 - 1
+    nearest, linear = padded(values[tuple(index)][None]), padded(linear_fill(values)[None])
+    return Prepared(image, clip_crop(given.rgb, crop_px), nearest, linear, padded(~known[None]), size, low, high)
+
+
+def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Measured depth at another size, f32[h, w]: the nearest one in the part of the image that a pixel covers, NaN where there is none.
+
+    The published code picks single pixels instead, which loses most returns when an image shrinks.
+    """
+    near = torch.from_numpy(np.where(np.isfinite(measured), -measured, np.float32(-np.inf)))[None, None]
+    found = -functional.adaptive_max_pool2d(near, size)[0, 0].numpy()
+    return np.where(np.isfinite(found), found, np.float32(np.nan))
+
+
+def linear_fill(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Known values f[h, w] (NaN = unknown) interpolated linearly in the triangles between them; 0 outside, f32[h, w]."""
+    row, column = np.nonzero(np.isfinite(values))
+    try:
+        between = LinearNDInterpolator(np.stack([row, column], 1), values[row, column], fill_value=0)
+        filled = between(*np.indices(values.shape)).astype(np.float32)
+    except QhullError:  # fewer than three, or all in one line: there are no triangles
+        filled = np.zeros(values.shape, np.float32)
+    filled[row, column] = values[row, column]
+    return filled
+
+
+def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
+    """Image u8[H, W, 3] as CLIP's own preparation gives it, f32[1, 3, S, S]: bicubic to the shorter side, middle cut out, normalised."""
+    height, width = rgb.shape[:2]
+    shorter = min(height, width)
+    high, wide = height * side_px // shorter, width * side_px // shorter
+    scaled = np.array(Image.fromarray(rgb).resize((wide, high), Image.Resampling.BICUBIC))
+    top, left = (high - side_px) // 2, (wide - side_px) // 2
+    cut = torch.from_numpy(scaled[top : top + side_px, left : left + side_px]).permute(2, 0, 1)[None].float() / 255
+    mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (_CLIP_MEAN, _CLIP_DEVIATION))
+    return (cut - mean) / deviation
+
+
+# --- denoising --------------------------------------------------------------------------------------------------------
+
+
+class DepthLab:
+    """A DepthLab model ready for use; ``load`` makes one from a converted folder."""
+
+    def __init__(self, parts: Parts, sampling: Sampling = Sampling(), place: Place = CPU) -> None:
+        """Raises: UsageError: more steps than the noise schedule has."""
+        most = int(parts.scheduler.config.num_train_timesteps)
+        if sampling.steps > most:
+            raise UsageError(
+                "too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(sampling.steps)
+            )
+        self._parts, self._sampling, self._place = parts, sampling, place
+        self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
+        hand_over(parts.reference_unet, parts.denoising_unet)
+
+    @classmethod
+    def load(cls, folder: str | Path, place: Place = CPU, *, steps: int = 0) -> DepthLab:
+        """Read a folder that ``mudg convert`` wrote; ``steps`` 0 = as many as it says.
+
+        Raises:
+            InputError: not such a folder, or not of this version. IntegrityError: a file is missing or altered.
+            ResourceError: a package or the device is missing. UsageError: too few steps.
+        """
+        file = Path(folder) / DESCRIPTION
+        described = folders.read_settings(file)
+        if described.get("kind") != KIND or described.get("schema") != SCHEMA:
+            raise InputError("not a DepthLab model of this version", where=str(file), expected=f"kind {KIND}, schema {SCHEMA}",
+                             got=f"{described.get('kind')}, {described.get('schema')}",
+                             remedy="convert the published files again")  # fmt: skip
+        sampling = _sampling(described.get("sampling"), steps, str(file))
+        return cls(read_parts(Path(folder), described, place), sampling, place)
+
+    def __call__(self, given: DepthInput) -> Prediction:
+        """Depth of one image at the image's size, near metres: it is to be aligned.
+
+        Raises:
+            InputError: no depth is known in the image.
+        """
+        made = prepare(given, self._sampling, self._cell, int(self._parts.image_encoder.config.image_size))
+        shape = (1, self._parts.vae.config.latent_channels, *(side // self._cell for side in made.image.shape[2:]))
+        noise = torch.randn(shape, generator=seeds.torch_generator(0, 0, "depthlab"))
+        found = self.predict(made, noise) * (made.high_m - made.low_m) + made.low_m
+        found = functional.interpolate(found, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
+        return Prediction(found[0, 0].clamp(min=0).cpu().numpy(), "depth")
+
+    def predict(self, made: Prepared, noise: Tensor) -> Tensor:
+        """Depth f32[1, 1, h, w], 0..1 between the least and the greatest known (others go beyond), from noise [1, C, H, W] in cells."""
+        parts, sampling, device = self._parts, self._sampling, self._place.device
+        noise = noise.to(device)
+        with torch.inference_mode():
+            depth, known, mask, image = (
+                self._encoded(plane)
+                for plane in (made.nearest, made.linear, 2 * made.missing - 1, made.image)
+            )  # fmt: skip
+            # one pixel of every cell decides, as published
+            missing = functional.interpolate(made.missing, size=noise.shape[2:], mode="nearest").to(device)
+            with self._place.autocast():
+                embedding = parts.mapping_layer(parts.image_encoder(made.crop.to(device)).image_embeds[:, None])
+                parts.reference_unet(image, torch.zeros((), dtype=torch.int64), encoder_hidden_states=embedding)
+            parts.scheduler.set_timesteps(sampling.steps)
+            times = parts.scheduler.timesteps[sampling.steps - int(sampling.steps * sampling.strength) :]
+            latent = parts.scheduler.add_noise(depth, noise, times[:1]) if sampling.strength < 1 else noise
+            for i, t in enumerate(times):
+                with self._place.autocast():
+                    seen = torch.cat([latent, mask, known], 1)
+                    output = parts.denoising_unet(seen, t, encoder_hidden_states=embedding, return_dict=False)[0]
+                latent = parts.scheduler.step(output.float(), t, latent).prev_sample
+                if i + 1 < len(times):
+                    as_known = parts.scheduler.add_noise(depth, noise, times[i + 1 : i + 2])
+                    latent = missing * latent + (1 - missing) * as_known
+            with self._place.autocast():
+                decoded = parts.vae.decode(latent / LATENT_SCALE, return_dict=False)[0]
+        found = decoded.float().mean(1, keepdim=True)[..., : made.size[0], : made.size[1]]
+        return (found / sampling.normalize_scale + 1) / 2
+
+    def _encoded(self, plane: Tensor) -> Tensor:
+        """Latent f32 of an image [1, 3, H, W], or of one channel thrice."""
+        with self._place.autocast():
+            latent = self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._place.device)).latent_dist.mode()
+        return latent.float() * LATENT_SCALE
+
+
+def _sampling(told: object, steps: int, where: str) -> Sampling:
+    """The sampling that a description tells, with other steps if asked; InputError for another kind of value."""
+    names = {field.name for field in fields(Sampling)}
+    numbers = isinstance(told, dict) and all(type(value) in (int, float) for value in told.values())
+    if not isinstance(told, dict) or set(told) != names or not numbers:
+        raise InputError("the sampling of a DepthLab model is not described", where=f"{where}: sampling",
+                         expected=", ".join(sorted(names)), got=str(told)[:200])  # fmt: skip
+    return Sampling(int(told["processing_px"]), steps or int(told["steps"]), float(told["strength"]),
+                    float(told["normalize_scale"]))  # fmt: skip

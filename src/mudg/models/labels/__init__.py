@@ -1,0 +1,1 @@
+"""Labellers: semantic classes and sky from images, LiDAR and boxes."""

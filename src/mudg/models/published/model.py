@@ -1,0 +1,557 @@
+"""The published multi-modal diffusion model, full size: the same thing as `MDM`, of other parts.
+
+    conditions -> latents          autoencoder (`kl_vae`); frame 0 of the colour condition is the dense reference
+    reference  -> image tokens     image tower (`clip`) and resampler, 16 tokens for each of 16 frames
+    one pass per modality          v-prediction with classifier-free guidance, told apart by the modality label
+    latents    -> pixels           autoencoder
+
+`encode_condition`, `loss` and `sample` mean what they mean in `models/mdm/model.py`. Where model and paper differ from each other
+the defaults follow the released weights; docs/published.md lists the differences.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mudg.base import seeds
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Condition
+from mudg.core import noise
+from mudg.core.align import DepthFit, align_depth
+from mudg.core.noise import Schedule, ScheduleConfig
+from mudg.models.mdm.codec import MODALITIES, Modality
+from mudg.models.mdm.model import LABELS, Losses, Sample, check_request, confidence_of, depth_agreement
+from mudg.models.published.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, ImageTower, TowerConfig
+from mudg.models.published.kl_vae import Autoencoder, AutoencoderConfig
+from mudg.models.published.resampler import Resampler, ResamplerConfig
+from mudg.models.published.video_unet import SeededDropout, VideoUNet, VideoUNetConfig, temporal_layers
+
+SCALE_ENTRIES = 1400
+"""Length of the published table of the dynamic rescale; one entry per noise step is used, the rest repeats the last."""
+
+
+@dataclass(frozen=True)
+class PublishedConfig:
+    """Everything that fixes the model's function except its weights. The defaults are the published model at 576x1024."""
+
+    net: VideoUNetConfig = VideoUNetConfig()
+    codec: AutoencoderConfig = AutoencoderConfig()
+    image_tokens: ResamplerConfig = ResamplerConfig()
+    image: TowerConfig = IMAGE_TOWER
+    image_patch: int = 14
+    image_side: int = 224
+    text: TowerConfig = TEXT_TOWER
+    vocabulary: int = 49408
+    schedule: ScheduleConfig = ScheduleConfig(base_scale=0.7)
+    """A checkpoint's own table of the dynamic rescale wins over base_scale."""
+    width: int = 1024
+    height: int = 576
+    fps: int = 10
+    """Frame rate that the model is told; the published one was never told another."""
+    missing_is_zero: bool = True
+    """Give the network black and 0 m where nothing was seen, as in the published training, whatever the condition holds there."""
+
+    def __post_init__(self) -> None:
+        if self.text.width != self.net.context_width or self.image_tokens.context_width != self.net.context_width:
+            raise UsageError(
+                "caption and image tokens must have the width of the network's context", expected=str(self.net.context_width),
+                got=f"{self.text.width}, {self.image_tokens.context_width}",
+            )  # fmt: skip
+        if self.image.width != self.image_tokens.image_width:
+            raise UsageError(
+                "image tower and resampler differ in width", got=f"{self.image.width}, {self.image_tokens.image_width}"
+            )
+        if (
+            self.net.channels_in != 3 * self.codec.latent_channels
+            or self.net.channels_out != self.codec.latent_channels
+        ):
+            raise UsageError(
+                "the network must take three latents (noisy, colour, depth) and give one",
+                expected=f"{3 * self.codec.latent_channels} -> {self.codec.latent_channels}",
+                got=f"{self.net.channels_in} -> {self.net.channels_out}",
+            )  # fmt: skip
+
+    @property
+    def window(self) -> int:
+        """Frames per clip: exactly this many, the image tokens are made for them."""
+        return self.image_tokens.frames
+
+    @property
+    def pixel_multiple(self) -> int:
+        """Image sides must be multiples of this many pixels."""
+        return 2 ** (len(self.codec.multipliers) + len(self.net.multipliers) - 2)
+
+
+def config_to_dict(config: PublishedConfig) -> dict[str, Any]:
+    """Plain JSON values of a configuration."""
+    return dataclasses.asdict(config)
+
+
+def config_from_dict(values: Any, where: str = "model configuration") -> PublishedConfig:
+    """Inverse of `config_to_dict`; unknown, missing or ill-typed fields are an InputError that names them."""
+    return _rebuild(PublishedConfig(), values, where)
+
+
+def _rebuild(default: Any, values: Any, where: str) -> Any:
+    known = {f.name for f in dataclasses.fields(default)}
+    given = set(values) if isinstance(values, Mapping) else set()
+    if given != known:
+        raise InputError(
+            "a model configuration has other fields than this version knows", where=where, expected=", ".join(sorted(known)),
+            got="missing " + ", ".join(sorted(known - given)) + "; unknown " + ", ".join(sorted(given - known)),
+        )  # fmt: skip
+    built: dict[str, Any] = {}
+    for name in sorted(known):
+        before, value = getattr(default, name), values[name]
+        if dataclasses.is_dataclass(before):
+            built[name] = _rebuild(before, value, f"{where}: {name}")
+            continue
+        value = tuple(value) if isinstance(value, list) else value
+        number = isinstance(before, float) and isinstance(value, int) and not isinstance(value, bool)
+        if not number and type(value) is not type(before) and not (name == "base_scale" and value is None):
+            raise InputError(
+                "a model configuration has a value of a wrong type", where=f"{where}: {name}", expected=type(before).__name__,
+                got=repr(value)[:80],
+            )  # fmt: skip
+        built[name] = value
+    return type(default)(**built)
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A batch of conditions as the network wants them.
+
+    planes f32[B,T,8,h,w]: latents of the colour and the depth condition; features [B,257,D] image tower's output for the reference and
+    grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell that was seen.
+    """
+
+    planes: Tensor
+    features: Tensor
+    grey: Tensor
+    seen: Tensor
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How samples are drawn, and how the work is cut into pieces; the pieces do not change what is computed."""
+
+    guidance: float = 7.5
+    """Weight of the guided over the unguided velocity; 1 switches guidance off and halves the work."""
+    rescale: float = 0.7
+    """Share of the guided velocity whose spread is pulled back to that of the conditional one."""
+    modalities_together: bool = True
+    guidance_together: bool = True
+    frames_at_once: int = 16
+    """Frames per pass of the autoencoder."""
+
+
+@dataclass(frozen=True)
+class ContextDropout:
+    """Shares of training clips that miss their caption only, caption and reference, or the reference only."""
+
+    text: float = 0.05
+    both: float = 0.05
+    reference: float = 0.15
+
+    @classmethod
+    def of(cls, reference: float) -> ContextDropout:
+        """With the reference missing in this share of the clips (0.2: the paper, 0.1: the released code)."""
+        both = min(cls.both, reference)
+        return cls(cls.text, both, round(min(reference - both, 1 - cls.text - both), 12))
+
+
+PAPER_DROPOUT = ContextDropout()
+"""The reference is missing in 20 % of the clips, as the paper says."""
+RELEASED_DROPOUT = ContextDropout(0.05, 0.05, 0.05)
+"""What the released training code does: each of the three in 5 % of the clips."""
+
+MODALITY_SHARES: dict[Modality, float] = {"rgb": 0.5, "semantics": 0.25, "depth": 0.25}
+"""How often a training clip shows which modality."""
+
+
+class PublishedMDM(nn.Module):
+    """The model (see the module text). The caption's embedding is a buffer: the text tower is not part of it."""
+
+    text: Tensor
+    scale: Tensor
+
+    def __init__(self, config: PublishedConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.sampling = Sampling()
+        self.codec = Autoencoder(config.codec)
+        self.net = VideoUNet(config.net)
+        self.image = ImageTower(config.image, config.image_patch, config.image_side)
+        self.image_tokens = Resampler(config.image_tokens)
+        self.schedule = Schedule(config.schedule)
+        self.register_buffer("text", torch.zeros(2, TEXT_TOKENS, config.text.width))
+        last = self.schedule.scale[-1:].expand(max(0, SCALE_ENTRIES - len(self.schedule)))
+        self.register_buffer("scale", torch.cat([self.schedule.scale, last])[:SCALE_ENTRIES])
+
+    def adopt_scale(self) -> None:
+        """Take the dynamic rescale from the buffer `scale`. To be called after weights were loaded."""
+        self.schedule.scale = self.scale[: len(self.schedule)].float().cpu()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights lie."""
+        return self.text.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Number format of the denoising network."""
+        return self.net.leave.weight.dtype  # type: ignore[return-value]
+
+    # inputs -----------------------------------------------------------------------------------------------------------
+
+    def check_size(self, height: int, width: int) -> None:
+        """UsageError unless an image of this size fits the network's strides."""
+        multiple = self.config.pixel_multiple
+        if height % multiple or width % multiple or height < multiple or width < multiple:
+            raise UsageError(
+                "image size does not fit the diffusion model",
+                expected=f"multiples of {multiple} pixels",
+                got=f"{width}x{height}",
+            )
+
+    def check_frames(self, frames: int) -> None:
+        """UsageError unless a clip has exactly the number of frames that the image tokens are made for."""
+        if frames != self.config.window:
+            raise UsageError(
+                "a clip of the published model has a fixed number of frames: its image tokens belong to one frame each",
+                where="PublishedMDM", expected=f"{self.config.window} frames", got=f"{frames}",
+                remedy=f"use trajectories of at least {self.config.window} frames; they are made in windows of that length",
+            )  # fmt: skip
+
+    def encode_condition(
+        self,
+        condition: Condition | Sequence[Condition],
+        generator: torch.Generator | None = None,
+        known: Tensor | None = None,
+    ) -> Encoded:
+        """Latents of the conditions of clips of one shape, and image features of their references (see `Encoded`).
+
+        generator   noise of the autoencoder's posterior; needed unless the configuration asks for its mean
+        known       colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
+                    colour there (of every clip), frame 0 excepted
+        """
+        batch = [condition] if isinstance(condition, Condition) else list(condition)
+        stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
+        return self.encode_planes(
+            stack("color"), stack("depth"), stack("valid"), stack("reference"), generator, known
+        )  # fmt: skip
+
+    def encode_planes(
+        self, color: Tensor, depth: Tensor, valid: Tensor, reference: Tensor, generator: torch.Generator | None = None,
+        known: Tensor | None = None,
+    ) -> Encoded:  # fmt: skip
+        """As `encode_condition`, from stacked tensors: color f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres,
+        valid bool[B,T,1,H,W], reference f32[B,3,H,W] in [0,1]."""
+        color, depth, valid, reference = (x.to(self.device) for x in (color, depth, valid.float(), reference))
+        self.check_size(*color.shape[-2:])
+        self.check_frames(color.shape[1])
+        if self.config.missing_is_zero:
+            color, depth = color * valid, depth * valid
+        seen = valid
+        if known is not None:
+            color = torch.cat([known.to(color).expand(len(color), -1, -1, -1, -1), color[:, len(known) :]], 1)
+            seen = torch.cat([torch.ones_like(seen[:, : len(known)]), seen[:, len(known) :]], 1)
+        color = torch.cat([reference[:, None], color[:, 1:]], 1)
+        seen = torch.cat([torch.ones_like(seen[:, :1]), seen[:, 1:]], 1)
+        generator = self._posterior(generator)
+        planes = torch.cat(
+            [self._encode(color * 2 - 1, generator), self._encode(self.codec.depth_image(depth), generator)], 2
+        )
+        images = torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])])
+        with torch.no_grad():
+            features = self.image(images)
+        seen = functional.avg_pool2d(seen.flatten(0, 1), self.codec.factor).unflatten(0, seen.shape[:2])
+        return Encoded(planes, features[:-1], features[-1:], seen)
+
+    def encode_truth(
+        self, rgb: Tensor, depth: Tensor, semantics: Tensor, generator: torch.Generator | None = None
+    ) -> dict[Modality, Tensor]:
+        """Latents of a clip's truth: rgb [B,T,3,H,W] in [0,1], depth [B,T,1,H,W] m (sky = far), semantics i64[B,T,H,W]."""
+        generator = self._posterior(generator)
+        images: dict[Modality, Tensor] = {
+            "rgb": rgb * 2 - 1, "depth": self.codec.depth_image(depth), "semantics": self.codec.semantic_image(semantics)
+        }  # fmt: skip
+        return {m: self._encode(image, generator) for m, image in images.items()}
+
+    def _encode(self, image: Tensor, generator: torch.Generator | None) -> Tensor:
+        with torch.no_grad():
+            return self.codec.encode(image.to(self.device), generator, self.sampling.frames_at_once)
+
+    def _posterior(self, generator: torch.Generator | None) -> torch.Generator | None:
+        if self.config.codec.posterior == "mean":
+            return None
+        if generator is None:
+            raise UsageError(
+                "encoding draws from the posterior and needs a generator",
+                where="PublishedMDM",
+                remedy='or use posterior = "mean"',
+            )
+        return generator
+
+    # network ----------------------------------------------------------------------------------------------------------
+
+    def predict(
+        self, x: Tensor, planes: Tensor, t: Tensor, names: Sequence[Modality], text: Tensor, tokens: Tensor
+    ) -> Tensor:
+        """Velocity f32[N,T,4,h,w] of noisy latents `x` of the same shape, modality `names[n]` each, at steps `t` i64[N].
+
+        planes [N,T,8,h,w]; text [N,77,D]; tokens [N,T,16,D].
+        """
+        label = torch.tensor([LABELS[m] for m in names], device=x.device)
+        inputs = torch.cat([x, planes], 2).to(self.dtype)
+        fps = torch.full_like(t, self.config.fps)
+        return self.net(inputs, t, label, fps, text.to(self.dtype), tokens.to(self.dtype)).float()
+
+    # training ---------------------------------------------------------------------------------------------------------
+
+    def loss(
+        self,
+        truth: Mapping[Modality, Tensor],
+        encoded: Encoded,
+        generator: torch.Generator,
+        *,
+        dropout: ContextDropout = PAPER_DROPOUT,
+        known: Mapping[Modality, Tensor] | None = None,
+        first: int = 0,
+        whole: int = 0,
+    ) -> Losses:
+        """Mean squared error of the velocity; every clip of the batch shows one modality, drawn by `MODALITY_SHARES`.
+
+        truth       latents of `encode_truth`, each [B,T,4,h,w]
+        generator   of all draws: modality, noise step, noise, which context is left out, dropout inside the network
+        known       f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere
+        first, whole  these clips are number `first` and following of a batch of `whole` clips (0 = of just these); what is
+                    drawn for a clip does not depend on how that batch is divided
+
+        Terms: one for each modality that any clip of the whole batch shows, so that all parts have the same; scaled so that the
+        mean over equal parts is the mean over the clips that show it.
+        """
+        batch = encoded.planes.shape[0]
+        whole, own = whole or batch, slice(first, first + batch)
+        t = noise.stratified_steps(whole, len(self.schedule), generator)[own].to(self.device)
+        shown = _draw_modalities(whole, generator)
+        names = shown[own]
+        x0 = torch.stack([truth[m][n] for n, m in enumerate(names)])
+        seed, shape = generator.initial_seed(), (1, *x0.shape[1:])
+        draws = [noise.video_noise(shape, seeds.torch_generator(seed, first + n, "noise")) for n in range(batch)]
+        eps = torch.cat(draws).to(self.device)
+        u = torch.rand(whole, generator=generator)[own].to(self.device)
+        no_text = u < dropout.text + dropout.both
+        no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
+        text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
+        features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
+        self._seed_dropout(seed, range(first, first + batch))
+        stated = self.predict(
+            self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
+        )
+        squares = (stated - self.schedule.velocity(x0, eps, t)).square()
+        if known:
+            everywhere = torch.ones_like(x0[0, :, :1])
+            squares = squares * torch.stack([known[m][n] if m in known else everywhere for n, m in enumerate(names)])
+        errors = squares.flatten(1).mean(1)
+        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in shown}
+        return Losses(errors.mean(), {m: total * whole / (batch * shown.count(m)) for m, total in sums.items()})
+
+    def _seed_dropout(self, seed: int, clips: range) -> None:
+        layers = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]
+        for number, layer in enumerate(layers):
+            layer.seeds = tuple(seeds.key(seed, clip, f"dropout {number}") for clip in clips)
+
+    def trained_part(self) -> nn.ModuleDict:
+        """What training changes, by attribute name: the denoising network and the resampler of the image tokens."""
+        return nn.ModuleDict({"net": self.net, "image_tokens": self.image_tokens})
+
+    def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
+        """Names in `trained_part` of the parameters that mix frames: of the temporal transformers inside the blocks, which is
+        what the published second stage froze, or of `all` temporal layers, which is what its text says."""
+        layers = temporal_layers(self.net, all_layers=which == "all")
+        ids = {id(parameter) for layer in layers for parameter in layer.parameters()}
+        return {name for name, parameter in self.trained_part().named_parameters() if id(parameter) in ids}
+
+    # sampling ---------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def sample(
+        self,
+        condition: Condition,
+        *,
+        steps: int = 50,
+        seed: int = 0,
+        index: int = 0,
+        sampler: str = "ddim",
+        eta: float = 1.0,
+        modalities: Sequence[Modality] = MODALITIES,
+        n_samples: int = 1,
+        known: Mapping[Modality, Tensor] | None = None,
+        start: Mapping[Modality, Tensor] | None = None,
+        strength: float = 1.0,
+        align: bool = True,
+        bf16: bool = False,
+    ) -> Sample:
+        """Generate one clip of exactly `config.window` frames; guidance and the cutting of the work are in `self.sampling`.
+
+        condition   H and W multiples of `config.pixel_multiple`
+        steps       denoiser passes per modality (two networks' worth each with guidance), from the noisiest step down
+        known       latents [k,4,h,w] of the first k frames from the previous window. Their colour, decoded, takes the place of the
+                    sparse colour of these frames: the published way to continue a video. Depth and semantics are not continued.
+        bf16        run the networks in bfloat16 where their weights are wider
+        align       bring each frame's depth to the measured scale (`core.align`); otherwise depth is what the model says
+        Other arguments as in `MDM.sample`.
+        """
+        check_request(sampler, modalities)
+        self.check_frames(len(condition.views))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16 and self.dtype == torch.float32):
+            before = known.get("rgb") if known else None
+            if before is not None:
+                before = self.codec.decode({"rgb": before.to(self.device)}, self.sampling.frames_at_once).rgb
+            encoded = self.encode_condition(condition, seeds.torch_generator(seed, index, "posterior"), before)
+            tokens = self.image_tokens(torch.cat([encoded.features, encoded.grey]).to(self.image_tokens.queries.dtype))
+            together: tuple[Modality, ...] = tuple(modalities)
+            groups = (
+                [together] if self.sampling.modalities_together else [together[n : n + 1] for n in range(len(together))]
+            )
+            drawn: list[dict[Modality, Tensor]] = []
+            change: Tensor | None = None
+            for number in range(n_samples):
+                latents: dict[Modality, Tensor] = {}
+                for names in groups:
+                    part, moved = self._denoise(encoded, names, tokens, steps, seed, index * 64 + number, sampler, eta, start,
+                                                strength)  # fmt: skip
+                    latents |= part
+                    change = moved if change is None else change
+                drawn.append(latents)
+            latents = drawn[0]
+            if n_samples > 1:
+                first = next(iter(latents))
+                change = torch.stack([d[first] for d in drawn]).std(0).mean(1, keepdim=True) * 2
+            decoded = self.codec.decode(latents, self.sampling.frames_at_once)
+        if change is None:
+            raise UsageError("no sampling step was made", where="PublishedMDM.sample")
+        confidence = confidence_of(encoded.seen[0].cpu(), change.cpu(), self.codec.factor)
+        rgb, depth, ids = (None if y is None else y.cpu() for y in (decoded.rgb, decoded.depth, decoded.semantics))
+        fits: list[DepthFit] = []
+        if depth is not None and align:
+            depth, fits = align_depth(depth, condition.depth, condition.valid)
+            confidence = confidence * depth_agreement(depth, condition)
+        return Sample(rgb, depth, ids, confidence, {m: z.cpu() for m, z in latents.items()}, tuple(fits))
+
+    def condition_latents(self, condition: Condition) -> dict[Modality, Tensor]:
+        """The condition's colour and depth as latents [T,4,h,w] of all modalities, to `start` from; its colour stands in for
+        classes, which it does not have."""
+        rgb, depth = self.codec.encode_rgb(condition.color.to(self.device)), self.codec.encode_depth(condition.depth.to(self.device))
+        return {"rgb": rgb, "depth": depth, "semantics": rgb}
+
+    def _denoise(
+        self,
+        encoded: Encoded,
+        names: tuple[Modality, ...],
+        tokens: Tensor,
+        steps: int,
+        seed: int,
+        index: int,
+        sampler: str,
+        eta: float,
+        start: Mapping[Modality, Tensor] | None,
+        strength: float,
+    ) -> tuple[dict[Modality, Tensor], Tensor]:
+        """Sample some modalities in one batch; returns their latents [T,4,h,w] and how much the first still changed [T,1,h,w].
+
+        `tokens` [2,T,16,D]: with the reference and without. Every modality has its own stream of noise.
+        """
+        _, frames, _, h, w = encoded.planes.shape
+        shape = (1, frames, self.config.codec.latent_channels, h, w)
+        streams = [seeds.torch_generator(seed, index, f"sample {m}") for m in names]
+        draw = lambda: torch.cat([noise.video_noise(shape, g) for g in streams]).to(self.device)  # noqa: E731
+        velocity = self._guided(encoded, names, tokens)
+        estimates: list[Tensor] = []
+        indices = noise.trailing_steps(len(self.schedule), steps)
+        begin = draw()
+        if start is not None:
+            indices = noise.partial_steps(indices, len(self.schedule), strength)
+            given = torch.stack([start[m].to(self.device) for m in names])
+            begin = self.schedule.add_noise(given, begin, torch.full((len(names),), indices[0], device=self.device))
+        elif strength != 1.0:
+            raise UsageError("strength needs something to start from", got=str(strength), remedy="strength = 1")
+
+        def watch(number: int, x0: Tensor) -> None:
+            if 2 * number >= len(indices) - 1:
+                estimates.append(x0[0])
+
+        x = noise.SAMPLERS[sampler](
+            velocity,
+            begin,
+            self.schedule,
+            indices,
+            prediction="v",
+            eta=eta,
+            draw=draw,
+            last="first_alpha",
+            on_step=watch,
+        )
+        moved = torch.stack([(e - x[0]).abs().mean(1, keepdim=True) for e in estimates]).mean(0)
+        return {m: x[n] for n, m in enumerate(names)}, moved
+
+    def _guided(self, encoded: Encoded, names: tuple[Modality, ...], tokens: Tensor) -> Callable[[Tensor, int], Tensor]:
+        """The denoiser for `names` in one batch: velocity with classifier-free guidance."""
+        rules, count = self.sampling, len(names)
+
+        def passed(x: Tensor, t: int, kinds: Sequence[int]) -> Tensor:
+            """Velocities [K*N,...] with (0) and without (1) caption and reference."""
+            n = len(kinds)
+            return self.predict(
+                x.repeat(n, 1, 1, 1, 1), encoded.planes.expand(n * count, -1, -1, -1, -1),
+                torch.full((n * count,), t, device=x.device), names * n,
+                self.text[list(kinds)].repeat_interleave(count, 0), tokens[list(kinds)].repeat_interleave(count, 0),
+            )  # fmt: skip
+
+        def velocity(x: Tensor, t: int) -> Tensor:
+            if rules.guidance == 1:
+                return passed(x, t, [0])
+            if rules.guidance_together:
+                with_context, without = passed(x, t, [0, 1]).chunk(2)
+            else:
+                with_context, without = passed(x, t, [0]), passed(x, t, [1])
+            return noise.guide(with_context, without, rules.guidance, rules.rescale)
+
+        return velocity
+
+
+def _draw_modalities(count: int, generator: torch.Generator) -> list[Modality]:
+    u = torch.rand(count, generator=generator, dtype=torch.float64)
+    limits = torch.tensor(list(MODALITY_SHARES.values()), dtype=torch.float64).cumsum(0)[:-1]
+    names = list(MODALITY_SHARES)
+    return [names[int(place)] for place in torch.bucketize(u, limits, right=True)]
+
+
+def choose_trainable(
+    model: PublishedMDM, stage: Literal[1, 2], temporal: Literal["transformers", "all"] = "transformers"
+) -> list[nn.Parameter]:
+    """Switch gradients on for the parameters that a training stage moves, off for the rest; returns those that move.
+
+    Stage 1 (low resolution): the whole denoising network and the resampler. Stage 2 (high resolution): the same without the temporal
+    transformers of the blocks, which is what the published training did, or with `temporal = "all"` without any temporal layer,
+    which is what its text says. Autoencoder and image tower never move.
+    """
+    if stage not in (1, 2) or temporal not in ("transformers", "all"):
+        raise UsageError(
+            "unknown training stage", expected="stage 1 or 2, temporal transformers or all", got=f"{stage}, {temporal}"
+        )
+    model.requires_grad_(False)
+    model.net.requires_grad_(True)
+    model.image_tokens.requires_grad_(True)
+    if stage == 2:
+        for layer in temporal_layers(model.net, all_layers=temporal == "all"):
+            layer.requires_grad_(False)
+    return [p for p in model.parameters() if p.requires_grad]

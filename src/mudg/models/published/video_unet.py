@@ -1,0 +1,378 @@
+"""The denoising network of the published model: a latent-video UNet with spatial and temporal transformers.
+
+Everything except the temporal layers works on frames, [B*T,C,h,w]. A frame sees the others in three places: in the four
+1-D convolutions over time inside each residual block, in the temporal transformers (self-attention over the T frames at one
+cell; order is known only through the convolutions and the image tokens), and in `first`, one more temporal transformer right
+after the input convolution. Cross-attention looks at the caption's tokens and, with keys and values of its own, at the 16
+image tokens that belong to the frame.
+
+The vector that modulates the residual blocks is time(t) + label(modality) + fps(rate), all through sinusoids.
+
+Source: paper of MuDG, section on the multi-modal diffusion model; architecture of DynamiCrafter (Xing et al.) with a modality label added.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
+
+from mudg.base.errors import UsageError
+from mudg.models.mdm.unet import sinusoid
+
+GROUPS = 32
+MAX_ATTENTION_BATCH = 32768
+"""Attention over more sequences than this is done in parts: GPU kernels have a limit of 65535."""
+
+
+@dataclass(frozen=True)
+class VideoUNetConfig:
+    """Sizes of the network; the defaults are the published ones (1,440,917,060 parameters)."""
+
+    channels_in: int = 12
+    channels_out: int = 4
+    width: int = 320
+    multipliers: tuple[int, ...] = (1, 2, 4, 4)
+    blocks: int = 2
+    """Residual blocks per level on the way down; one more on the way up."""
+    attention: tuple[bool, ...] = (True, True, True, False)
+    """Levels with transformers; the middle always has them."""
+    head_width: int = 64
+    first_heads: int = 8
+    context_width: int = 1024
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        if len(self.multipliers) != len(self.attention):
+            raise UsageError(
+                "multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}"
+            )
+        if self.width % GROUPS:
+            raise UsageError(
+                "the width is no multiple of the normalisation groups",
+                expected=f"multiple of {GROUPS}",
+                got=str(self.width),
+            )
+
+
+class SeededDropout(nn.Module):
+    """Dropout that draws for each clip from a seed of its own; the caller sets `seeds`, one per clip, before a training step.
+
+    What is drawn depends on the layer's seeds alone: neither on the other clips of the batch nor on when the layer is run, so
+    that a second computation in the backward pass draws the same.
+    """
+
+    seeds: tuple[int, ...] = ()
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B*n,..] -> the same; the first axis holds the clips one after another."""
+        if not self.training or self.share == 0:
+            return x
+        if not self.seeds or len(x) % len(self.seeds):
+            raise UsageError(
+                "dropout needs a seed for every clip", where="SeededDropout", expected=f"a divisor of {len(x)} seeds",
+                got=str(len(self.seeds)), remedy="call PublishedMDM.loss, or eval()",
+            )  # fmt: skip
+        shape = (len(x) // len(self.seeds), *x.shape[1:])
+        draws = [
+            torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
+        ]
+        return x * (torch.cat(draws) >= self.share).to(x) / (1 - self.share)
+
+
+def attend(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
+    """Softmax attention of `query` [N,L,C] over `key`, `value` [N,M,C] with C split into `heads` -> [N,L,C]."""
+    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (query, key, value))
+    if len(q) > MAX_ATTENTION_BATCH:
+        parts = zip(*(x.split(MAX_ATTENTION_BATCH) for x in (q, k, v)))
+        mixed = torch.cat([functional.scaled_dot_product_attention(*part) for part in parts])
+    else:
+        mixed = functional.scaled_dot_product_attention(q, k, v)
+    return mixed.transpose(1, 2).flatten(2)
+
+
+class Attention(nn.Module):
+    """Multi-head attention; with `image`, a second attention over image tokens is added before the output projection."""
+
+    def __init__(self, width: int, context_width: int, heads: int, image: bool, dropout: float) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width, bias=False)
+        self.key = nn.Linear(context_width, width, bias=False)
+        self.value = nn.Linear(context_width, width, bias=False)
+        self.image_key = nn.Linear(context_width, width, bias=False) if image else None
+        self.image_value = nn.Linear(context_width, width, bias=False) if image else None
+        self.out = nn.Linear(width, width)
+        self.dropout = SeededDropout(dropout)
+
+    def forward(self, tokens: Tensor, text: Tensor | None = None, image: Tensor | None = None) -> Tensor:
+        """`tokens` [N,L,C]; `text` [N/T,77,D] or None for self-attention; `image` [N,16,D] -> [N,L,C]."""
+        query = self.query(tokens)
+        if text is None:
+            mixed = attend(query, self.key(tokens), self.value(tokens), self.heads)
+        else:
+            repeats = len(tokens) // len(text)
+            key, value = (p(text).repeat_interleave(repeats, 0) for p in (self.key, self.value))
+            mixed = attend(query, key, value, self.heads)
+        if image is not None and self.image_key is not None and self.image_value is not None:
+            mixed = mixed + attend(query, self.image_key(image), self.image_value(image), self.heads)
+        return self.dropout(self.out(mixed))
+
+
+class GatedFeedForward(nn.Module):
+    """Linear - a * GELU(b) - Linear, hidden width four times the outer one (Shazeer, "GLU variants")."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.enter = nn.Linear(width, 8 * width)
+        self.dropout = SeededDropout(dropout)
+        self.out = nn.Linear(4 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N,L,C] -> the same."""
+        value, gate = self.enter(x).chunk(2, -1)
+        return self.out(self.dropout(value * functional.gelu(gate)))
+
+
+class TransformerBlock(nn.Module):
+    """Attention, attention, feed-forward, each after a layer norm and around a residual."""
+
+    def __init__(self, width: int, heads: int, context_width: int | None, dropout: float) -> None:
+        super().__init__()
+        self.norm1, self.norm2, self.norm3 = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attention1 = Attention(width, width, heads, False, dropout)
+        self.attention2 = Attention(width, context_width or width, heads, context_width is not None, dropout)
+        self.feed = GatedFeedForward(width, dropout)
+
+    def forward(self, x: Tensor, text: Tensor | None = None, image: Tensor | None = None) -> Tensor:
+        """`x` [N,L,C] -> the same."""
+        x = x + self.attention1(self.norm1(x))
+        x = x + self.attention2(self.norm2(x), text, image)
+        return x + self.feed(self.norm3(x))
+
+
+def _zero(layer: nn.Module) -> nn.Module:
+    for value in layer.parameters():
+        nn.init.zeros_(value)
+    return layer
+
+
+class SpatialTransformer(nn.Module):
+    """Self-attention over the cells of a frame and cross-attention to caption and image tokens."""
+
+    def __init__(self, width: int, config: VideoUNetConfig) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(GROUPS, width, eps=1e-6)
+        self.enter = nn.Linear(width, width)
+        self.block = TransformerBlock(width, width // config.head_width, config.context_width, config.dropout)
+        self.out = _zero(nn.Linear(width, width))
+
+    def forward(self, x: Tensor, text: Tensor, image: Tensor) -> Tensor:
+        """`x` [B*T,C,h,w], `text` [B,77,D], `image` [B*T,16,D] -> [B*T,C,h,w]."""
+        tokens = self.enter(self.norm(x).flatten(2).transpose(1, 2))
+        tokens = self.out(self.block(tokens, text, image))
+        return x + tokens.transpose(1, 2).unflatten(2, x.shape[2:])
+
+
+class TemporalTransformer(nn.Module):
+    """Two self-attentions over the frames of a clip, at every cell for itself."""
+
+    def __init__(self, width: int, inner: int, heads: int, dropout: float, convolution: bool = False) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(GROUPS, width, eps=1e-6)
+        self.enter = nn.Conv1d(width, inner, 1) if convolution else nn.Linear(width, inner)
+        self.block = TransformerBlock(inner, heads, None, dropout)
+        self.out = _zero(nn.Conv1d(inner, width, 1) if convolution else nn.Linear(inner, width))
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same. Normalised over all frames of a clip together."""
+        n, c, h, w = x.shape
+        video = x.unflatten(0, (n // frames, frames)).transpose(1, 2)
+        tokens = self.norm(video).permute(0, 3, 4, 2, 1).reshape(-1, frames, c)
+        tokens = functional.linear(tokens, self.enter.weight.flatten(1), self.enter.bias)
+        tokens = self.block(tokens)
+        tokens = functional.linear(tokens, self.out.weight.flatten(1), self.out.bias)  # type: ignore[arg-type, operator, union-attr]
+        return x + tokens.reshape(n // frames, h, w, frames, c).permute(0, 3, 4, 1, 2).reshape(n, c, h, w)
+
+
+class TemporalConv(nn.Module):
+    """norm - SiLU - convolution over three neighbouring frames."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(GROUPS, width)
+        self.dropout = SeededDropout(dropout)
+        self.conv = nn.Conv3d(width, width, (3, 1, 1), padding=(1, 0, 0))
+
+    def forward(self, video: Tensor) -> Tensor:
+        """[B,C,T,h,w] -> the same."""
+        return self.conv(self.dropout(functional.silu(self.norm(video))))
+
+
+class ResBlock(nn.Module):
+    """norm - SiLU - conv, the embedding added, norm - SiLU - conv, around a residual; then four temporal convolutions around another."""
+
+    def __init__(self, inside: int, outside: int, embed: int, dropout: float) -> None:
+        super().__init__()
+        self.norm1 = nn.GroupNorm(GROUPS, inside)
+        self.conv1 = nn.Conv2d(inside, outside, 3, padding=1)
+        self.embed = nn.Linear(embed, outside)
+        self.norm2 = nn.GroupNorm(GROUPS, outside)
+        self.dropout = SeededDropout(dropout)
+        self.conv2 = _zero(nn.Conv2d(outside, outside, 3, padding=1))
+        self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
+        self.temporal = nn.ModuleList(TemporalConv(outside, dropout if n else 0.0) for n in range(4))
+        _zero(self.temporal[-1].conv)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
+        h = self.conv1(functional.silu(self.norm1(x)))
+        h = h + self.embed(functional.silu(embedding))[:, :, None, None]
+        h = self.conv2(self.dropout(functional.silu(self.norm2(h))))
+        h = self.skip(x) + h
+        video = h.unflatten(0, (-1, frames)).transpose(1, 2)
+        for conv in self.temporal:
+            video = conv(video)
+        return h + video.transpose(1, 2).flatten(0, 1)
+
+
+class Stage(nn.Module):
+    """One step down or up the U: a plain convolution (`conv`), or a residual block with its transformers, and what enlarges after it."""
+
+    def __init__(
+        self, inside: int, outside: int, config: VideoUNetConfig, *, conv_stride: int = 0, attention: bool = False,
+        grow: bool = False,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.conv = nn.Conv2d(inside, outside, 3, stride=conv_stride, padding=1) if conv_stride else None
+        self.res = None if conv_stride else ResBlock(inside, outside, 4 * config.width, config.dropout)
+        self.spatial = SpatialTransformer(outside, config) if attention else None
+        heads = outside // config.head_width
+        self.temporal = TemporalTransformer(outside, outside, heads, config.dropout) if attention else None
+        self.grow = nn.Conv2d(outside, outside, 3, padding=1) if grow else None
+
+    def forward(self, x: Tensor, embedding: Tensor, text: Tensor, image: Tensor, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w] -> [B*T,outside,h',w']."""
+        if self.conv is not None:
+            return self.conv(x)
+        if self.res is not None:
+            x = self.res(x, embedding, frames)
+        if self.spatial is not None and self.temporal is not None:
+            x = self.temporal(self.spatial(x, text, image), frames)
+        if self.grow is not None:
+            x = self.grow(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
+        return x
+
+
+class Middle(nn.Module):
+    """The bottom of the U: residual block, both transformers, residual block."""
+
+    def __init__(self, width: int, config: VideoUNetConfig) -> None:
+        super().__init__()
+        self.res1 = ResBlock(width, width, 4 * config.width, config.dropout)
+        self.spatial = SpatialTransformer(width, config)
+        self.temporal = TemporalTransformer(width, width, width // config.head_width, config.dropout)
+        self.res2 = ResBlock(width, width, 4 * config.width, config.dropout)
+
+    def forward(self, x: Tensor, embedding: Tensor, text: Tensor, image: Tensor, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same."""
+        x = self.temporal(self.spatial(self.res1(x, embedding, frames), text, image), frames)
+        return self.res2(x, embedding, frames)
+
+
+def _embedding(width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(width, 4 * width), nn.SiLU(), nn.Linear(4 * width, 4 * width))
+
+
+class VideoUNet(nn.Module):
+    """The network (see the module text)."""
+
+    def __init__(self, config: VideoUNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.checkpointing = False
+        """Training: keep only what passes between stages, and compute the rest again in the backward pass."""
+        width, top = config.width, len(config.multipliers) - 1
+        self.time, self.label, self.fps = _embedding(width), _embedding(width), _embedding(width)
+        _zero(self.fps[2])
+        inner = config.first_heads * config.head_width
+        self.first = TemporalTransformer(width, inner, config.first_heads, config.dropout, convolution=True)
+        self.down = nn.ModuleList([Stage(config.channels_in, width, config, conv_stride=1)])
+        skips, inside = [width], width
+        for level, multiplier in enumerate(config.multipliers):
+            for _ in range(config.blocks):
+                self.down.append(Stage(inside, multiplier * width, config, attention=config.attention[level]))
+                inside = multiplier * width
+                skips.append(inside)
+            if level < top:
+                self.down.append(Stage(inside, inside, config, conv_stride=2))
+                skips.append(inside)
+        self.middle = Middle(inside, config)
+        self.up = nn.ModuleList()
+        for level in reversed(range(top + 1)):
+            outside = config.multipliers[level] * width
+            for number in range(config.blocks + 1):
+                grow = level > 0 and number == config.blocks
+                self.up.append(
+                    Stage(inside + skips.pop(), outside, config, attention=config.attention[level], grow=grow)
+                )
+                inside = outside
+        self.norm = nn.GroupNorm(GROUPS, inside)
+        self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))
+
+    @property
+    def multiple(self) -> int:
+        """Latent sides must be multiples of this."""
+        return 2 ** (len(self.config.multipliers) - 1)
+
+    def forward(self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor) -> Tensor:
+        """One denoiser pass.
+
+        x      [B,T,channels_in,h,w]: noisy latent, latent of the colour condition, latent of the depth condition
+        t      i64[B] noise step; label i64[B] modality; fps i64[B] frames per second
+        text   [B,77,D] caption tokens; image [B,T,16,D] image tokens of each frame
+        Returns v [B,T,channels_out,h,w]. Raises UsageError when the image tokens are for another number of frames.
+        """
+        batch, frames = x.shape[:2]
+        if image.shape[1] != frames:
+            raise UsageError(
+                "the image tokens are made for another number of frames", where="VideoUNet", expected=f"{image.shape[1]} frames",
+                got=f"{frames}", remedy="give the model clips of exactly the length it was trained on",
+            )  # fmt: skip
+        wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)  # noqa: E731
+        embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
+        embedding = embedding.repeat_interleave(frames, 0)
+        image = image.flatten(0, 1)
+        h = x.flatten(0, 1)
+        skips = []
+        for number, stage in enumerate(self.down):
+            h = self._run(stage, h, embedding, text, image, frames)
+            if number == 0:
+                h = self.first(h, frames)
+            skips.append(h)
+        h = self._run(self.middle, h, embedding, text, image, frames)
+        for stage in self.up:
+            h = self._run(stage, torch.cat([h, skips.pop()], 1), embedding, text, image, frames)
+        return self.leave(functional.silu(self.norm(h))).unflatten(0, (batch, frames))
+
+    def _run(self, stage: nn.Module, *inputs: Tensor | int) -> Tensor:
+        """A stage, kept for the backward pass or not. Dropout draws the same numbers when it is computed again."""
+        if not (self.checkpointing and self.training and torch.is_grad_enabled()):
+            return stage(*inputs)
+        return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)  # type: ignore[return-value]
+
+
+def temporal_layers(net: VideoUNet, *, all_layers: bool) -> list[nn.Module]:
+    """What stage 2 keeps frozen: the temporal transformers inside the blocks, as the published training did, or with
+    `all_layers` the one after the input convolution and the temporal convolutions too."""
+    found: list[nn.Module] = [m for m in net.modules() if isinstance(m, TemporalTransformer) and m is not net.first]
+    if all_layers:
+        found += [net.first, *(m for m in net.modules() if isinstance(m, TemporalConv))]
+    return found

@@ -1,0 +1,1 @@
+"""The dynamic Gaussian scene: nodes, motion, densification, appearance."""

@@ -1,0 +1,212 @@
+"""Densification by screen gradient: grow Gaussians where the image asks for detail, drop those that do nothing.
+
+The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): every ``every`` steps rows whose mean screen
+gradient exceeds a threshold are cloned (small) or split in two (large); rows that are transparent, grown out of proportion,
+or have left their box are removed; now and then opacities are pulled down so that what is not needed fades. The background
+is judged by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain ones. Growth is
+bounded by ``max_rows``: the rows with the largest gradients go first.
+
+State is explicit: statistics belong to rows of the table, the schedule is a function of the step. Which views may speak is the
+caller's choice (``stages/fit.py`` feeds recorded views only, see ``Observation.kind``). ``models/scene/mcmc.py`` is the alternative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mudg.base import seeds
+from mudg.base.types import RasterTrace
+from mudg.core.table import Table
+from mudg.models.scene.nodes import RigidNode, SceneModel
+
+SPLIT_SHRINK = 1.6
+"""Both halves of a split Gaussian are this much smaller (published value)."""
+
+
+@dataclass(frozen=True)
+class DensifySettings:
+    """When and how to densify. Steps count from 1.
+
+    Args:
+        start, stop, every: densify after step s when start <= s <= stop and s is a multiple of ``every``.
+        static_gradient, object_gradient: thresholds on the mean absolute screen gradient, in units of half the image
+            (published: 6e-4 for the background, 2e-4 for objects).
+        split_above_m: rows whose largest scale exceeds this are split, smaller ones cloned.
+        max_rows: growth stops here.
+        growth: at most this share of the present rows is added at a time.
+        prune_opacity: rows below are removed.
+        prune_scale_m: rows larger are removed (static rows only beyond ``start``).
+        box_margin: object rows outside this many half-sizes of their box are removed.
+        reset_every: steps between opacity resets, 0 = never. reset_opacity: the value opacities are pulled down to.
+    """
+
+    start: int
+    stop: int
+    every: int
+    static_gradient: float = 6e-4
+    object_gradient: float = 2e-4
+    split_above_m: float = 0.2
+    max_rows: int = 150_000
+    growth: float = 0.3
+    prune_opacity: float = 0.005
+    prune_scale_m: float = 8.0
+    box_margin: float = 1.25
+    reset_every: int = 0
+    reset_opacity: float = 0.01
+
+    def due(self, step: int) -> bool:
+        """Whether to densify after step ``step`` (from 1)."""
+        return self.start <= step <= self.stop and step % self.every == 0
+
+    def reset_due(self, step: int) -> bool:
+        """Whether to pull opacities down after step ``step``."""
+        return self.reset_every > 0 and self.start <= step <= self.stop and step % self.reset_every == 0
+
+
+@dataclass
+class DensifyStats:
+    """What was seen of each row since the last densification: ``gradient`` f32[N] (sum), ``seen`` f32[N] (views)."""
+
+    gradient: Tensor
+    seen: Tensor
+
+    @classmethod
+    def zeros(cls, rows: int) -> DensifyStats:
+        """Nothing seen yet."""
+        return cls(torch.zeros(rows), torch.zeros(rows))
+
+    def observe(self, trace: RasterTrace, width: int, height: int, plain_from: int | None = None) -> None:
+        """Add one backward pass (gradients in pixels; stored in units of half the image).
+
+        Args:
+            trace: of a render with absolute gradients, after backward.
+            plain_from: rows from here on (those of the objects) count with their plain gradient, where the contributions
+                of single pixels cancel; None = all rows with the absolute one.
+        """
+        if trace.abs_grad2d is None:
+            raise ValueError("the render was made without absolute gradients")
+        gradient = trace.abs_grad2d
+        if plain_from is not None and plain_from < len(gradient) and trace.means2d.grad is not None:
+            gradient = torch.cat([gradient[:plain_from], trace.means2d.grad[plain_from:]])
+        half_size = torch.tensor([width / 2, height / 2])
+        visible = trace.visible
+        length = torch.view_as_complex(gradient * half_size).abs()  # far faster than a norm over rows of two
+        self.gradient += length * visible
+        self.seen += visible
+
+    def state(self) -> dict[str, Tensor]:
+        """For a checkpoint."""
+        return {"gradient": self.gradient, "seen": self.seen}
+
+    @classmethod
+    def from_state(cls, tensors: Mapping[str, Tensor]) -> DensifyStats:
+        """Inverse of ``state``."""
+        return cls(tensors["gradient"].clone(), tensors["seen"].clone())
+
+
+def densify(model: SceneModel, stats: DensifyStats, step: int, settings: DensifySettings, run_seed: int) -> dict[str, Any]:
+    """Clone, split and prune rows of the model's table in place; the caller starts new statistics.
+
+    Args:
+        step: finished steps; with ``run_seed`` it decides all random draws.
+
+    Returns:
+        Counts: ``cloned``, ``split``, ``pruned``, ``rows`` (after).
+    """
+    grow = _rows_to_grow(model, stats, settings)
+    largest = model.table["log_scales"].detach().amax(1).exp()
+    split_rows = (grow & (largest > settings.split_above_m)).nonzero()[:, 0]
+    clone_rows = (grow & (largest <= settings.split_above_m)).nonzero()[:, 0]
+    keep = torch.ones(len(model.table), dtype=torch.bool)
+    keep[split_rows] = False
+    halves = [(split_rows, *half) for half in _halves(model, split_rows, step, run_seed)]
+    for parents, columns, labels in ((clone_rows, *_rows(model, clone_rows)), *halves):
+        if len(parents):
+            model.table.append(columns, labels, like=parents)
+    keep = torch.cat([keep, torch.ones(len(model.table) - len(keep), dtype=torch.bool)])
+    doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
+    pruned = int((doomed & keep).sum())
+    model.table.take(keep & ~doomed)
+    model.sort_rows()
+    return {"cloned": len(clone_rows), "split": len(split_rows), "pruned": pruned, "rows": len(model.table)}
+
+
+def reset_opacity(model: SceneModel, settings: DensifySettings) -> None:
+    """Pull every opacity down to at most ``settings.reset_opacity`` and forget its moments."""
+    ceiling = torch.logit(torch.tensor(settings.reset_opacity))
+    model.table.columns["logits"].detach().clamp_(max=float(ceiling))
+    model.table.reset_moments("logits")
+
+
+def shorten_needles(table: Table, longest_to_middle: float) -> None:
+    """Cut every Gaussian's longest axis down to ``longest_to_middle`` times its middle one, in place.
+
+    Cameras that all move along one line cannot tell a long thin Gaussian along that line from the right one; from the side
+    it sticks out. Discs (two long axes) stay.
+    """
+    scales = table.columns["log_scales"].detach()
+    middle = scales.median(1, keepdim=True).values
+    torch.minimum(scales, middle + torch.log(torch.tensor(longest_to_middle)), out=scales)
+
+
+def _rows_to_grow(model: SceneModel, stats: DensifyStats, settings: DensifySettings) -> Tensor:
+    """Bool[N]: rows over their threshold, the strongest first where the budget is short."""
+    mean = stats.gradient / stats.seen.clamp_min(1)
+    static = torch.tensor([node.kind == "static" for node in model.nodes])[model.table.labels["node"].long()]
+    relative = mean / torch.where(static, settings.static_gradient, settings.object_gradient)
+    wanted = relative > 1
+    budget = min(settings.max_rows - len(model.table), int(settings.growth * len(model.table)))
+    if budget <= 0:
+        return torch.zeros_like(wanted)
+    if int(wanted.sum()) > budget:
+        order = torch.sort(relative, descending=True, stable=True).indices[:budget]
+        wanted = torch.zeros_like(wanted)
+        wanted[order] = True
+    return wanted
+
+
+def _rows(model: SceneModel, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    table = model.table
+    columns = {name: value.detach()[rows].clone() for name, value in table.columns.items()}
+    return columns, {name: value[rows].clone() for name, value in table.labels.items()}
+
+
+def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
+    """Two smaller Gaussians drawn from each split one (centres sampled from its own density)."""
+    halves = []
+    for half in (0, 1):
+        columns, labels = _rows(model, rows)
+        generator = seeds.torch_generator(run_seed, step, f"split half {half}")
+        noise = torch.randn(len(rows), 3, generator=generator)
+        local = torch.exp(columns["log_scales"]) * noise
+        columns["means"] = columns["means"] + rotate(columns["quats"], local)
+        columns["log_scales"] = columns["log_scales"] - torch.log(torch.tensor(SPLIT_SHRINK))
+        halves.append((columns, labels))
+    return halves
+
+
+def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, box_margin: float) -> Tensor:
+    """Bool[N]: transparent, oversized, not finite, or outside ``box_margin`` times the box it belongs to (plus 0.1 m)."""
+    table = model.table
+    means = table["means"].detach()
+    doomed = torch.sigmoid(table["logits"].detach()) < prune_opacity
+    doomed |= table["log_scales"].detach().amax(1).exp() > prune_scale_m
+    doomed |= ~torch.isfinite(means).all(1)
+    half_size = torch.full((len(model.nodes), 3), torch.inf)
+    for index, node in enumerate(model.nodes):
+        if isinstance(node, RigidNode):
+            half_size[index] = torch.tensor(node.size_m) / 2 * box_margin + 0.1
+    return doomed | (means.abs() > half_size[table.labels["node"].long()]).any(1)
+
+
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate ``[n, 3]`` vectors by ``[n, 4]`` quaternions (w, x, y, z), normalised here."""
+    unit = torch.nn.functional.normalize(quats, dim=1)
+    w, axis = unit[:, :1], unit[:, 1:]
+    cross = torch.linalg.cross(axis, vectors)
+    return vectors + 2 * (w * cross + torch.linalg.cross(axis, cross))

@@ -1,0 +1,1 @@
+"""Pages, videos, contact sheets and tables made from results."""

@@ -1,0 +1,255 @@
+"""Starting values of a scene model: fused points become Gaussians, what LiDAR never reached is filled in, the sky is painted.
+
+What LiDAR does not reach in a street: facades above the topmost beam, and everything beyond its range. Both are filled from
+the recorded images: a pixel that is not sky, not a moving thing and has no point near it takes the depth of the surface of
+the same class below it in its column (walls, trees and poles stand upright, so their camera z hardly changes upwards); where
+there is none it is put on a far shell. This needs semantic labels; without them nothing is filled and the sky stands in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mudg.base import geometry, log, seeds
+from mudg.base.errors import InputError
+from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
+from mudg.base.types import FusedCloud, PointCloud, Scene
+from mudg.core.table import Table
+from mudg.models.scene.nodes import (
+    RigidNode,
+    SceneModel,
+    SkyNode,
+    StaticNode,
+    box_grid,
+    columns_from_points,
+    neighbour_scale,
+    object_node,
+    voxel_filter,
+)  # fmt: skip
+from mudg.stages.fitting.views import StoredView
+
+UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation"))
+GROUND_IDS = tuple(ID[n] for n in ("road", "sidewalk", "terrain"))
+FILL_CELL_PX = 8
+FILL_FRAMES = 30
+SKY_ROWS = 192
+FEWEST_OBJECT_POINTS = 150
+MIRROR_APART_M = 0.25
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """Numbers of the start; see ``FitConfig`` for their meaning."""
+
+    initial_gaussians: int
+    voxel_m: float
+    far_m: float
+    sh_degree: int
+    with_objects: bool
+    with_sky: bool
+    learn_poses: bool
+    seed: int
+    deformable: bool = False
+    color_terms: int = 0
+    mirror: bool = False
+    outlier_deviations: float = 0.0
+
+
+def start_model(
+    scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], settings: StartSettings
+) -> SceneModel:
+    """Build the scene model that the fit starts from.
+
+    Raises:
+        InputError: the fused cloud has no points at all.
+    """
+    if len(fused.static) == 0:
+        raise InputError("the fused cloud has no static points to start from", where=scene.root, remedy="check the LiDAR of the scene")
+    blocks = [_static_columns(scene, fused.static, views, classes, settings)]
+    nodes: list[StaticNode | RigidNode] = [StaticNode()]
+    if settings.with_objects:
+        share = settings.initial_gaussians // max(1, len(fused.objects))
+        for track_id, cloud in sorted(fused.objects.items()):
+            node = object_node(scene.track(track_id), settings.learn_poses, settings.deformable)
+            blocks.append(_object_columns(node, cloud, classes, settings, min(share, 8000)))
+            nodes.append(node)
+    columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
+    owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
+    sky = _painted_sky(views) if settings.with_sky else None
+    log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} objects")
+    moving = len(owner) - len(blocks[0]["means"])
+    partial = {"sh_time": torch.zeros(moving, settings.color_terms, 3)} if settings.color_terms and moving else {}
+    return SceneModel(Table(columns, {"node": owner}, partial), tuple(nodes), sky, classes, settings.sh_degree)
+
+
+def _static_columns(
+    scene: Scene, cloud: PointCloud, views: Sequence[StoredView], classes: tuple[int, ...], settings: StartSettings
+) -> Mapping[str, torch.Tensor]:
+    centers = np.stack([view.view.center_world for view in views]).astype(np.float32)
+    rows = _thinned(cloud.xyz, centers, settings)
+    if settings.outlier_deviations:
+        rows = rows[~_lonely(cloud.xyz[rows], centers, settings.outlier_deviations)]
+    xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
+    semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
+    scale = neighbour_scale(xyz)
+    filled = _fill_unreached(views, xyz, classes, settings.far_m)
+    if filled is not None:
+        xyz, rgb = np.concatenate([xyz, filled.xyz]), np.concatenate([rgb, filled.rgb])
+        semantics, scale = np.concatenate([semantics, filled.semantics]), np.concatenate([scale, filled.scale_m])
+    return columns_from_points(xyz, rgb, semantics, classes, settings.sh_degree, scale_m=scale)
+
+
+def _thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], settings: StartSettings) -> NDArray[np.int64]:
+    """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera, at most the wanted number."""
+    distance, _ = cKDTree(centers).query(xyz, k=1, workers=1)
+    size = settings.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
+    for _ in range(12):
+        rows = voxel_filter(xyz, size)
+        if len(rows) <= settings.initial_gaussians:
+            return rows
+        size = size * np.clip((len(rows) / settings.initial_gaussians) ** 0.5, 1.08, 2.0)
+    return rows[np.sort(seeds.numpy_rng(settings.seed, 0, "thin").permutation(len(rows))[: settings.initial_gaussians])]
+
+
+def _lonely(xyz: NDArray[np.float32], centers: NDArray[np.float32], deviations: float, neighbours: int = 6) -> NDArray[np.bool_]:
+    """Bool[N]: points whose neighbours are unusually far for their distance from the drive.
+
+    The mean distance to the nearest neighbours grows with the range and has a long tail, so its logarithm is compared with the
+    mean and spread (median and quartiles, which outliers do not move) of points in the same band of range.
+    """
+    if len(xyz) <= neighbours:
+        return np.zeros(len(xyz), bool)
+    apart = np.log(cKDTree(xyz).query(xyz, k=neighbours + 1, workers=1)[0][:, 1:].mean(1) + 1e-6)
+    band = np.round(2 * np.log2(1 + cKDTree(centers).query(xyz, k=1, workers=1)[0])).astype(int)
+    lonely = np.zeros(len(xyz), bool)
+    for one in np.unique(band):
+        mine = band == one
+        low, middle, high = np.percentile(apart[mine], (25, 50, 75))
+        lonely[mine] = apart[mine] > middle + deviations * max((high - low) / 1.349, 1e-3)
+    return lonely
+
+
+def mirrored_points(xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Points reflected about y = 0 of the box, where no measured point is within ``apart_m``: xyz f32[M, 3] and their sources."""
+    if len(xyz) == 0:
+        return xyz, np.zeros(0, np.int64)
+    flipped = xyz * np.array([1, -1, 1], np.float32)
+    distance, _ = cKDTree(xyz).query(flipped, k=1, workers=1)
+    source = np.flatnonzero(distance > apart_m)
+    return flipped[source], source
+
+
+def _object_columns(
+    node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], settings: StartSettings, most: int
+) -> Mapping[str, torch.Tensor]:
+    rows = voxel_filter(cloud.xyz, 0.06)
+    rows = rows[np.sort(seeds.numpy_rng(settings.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
+    xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
+    semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
+    if settings.mirror and node.symmetric:
+        other, source = mirrored_points(xyz)
+        xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
+        semantics = np.concatenate([semantics, semantics[source]])
+    if len(rows) < FEWEST_OBJECT_POINTS:
+        color = rgb.mean(0) if len(rgb) else np.array([127, 127, 127])
+        grid_xyz, grid_rgb = box_grid(node.size_m, color)
+        commonest = np.bincount(semantics, minlength=256).argmax() if len(semantics) else UNLABELLED
+        xyz, rgb = np.concatenate([xyz, grid_xyz]), np.concatenate([rgb, grid_rgb])
+        semantics = np.concatenate([semantics, np.full(len(grid_xyz), commonest, np.uint8)])
+    return columns_from_points(xyz, rgb, semantics, classes, settings.sh_degree, scale_m=neighbour_scale(xyz, 0.02, 0.3))
+
+
+# ---- beyond LiDAR ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Fill:
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8]
+    scale_m: NDArray[np.float32]
+
+
+def _fill_unreached(
+    views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float
+) -> _Fill | None:
+    """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
+    labelled = [view for view in views if view.channel is not None]
+    if not labelled or not classes:
+        return None
+    chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
+    parts = [_fill_view(view, xyz, classes, far_m) for view in chosen]
+    points = np.concatenate([part.xyz for part in parts])
+    scale = np.concatenate([part.scale_m for part in parts])
+    if len(points) == 0:
+        return None
+    rows = voxel_filter(points, np.maximum(scale * 2.0, 0.05))
+    rgb = np.concatenate([part.rgb for part in parts])
+    semantics = np.concatenate([part.semantics for part in parts])
+    return _Fill(points[rows], rgb[rows], semantics[rows], scale[rows])
+
+
+def _fill_view(stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float) -> _Fill:
+    view, cell = stored.view, FILL_CELL_PX
+    rows, columns = view.camera.height // cell, view.camera.width // cell
+    center_row = (np.arange(rows) * cell + cell // 2)[:, None]
+    center_column = (np.arange(columns) * cell + cell // 2)[None, :]
+    train_ids = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))
+    channel = stored.channel[center_row, center_column]  # type: ignore[index]
+    label = train_ids[np.minimum(channel, len(classes))]
+    depth = _cell_depth(stored, xyz, rows, columns)
+    covered = np.isfinite(depth)
+    wanted = ~covered & np.isin(label, [i for i in range(19) if i not in (*DYNAMIC_IDS, *GROUND_IDS, ID["sky"])])
+    if stored.mask is not None:
+        wanted &= stored.mask[center_row, center_column]
+    guess = np.full((rows, columns), far_m)
+    below = np.full((256, columns), np.inf)  # per class: depth of the last covered cell below, in this column
+    every = np.arange(columns)
+    for row in range(rows - 1, -1, -1):
+        known = covered[row] & np.isin(label[row], UPRIGHT_IDS)
+        below[label[row, known], every[known]] = depth[row, known]
+        surface = below[label[row], every]
+        guess[row] = np.where(np.isfinite(surface), surface, far_m)
+    row, column = wanted.nonzero()
+    uv = np.stack([column * cell + cell / 2, row * cell + cell / 2], 1)
+    z = guess[row, column]
+    color = stored.rgb[row * cell + cell // 2, column * cell + cell // 2]
+    points = geometry.unproject(view, uv, z).astype(np.float32)
+    return _Fill(points, color, label[row, column], (0.5 * cell * z / view.camera.fx).astype(np.float32))
+
+
+def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:
+    """Nearest depth of the points in each cell of the image; infinity where there is none. A cell beside a covered one in
+    its row counts as covered (LiDAR lines are sparse)."""
+    uv, z = geometry.project(stored.view, xyz)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 1.0) & (uv[:, 0] >= 0) & (uv[:, 0] < columns * FILL_CELL_PX) & (uv[:, 1] >= 0) & (uv[:, 1] < rows * FILL_CELL_PX)
+    column, row = (uv[inside, 0] // FILL_CELL_PX).astype(int), (uv[inside, 1] // FILL_CELL_PX).astype(int)
+    depth = np.full((rows, columns), np.inf)
+    np.minimum.at(depth, (row, column), z[inside])
+    padded = np.pad(depth, ((0, 0), (1, 1)), constant_values=np.inf)
+    return np.where(np.isfinite(depth), depth, np.minimum(padded[:, :-2], padded[:, 2:]))
+
+
+def _painted_sky(views: Sequence[StoredView]) -> SkyNode:
+    """A sky that starts with the mean recorded colour per direction."""
+    sky = SkyNode.uniform(SKY_ROWS)
+    directions, colors = [], []
+    for stored in views:
+        if stored.sky is None:
+            continue
+        camera = stored.view.camera
+        row, column = stored.sky[::2, ::2].nonzero()
+        row, column = row * 2, column * 2
+        rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))], 1)
+        directions.append(rays @ stored.view.world_from_cam[:3, :3].T)
+        colors.append(stored.rgb[row, column].astype(np.float32) / 255)
+    if directions:
+        sky.fill(np.concatenate(directions), np.concatenate(colors))
+    return sky

@@ -1,0 +1,192 @@
+"""Where a virtual view has something to say: the part of it that no recorded camera ever saw.
+
+A generated view is the best there is behind a parked bus, and worse than the photographs wherever they look. So each of its
+pixels is asked: is the surface you show seen by any recorded view? The pixel's point (at the depth the virtual view itself
+claims) is carried to a number of recorded views, with its moving object if it lies in one's box, and compared with the depth
+the model renders there: if the recorded view looks at or through that point, the pixel is *seen*. Points that are hidden in
+every recorded view, or in none's image, are *unseen*, and there the virtual view keeps its full weight. Since nothing was
+measured there, nothing could start there either: ``unseen_rows`` makes Gaussians from what the virtual views show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mudg.base import geometry, log, seeds
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import View
+from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.models.scene.nodes import RigidNode, SceneModel, columns_from_points, compose, voxel_filter
+from mudg.stages.fitting.views import StoredView
+
+WITNESSES = 36
+"""Recorded views asked, spread evenly over cameras and time."""
+STRIDE_PX = 2
+TOLERANCE = 0.15
+SKY_AT_M = 1000.0
+WITNESS_WIDTH_PX = 160
+SEED_STRIDE_PX = 3
+SEED_NEAREST_M, SEED_FARTHEST_M = 2.0, 80.0
+SEED_CONFIDENCE = 0.2
+"""Least confidence of a virtual pixel that may become a Gaussian."""
+
+
+@dataclass(frozen=True)
+class _Witness:
+    """A recorded view and what it sees: depth f32[H, W], infinite in the sky."""
+
+    view: View
+    depth: NDArray[np.float32]
+
+
+@torch.no_grad()
+def unseen_maps(
+    model: SceneModel, recorded: Sequence[StoredView], virtual: Sequence[StoredView], raster: RasterConfig
+) -> list[NDArray[np.bool_]]:
+    """For every virtual view: bool[H, W], True where no recorded view saw the surface it shows.
+
+    Pixels without depth count as sky, far away. Depends on the geometry the model has by now.
+    """
+    chosen = [recorded[i] for i in np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))]
+    witnesses = [_witness(model, stored.view, raster) for stored in chosen]
+    objects = [node for node in model.nodes if isinstance(node, RigidNode)]
+    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "what virtual views add")]
+
+
+def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
+    camera = view.camera
+    width = min(WITNESS_WIDTH_PX, camera.width)
+    small = view.resized(width, max(1, round(camera.height * width / camera.width)))
+    render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
+    depth = torch.where(render.alpha > 0.5, render.depth, torch.inf)
+    return _Witness(small, depth[0].numpy())
+
+
+def block_centres(size_px: int) -> NDArray[np.intp]:
+    """Pixel asked about for each block of ``STRIDE_PX``; the last block may be cut, so that any size is covered."""
+    return np.minimum(np.arange(0, size_px, STRIDE_PX) + STRIDE_PX // 2, size_px - 1)
+
+
+def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence[RigidNode]) -> NDArray[np.bool_]:
+    height, width = stored.rgb.shape[:2]
+    row, column = np.meshgrid(block_centres(height), block_centres(width), indexing="ij")
+    shape = row.shape
+    row, column = row.ravel(), column.ravel()
+    depth = np.full(len(row), SKY_AT_M) if stored.depth is None else stored.depth[row, column].astype(np.float64)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, SKY_AT_M)
+    points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), depth)
+    carried = [(node, found) for node in objects if (found := _in_box(node, points, stored.view.time_s)) is not None]
+    seen = np.zeros(len(points), bool)
+    for witness in witnesses:
+        moved = points.copy()
+        exists = np.ones(len(points), bool)
+        for node, (inside, local) in carried:
+            pose = _pose(node, witness.view.time_s)
+            exists[inside] = pose is not None
+            if pose is not None:
+                moved[inside] = geometry.transform_points(pose, local)
+        seen |= exists & _looks_at_or_through(witness, moved)
+    coarse = ~seen.reshape(shape)
+    return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """Points of one node, in its own frame."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    train_id: NDArray[np.uint8]
+    scale_m: NDArray[np.float32]
+
+
+def unseen_rows(
+    model: SceneModel, virtual: Sequence[StoredView], unseen: Sequence[NDArray[np.bool_]], most: int, run_seed: int
+) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Table rows (columns, labels) at the surfaces that only virtual views show, thinned to one per place, at most ``most``.
+
+    A point in the box of a moving object belongs to that object.
+    """
+    objects = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
+    found: dict[int, list[_Seeds]] = {index: [] for index in range(len(model.nodes))}
+    for stored, unseen_here in zip(virtual, unseen):
+        for index, seeds_here in _seeds_of(stored, unseen_here, objects, model.classes):
+            found[index].append(seeds_here)
+    columns, owners = [], []
+    total = sum(len(part.xyz) for parts in found.values() for part in parts)
+    for index, parts in found.items():
+        if not parts:
+            continue
+        xyz, scale = np.concatenate([p.xyz for p in parts]), np.concatenate([p.scale_m for p in parts])
+        rows = voxel_filter(xyz, np.maximum(2.0 * scale, 0.08))
+        share = max(1, most * sum(len(p.xyz) for p in parts) // total)
+        rows = rows[np.sort(seeds.numpy_rng(run_seed, index, "unseen rows").permutation(len(rows))[:share])]
+        rgb, train_id = np.concatenate([p.rgb for p in parts])[rows], np.concatenate([p.train_id for p in parts])[rows]
+        columns.append(columns_from_points(xyz[rows], rgb, train_id, model.classes, model.sh_degree, scale_m=scale[rows]))
+        owners.append(torch.full((len(rows),), index, dtype=torch.int32))
+    if not columns:
+        return {name: value.detach()[:0] for name, value in model.table.columns.items()}, {"node": torch.zeros(0, dtype=torch.int32)}
+    return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}
+
+
+def _seeds_of(
+    stored: StoredView, unseen: NDArray[np.bool_], objects: dict[int, RigidNode], classes: tuple[int, ...]
+) -> list[tuple[int, _Seeds]]:
+    """Points of one virtual view's unseen pixels, by node index."""
+    if stored.depth is None:
+        return []
+    height, width = stored.rgb.shape[:2]
+    row, column = np.mgrid[SEED_STRIDE_PX // 2 : height : SEED_STRIDE_PX, SEED_STRIDE_PX // 2 : width : SEED_STRIDE_PX]
+    row, column = row.ravel(), column.ravel()
+    z = stored.depth[row, column]
+    with np.errstate(invalid="ignore"):
+        kept = unseen[row, column] & (z > SEED_NEAREST_M) & (z < SEED_FARTHEST_M)
+    if stored.mask is not None:
+        kept &= stored.mask[row, column]
+    if stored.confidence is not None:
+        kept &= stored.confidence[row, column] >= SEED_CONFIDENCE * 255
+    row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
+    points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
+    channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channel is None else stored.channel[row, column]
+    train_id = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))[np.minimum(channel, len(classes))]
+    scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
+    rgb = stored.rgb[row, column]
+    owner = np.zeros(len(row), np.int64)
+    local = points.copy()
+    for index, node in objects.items():
+        inside = _in_box(node, points, stored.view.time_s)
+        if inside is not None:
+            owner[inside[0]], local[inside[0]] = index, inside[1]
+    return [
+        (int(index), _Seeds(local[mine].astype(np.float32), rgb[mine], train_id[mine], scale[mine]))
+        for index in np.unique(owner) for mine in [owner == index]
+    ]  # fmt: skip
+
+
+def _looks_at_or_through(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    camera = witness.view.camera
+    uv, z = geometry.project(witness.view, points)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0.2) & (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+    column = np.where(inside, np.nan_to_num(uv[:, 0]), 0).astype(int).clip(0, camera.width - 1)
+    row = np.where(inside, np.nan_to_num(uv[:, 1]), 0).astype(int).clip(0, camera.height - 1)
+    return inside & (witness.depth[row, column] >= z * (1 - TOLERANCE))
+
+
+def _in_box(node: RigidNode, points: NDArray[np.float64], time_s: float) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """Indices of points in the node's box (grown by a tenth) and their coordinates in it; None if there are none."""
+    pose = _pose(node, time_s)
+    if pose is None:
+        return None
+    local = geometry.transform_points(geometry.invert(pose), points)
+    inside = np.flatnonzero((np.abs(local) < np.array(node.size_m) * 0.55 + 0.1).all(1))
+    return (inside, local[inside]) if len(inside) else None
+
+
+def _pose(node: RigidNode, time_s: float) -> NDArray[np.float64] | None:
+    return node.pose_matrix(time_s)
