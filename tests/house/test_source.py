@@ -21,7 +21,7 @@ FLOORS = {
 
 # Modules that `mudg --help` loads, or that plain `import mudg` may reach: torch only inside functions.
 TORCH_FREE = (
-    "__init__.py", "__main__.py", "cli.py", "flags.py", "methods.py", "stages/__init__.py", "stages/config.py",
+    "__init__.py", "__main__.py", "cli.py", "flags.py", "methods.py", "stages/__init__.py", "stages/config/*.py",
     "stages/doctor.py", "base/*.py",
 )  # fmt: skip
 TORCH_ALLOWED = ("base/checkpoint.py",)
