@@ -16,7 +16,7 @@ from mudg import native
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.base.types import Camera, Gaussians, Render, View
-from mudg.core.raster import gsplat_cuda
+from mudg.core.raster import gsplat_cuda, torch_twin
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import BACKENDS, RasterConfig, rasterize
 
@@ -596,7 +596,7 @@ def test_without_the_library_auto_takes_torch_and_cpu_is_refused(monkeypatch: py
     monkeypatch.setattr(native, "_loaded", None)
     monkeypatch.setattr(native, "_problem", "not built: test")
     used: list[str] = []
-    monkeypatch.setitem(BACKENDS, "torch", lambda request: used.append("torch") or raster.raster_torch.render(request))
+    monkeypatch.setitem(BACKENDS, "torch", lambda request: used.append("torch") or torch_twin.render(request))
     rasterize(_gaussians(_parameters(5)), _view())
     assert used == ["torch"]
     with pytest.raises(ResourceError, match="not available"):

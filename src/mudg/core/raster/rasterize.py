@@ -1,6 +1,6 @@
 """The one front door to Gaussian splatting: ``rasterize(gaussians, view or views, config) -> Render``, differentiable.
 
-The mathematics, which every backend follows (it is written down, readable, in ``raster_torch``): elliptical weighted
+The mathematics, which every backend follows (it is written down, readable, in ``torch_twin``): elliptical weighted
 averaging of anisotropic Gaussians as in 3D Gaussian Splatting (Kerbl et al. 2023) with the conventions of gsplat: the
 projected covariance grows by ``blur_px2``; contributions below 1/255 are dropped; alpha is capped; a pixel stops when
 its transmittance would fall to 1e-4; colours are spherical harmonics plus 0.5, clamped at 0; pixel centres lie at +0.5.

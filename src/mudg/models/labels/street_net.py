@@ -24,7 +24,7 @@ from mudg.models.labels.evidence import PLANE_COUNT
 
 MODEL_FILE: Final = "model.json"
 WEIGHTS_FILE: Final = "weights.safetensors"
-EMBEDDED: Final = Path(__file__).resolve().parent.parent / "assets" / "segmenter_small"
+EMBEDDED: Final = Path(__file__).resolve().parents[2] / "assets" / "segmenter_small"
 """The network that comes with the package."""
 STRIDE: Final = 32
 RGB_MEAN: Final = 0.42

@@ -648,7 +648,7 @@ def settle_depth(depth: Tensor, condition: Condition, far_m: float) -> Tensor:
 # files ----------------------------------------------------------------------------------------------------------------
 
 MODEL_FILE = "model.json"
-_ASSETS = Path(__file__).resolve().parent.parent / "assets"
+_ASSETS = Path(__file__).resolve().parents[2] / "assets"
 EMBEDDED: dict[str, Path] = {"embedded": _ASSETS / "mdm_small", "embedded-tiny": _ASSETS / "mdm_tiny"}
 """Models that come with the package, by the names that stand for their folders."""
 PART_BYTES = 15 * 1024 * 1024
