@@ -317,7 +317,7 @@ def test_what_could_not_be_read_back_is_not_put_in_place(tmp_path: Path) -> None
     with SceneWriter(tmp_path / "s", "s", Source("t", "n", {"seed": 1})) as writer:
         fill(writer)
         writer.set_split({"front/000000": "val"})  # type: ignore[dict-item]
-        with pytest.raises(InputError, match="train and test"):
+        with pytest.raises(InputError, match="'train' or 'test'"):
             writer.finish()
     with SceneWriter(tmp_path / "t", "t", Source("t", "n", {"when": object()})) as writer:
         fill(writer)
@@ -381,7 +381,7 @@ EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
     "double id": ("twice", "frames", lambda d: d["frames"][1].update(id="front/000000")),
     "unsorted": ("do not increase", "frames of camera front", lambda d: d["frames"].reverse()),
     "split": ("does not have", "split", lambda d: d["split"].update({"front/000099": "test"})),
-    "split word": ("train and test", "split", lambda d: d["split"].update({"front/000000": "val"})),
+    "split word": ("'train' or 'test'", "split.front/000000", lambda d: d["split"].update({"front/000000": "val"})),
     "missing file": (
         "missing",
         "frame front/000001 image",
@@ -396,7 +396,7 @@ EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
     "label name": ("unknown field", "labels", lambda d: d["frames"][1].update(labels={"skyy": "a"})),
     "ego": ("pair up", "ego", lambda d: d["ego"]["times_s"].pop()),
     "ego order": ("do not increase", "ego", lambda d: d["ego"]["times_s"].reverse()),
-    "notes": ("list of texts", "source.notes", lambda d: d["source"].update(notes=[1])),
+    "notes": ("not a text", "source.notes[0]", lambda d: d["source"].update(notes=[1])),
 }
 
 
@@ -408,7 +408,7 @@ def test_reader_refuses_in_words(case: str, tmp_path: Path) -> None:
         read_scene(root)
     assert words in str(caught.value)
     assert where in caught.value.where
-    assert [f for f in check_scene(root) if f.level == "error" and where in f.where and words in f.words]
+    assert [f for f in check_scene(root) if f.level == "error" and where in f.where and words in f.message]
 
 
 def test_a_scene_needs_no_manifest_sweeps_tracks_or_split(tmp_path: Path) -> None:
@@ -525,7 +525,7 @@ def test_check_lists_all_errors_at_once_worst_first(tmp_path: Path) -> None:
     errors = [f for f in findings if f.level == "error"]
     assert [f.level for f in findings] == sorted((f.level for f in findings), key=["error", "warning", "note"].index)
     for where in ("frames[0].world_from_cam", "front/000002", "sweeps[1].time_s", "top/000002"):
-        assert any(where in f.where or where in f.words for f in errors), where
+        assert any(where in f.where or where in f.message for f in errors), where
 
 
 def test_check_names_what_is_odd(tmp_path: Path) -> None:
@@ -553,4 +553,4 @@ def test_check_names_what_is_odd(tmp_path: Path) -> None:
     for words in ("moves at 400 m/s", "down direction", "vehicle moves at 500 m/s", "width and length swapped", "moves at 180 m/s",
                   "not seen for 5.0 s", "lie outside the time", "no points", "intensity reaches 90", "none of its points falls",
                   "one flat colour", "no sweep within", "no frame is held out"):  # fmt: skip
-        assert any(words in f.words for f in findings), words
+        assert any(words in f.message for f in findings), words

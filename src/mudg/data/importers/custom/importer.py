@@ -341,7 +341,7 @@ def _collapsed(findings: Iterable[Finding]) -> list[Finding]:
     counts: Counter[tuple[str, str]] = Counter()
     kept = []
     for finding in findings:
-        kind = (finding.level, finding.words.split(";")[0])
+        kind = (finding.level, finding.message.split(";")[0])
         counts[kind] += 1
         if counts[kind] <= MAX_ALIKE:
             kept.append(finding)
