@@ -15,11 +15,10 @@ from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import EgoPath, Scene, Source, View
-from mudg.data.importers.drive_log import path_inside
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.kitti import boxes as kitti_boxes
 from mudg.data.importers.kitti.calib import KittiCalibration, nearest_rotation
-from mudg.data.importers.layout import chosen_cameras, refuse_options
+from mudg.data.importers.layout import chosen_cameras, path_inside, refuse_options
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import SceneWriter, decode_image
 
