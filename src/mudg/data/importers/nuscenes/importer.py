@@ -44,13 +44,9 @@ Matrix = NDArray[np.float64]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
 CAMERAS: Final[Mapping[str, str]] = {
-    "CAM_FRONT": "front",
-    "CAM_FRONT_LEFT": "front_left",
-    "CAM_FRONT_RIGHT": "front_right",
-    "CAM_BACK": "back",
-    "CAM_BACK_LEFT": "back_left",
-    "CAM_BACK_RIGHT": "back_right",
-}
+    "CAM_FRONT": "front", "CAM_FRONT_LEFT": "front_left", "CAM_FRONT_RIGHT": "front_right", "CAM_BACK": "back",
+    "CAM_BACK_LEFT": "back_left", "CAM_BACK_RIGHT": "back_right",
+}  # fmt: skip
 LIDAR: Final = "LIDAR_TOP"
 SENSOR: Final = "lidar_top"
 MAX_GAP_S: Final = 1.1
@@ -65,30 +61,17 @@ _OWN_VEHICLE_M: Final = ((-1.05, 1.05), (-2.2, 3.1), (-2.2, 0.5))
 _MAX_BEFORE_SCENE_S: Final = 1.0
 
 LABELS: Final[Mapping[str, str]] = {
-    "animal": "animal",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.personal_mobility": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "human.pedestrian.stroller": "stroller",
-    "human.pedestrian.wheelchair": "wheelchair",
-    "movable_object.barrier": "barrier",
-    "movable_object.debris": "debris",
-    "movable_object.pushable_pullable": "pushable",
-    "movable_object.trafficcone": "traffic_cone",
-    "static_object.bicycle_rack": "bicycle_rack",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
+    "animal": "animal", "human.pedestrian.adult": "pedestrian", "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian", "human.pedestrian.personal_mobility": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian", "human.pedestrian.stroller": "stroller",
+    "human.pedestrian.wheelchair": "wheelchair", "movable_object.barrier": "barrier",
+    "movable_object.debris": "debris", "movable_object.pushable_pullable": "pushable",
+    "movable_object.trafficcone": "traffic_cone", "static_object.bicycle_rack": "bicycle_rack",
+    "vehicle.bicycle": "bicycle", "vehicle.bus.bendy": "bus", "vehicle.bus.rigid": "bus", "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle", "vehicle.emergency.ambulance": "van",
+    "vehicle.emergency.police": "car", "vehicle.motorcycle": "motorcycle", "vehicle.trailer": "trailer",
     "vehicle.truck": "truck",
-}
+}  # fmt: skip
 """The release's categories in the product's words."""
 _RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
 _WITH_RIDER: Final = "cycle.with_rider"
@@ -157,13 +140,13 @@ class _Release:
     def path(self, name: str) -> Path:
         return self.folder / f"{name}.json"
 
-    def all_of(self, name: str) -> tables.Table:
+    def all_of(self, name: str) -> tables.TokenTable:
         """A small table, whole."""
-        return tables.Table(self.path(name), tables.iter_records(self.path(name)))
+        return tables.TokenTable(self.path(name), tables.iter_records(self.path(name)))
 
-    def those(self, name: str, field: str, values: set[str]) -> tables.Table:
+    def those(self, name: str, field: str, values: set[str]) -> tables.TokenTable:
         """The records of a large table whose ``field`` is one of ``values``."""
-        return tables.Table(self.path(name), tables.find_records(self.path(name), field, values))
+        return tables.TokenTable(self.path(name), tables.find_records(self.path(name), field, values))
 
 
 def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
@@ -223,12 +206,9 @@ def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Pat
     if not found or (not wanted and len(found) > 1):
         several = "the release holds several scenes" if found else "the release has no such scene"
         listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
-        raise UsageError(
-            several,
-            where=", ".join(str(folder) for folder in releases),
+        raise UsageError(several, where=", ".join(str(folder) for folder in releases),
             expected=f"--sequence with one of {listed}" if names else "a release with scenes",
-            got=options.sequence or "none chosen",
-        )
+            got=options.sequence or "none chosen")  # fmt: skip
     return found[0]  # the same scene may lie in two releases: the smaller one is quicker
 
 
@@ -247,26 +227,18 @@ def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
     common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
         late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
-        raise InputError(
-            "time stamps of key frames do not increase along the scene",
-            where=f"{samples.where}: record {late!r}",
-            got=f"{stamps[late]} after a later one",
-            expected="microseconds, increasing from one key frame to the next",
-            remedy="copy the table again",
-        )
+        raise InputError("time stamps of key frames do not increase along the scene",
+            where=f"{samples.where}: record {late!r}", got=f"{stamps[late]} after a later one",
+            expected="microseconds, increasing from one key frame to the next", remedy="copy the table again")  # fmt: skip
     return stamps
 
 
 def _check_all_cameras(there: Mapping[str, str], options: ImportOptions, where: str) -> None:
     absent = [name for raw, name in CAMERAS.items() if raw not in there]
     if absent and not options.cameras and not options.skip_missing:
-        raise InputError(
-            "cameras are missing in the tables",
-            where=where,
-            got=f"no images of {', '.join(absent)}",
+        raise InputError("cameras are missing in the tables", where=where, got=f"no images of {', '.join(absent)}",
             expected="six cameras",
-            remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing",
-        )
+            remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing")  # fmt: skip
 
 
 def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: str) -> None:
@@ -276,12 +248,9 @@ def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: 
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
     if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
-        raise InputError(
-            "an image or sweep lies outside its scene's time",
+        raise InputError("an image or sweep lies outside its scene's time",
             where=f"{where}: record {rows[int(beside.argmax())]['token']!r}",
-            got=f"{beside.max():.3f} s away from the key frames",
-            expected="microseconds since 1970, within the scene",
-        )
+            got=f"{beside.max():.3f} s away from the key frames", expected="microseconds since 1970, within the scene")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,8 +259,8 @@ class _RowReader:
 
     release: _Release
     where: str
-    calibrations: tables.Table
-    ego_poses: tables.Table
+    calibrations: tables.TokenTable
+    ego_poses: tables.TokenTable
     zero_us: int
 
     def time_s(self, row: tables.Row) -> float:
@@ -329,12 +298,8 @@ def camera_from_intrinsics(name: str, width: int, height: int, intrinsics: Any, 
         raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
     off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
     if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
-        raise InputError(
-            "intrinsics are malformed",
-            where=where,
-            expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
-            got=str(intrinsics)[:120],
-        )
+        raise InputError("intrinsics are malformed", where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+            got=str(intrinsics)[:120])  # fmt: skip
     return Camera(name, width, height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
 
 
@@ -366,11 +331,13 @@ def _read_tracks(release: _Release, samples: Mapping[str, int], zero_us: int) ->
         width, length, height = tables.numbers(row, "size", 3, annotations.where)  # in this order in the tables
         where = f"{annotations.where}: record {row['token']!r}"
         time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
-        tracks.add(instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where)
+        tracks.add(
+            instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where
+        )
     return tracks.tracks()
 
 
-def _is_ridden(row: tables.Row, attributes: tables.Table) -> bool:
+def _is_ridden(row: tables.Row, attributes: tables.TokenTable) -> bool:
     tokens = row.get("attribute_tokens")
     return isinstance(tokens, list) and any(
         attributes.rows.get(token, {}).get("name") == _WITH_RIDER for token in tokens if isinstance(token, str)
@@ -391,13 +358,9 @@ def read_scan(path: Path) -> SweepPoints:
     rows = read_float_rows(path, 5, "sweep")
     rings = rows[:, 4]
     if len(rows) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
-        raise InputError(
-            "fifth value of the points is no ring number",
-            where=str(path),
-            expected=f"whole numbers 0 to {BEAMS - 1}",
-            got=f"{rings.min():g} to {rings.max():g}",
-            remedy="is this a file of another sensor or format?",
-        )
+        raise InputError("fifth value of the points is no ring number", where=str(path),
+            expected=f"whole numbers 0 to {BEAMS - 1}", got=f"{rings.min():g} to {rings.max():g}",
+            remedy="is this a file of another sensor or format?")  # fmt: skip
     dt_s = point_times(rows[:, :3], rings)
     own = np.ones(len(rows), bool)
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):

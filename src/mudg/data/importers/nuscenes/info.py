@@ -52,13 +52,9 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
     path = source / "info.json"
     if not path.is_file():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-        raise InputError(
-            "no nuScenes tables found",
-            where=str(source),
-            expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json",
-            got=inside,
-            remedy="give the folder that holds v1.0-*, samples and sweeps",
-        )
+        raise InputError("no nuScenes tables found", where=str(source),
+            expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json", got=inside,
+            remedy="give the folder that holds v1.0-*, samples and sweeps")  # fmt: skip
     where = str(path)
     refuse_options(options, "single-frame nuScenes", "sequence")
     try:
@@ -67,12 +63,8 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
         )  # unknown velocities are NaN there; what is used is checked to be finite
         drive = _drive_log(source, record["metainfo"], record["data_list"][0], where, options)
     except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
-        raise InputError(
-            "frame record is malformed or incomplete",
-            where=where,
-            got=repr(error),
-            expected="metainfo.categories and data_list[0] with images, lidar_points, ego2global and instances",
-        ) from error
+        raise InputError("frame record is malformed or incomplete", where=where, got=repr(error),
+            expected="metainfo.categories and data_list[0] with images, lidar_points, ego2global and instances") from error  # fmt: skip
     log.info(f"nuscenes: one frame from {where}")
     return drive_log.write_log(drive, out, options)
 
@@ -112,10 +104,9 @@ def _tracks(meta: dict[str, Any], instances: list[dict[str, Any]], map_from_lida
             continue
         here = f"{where}: instances[{index}]"
         if int(item["bbox_label_3d"]) not in names:
-            raise InputError(
-                "box has a class that metainfo.categories lacks", where=here, got=str(item["bbox_label_3d"]),
-                expected=", ".join(f"{number} ({name})" for number, name in names.items())[:200],
-            )  # fmt: skip
+            raise InputError("box has a class that metainfo.categories lacks", where=here,
+                got=str(item["bbox_label_3d"]),
+                expected=", ".join(f"{number} ({name})" for number, name in names.items())[:200])  # fmt: skip
         x, y, z, length, width, height, yaw = (float(value) for value in item["bbox_3d"])
         size = box_size(length, width, height, here)
         if not np.isfinite([x, y, z, yaw]).all():

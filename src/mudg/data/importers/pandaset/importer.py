@@ -64,7 +64,7 @@ CAMERAS: Final = {
 SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
 OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
 """Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
-WORDS: Final = {
+LABELS: Final = {
     "Car": "car", "Pickup Truck": "car", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Towed Object": "trailer",
     "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Bicycle": "bicycle", "Bus": "bus", "Train": "train",
     "Trolley": "tram", "Tram / Subway": "tram", "Emergency Vehicle": "vehicle", "Pedestrian": "pedestrian",
@@ -163,7 +163,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
             boxes[index] = _read_cuboids(cuboids[number], points, motion, index)
 
     def tracks() -> Tracks:
-        found = BoxTracks(str(folder / "annotations" / "cuboids"), WORDS)
+        found = BoxTracks(str(folder / "annotations" / "cuboids"), LABELS)
         box_notes = _add_boxes(found, boxes)
         made, track_notes = found.tracks()
         return made, [*box_notes, *track_notes]
