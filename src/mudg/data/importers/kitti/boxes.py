@@ -72,13 +72,9 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
     for index, line in enumerate(read_lines(path)):
         words, where = line.split(), f"{path}: line {index + 1}"
         if len(words) - skip not in (15, 16):
-            raise InputError(
-                "label line has the wrong number of columns",
-                where=where,
-                got=str(len(words)),
-                expected=f"{15 + skip} (or {16 + skip} with a score)",
-                remedy="is this a tracking or an object label file?",
-            )
+            raise InputError("label line has the wrong number of columns", where=where, got=str(len(words)),
+                             expected=f"{15 + skip} (or {16 + skip} with a score)",
+                             remedy="is this a tracking or an object label file?")  # fmt: skip
         if words[skip] == "DontCare":
             continue
         try:
@@ -91,12 +87,8 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
             raise InputError("label value is not finite", where=where, got=line.strip()[:100])
         height, width, length = values[7:10]
         if min(height, width, length) <= 0:
-            raise InputError(
-                "box size is not positive",
-                where=where,
-                expected="height, width, length in metres",
-                got=str(values[7:10]),
-            )
+            raise InputError("box size is not positive", where=where, expected="height, width, length in metres",
+                             got=str(values[7:10]))  # fmt: skip
         pose = velo_from_rect0 @ rect0_from_box(values[10:13], height, values[13])
         left, top, right, bottom = values[3:7]
         boxes.append(
@@ -111,11 +103,8 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     if len(content) > MAX_TRACKLET_BYTES:
         raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
     if b"<!ENTITY" in content:
-        raise InputError(
-            "tracklet file declares XML entities, which no KITTI file does",
-            where=str(path),
-            remedy="use the file from the data set",
-        )
+        raise InputError("tracklet file declares XML entities, which no KITTI file does", where=str(path),
+                         remedy="use the file from the data set")  # fmt: skip
     try:
         root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
     except ElementTree.ParseError as error:
@@ -177,9 +166,8 @@ def build_tracks(
             outside += 1
             continue
         if box.frame in by_track.setdefault(box.track, {}):
-            raise InputError(
-                "a track has two boxes in one frame", where=where, got=f"track {box.track}, frame {box.frame}"
-            )
+            raise InputError("a track has two boxes in one frame", where=where,
+                             got=f"track {box.track}, frame {box.frame}")  # fmt: skip
         by_track[box.track][box.frame] = box
     notes = [f"{outside} boxes lie in frames that were not imported and were left out"] if outside else []
     tracks = []

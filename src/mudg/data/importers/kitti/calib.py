@@ -43,21 +43,14 @@ class KittiCalibration:
         """Pinhole intrinsics of the rectified camera ``number``."""
         projection = self._projection(number)
         if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
-            raise InputError(
-                "projection matrix is not of a rectified pinhole camera",
-                where=f"{self.source}: P{number}",
-                expected="no skew, last row 0 0 1",
-                got=str(projection[:, :3].tolist()),
-            )
+            raise InputError("projection matrix is not of a rectified pinhole camera",
+                             where=f"{self.source}: P{number}", expected="no skew, last row 0 0 1",
+                             got=str(projection[:, :3].tolist()))  # fmt: skip
         fx, fy = float(projection[0, 0]), float(projection[1, 1])
         if fx <= 0 or fy <= 0:
-            raise InputError(
-                "focal length is not positive",
-                where=f"{self.source}: P{number}",
-                expected="pixels, about 700 for KITTI",
-                got=f"fx={fx:g}, fy={fy:g}",
-                remedy="check the calibration file",
-            )
+            raise InputError("focal length is not positive", where=f"{self.source}: P{number}",
+                             expected="pixels, about 700 for KITTI", got=f"fx={fx:g}, fy={fy:g}",
+                             remedy="check the calibration file")  # fmt: skip
         return Camera(
             name,
             width,
@@ -79,11 +72,8 @@ class KittiCalibration:
 
     def _projection(self, number: int) -> Matrix:
         if number not in self.projections:
-            raise InputError(
-                f"calibration does not tell camera {number}",
-                where=self.source,
-                got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices",
-            )
+            raise InputError(f"calibration does not tell camera {number}", where=self.source,
+                             got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices")  # fmt: skip
         return self.projections[number]
 
 
@@ -106,9 +96,8 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
         except ValueError:
             continue
         if not np.isfinite(numbers).all():
-            raise InputError(
-                "calibration holds a value that is not finite", where=f"{path}: {match[1]}", got=match[2][:80]
-            )
+            raise InputError("calibration holds a value that is not finite", where=f"{path}: {match[1]}",
+                             got=match[2][:80])  # fmt: skip
         table[match[1]] = numbers
     return table
 
@@ -161,21 +150,13 @@ def _shaped(table: dict[str, NDArray[np.float64]], keys: tuple[str, ...], shape:
         if key in table:
             count = int(np.prod(shape))
             if table[key].size != count:
-                raise InputError(
-                    "calibration entry has the wrong number of values",
-                    where=f"{where}: {key}",
-                    expected=f"{count} numbers",
-                    got=f"{table[key].size}",
-                    remedy="is the file cut off?",
-                )
+                raise InputError("calibration entry has the wrong number of values", where=f"{where}: {key}",
+                                 expected=f"{count} numbers", got=f"{table[key].size}",
+                                 remedy="is the file cut off?")  # fmt: skip
             return table[key].reshape(shape)
-    raise InputError(
-        f"calibration lacks {keys[0]}",
-        where=where,
-        expected=" or ".join(keys),
-        got=", ".join(table) or "no entries",
-        remedy="use the calibration file that belongs to this recording",
-    )
+    raise InputError(f"calibration lacks {keys[0]}", where=where, expected=" or ".join(keys),
+                     got=", ".join(table) or "no entries",
+                     remedy="use the calibration file that belongs to this recording")  # fmt: skip
 
 
 def _rigid(matrix: Matrix, where: str) -> Matrix:
@@ -186,11 +167,7 @@ def nearest_rotation(matrix: Matrix, where: str) -> Matrix:
     """The nearest rotation of a matrix that was rounded to text; refuses what was no rotation to begin with."""
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if error > _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
-        raise InputError(
-            "calibration rotation is not a rotation",
-            where=where,
-            expected="orthonormal, determinant +1",
-            got=f"largest deviation {error:.3g}, determinant {np.linalg.det(matrix):.3g}",
-        )
+        raise InputError("calibration rotation is not a rotation", where=where, expected="orthonormal, determinant +1",
+                         got=f"largest deviation {error:.3g}, determinant {np.linalg.det(matrix):.3g}")  # fmt: skip
     u, _, vt = np.linalg.svd(matrix)
     return u @ vt

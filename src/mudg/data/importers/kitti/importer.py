@@ -198,20 +198,14 @@ def _refuse_without_images(source: Path, sequence: str) -> None:
         if p.is_dir() and p.name != "data"
     )
     if sequences:
-        raise UsageError(
-            "the folder holds several sequences",
-            where=str(source),
-            expected="--sequence with one of " + ", ".join(sequences[:12]),
-            got=sequence or "none chosen",
-        )
+        raise UsageError("the folder holds several sequences", where=str(source),
+                         expected="--sequence with one of " + ", ".join(sequences[:12]),
+                         got=sequence or "none chosen")  # fmt: skip
     inside = sorted(p.name for p in source.iterdir())[:12]
-    raise InputError(
-        "no KITTI images found",
-        where=str(source),
-        expected="image_02/data, image_02 or image_2 with numbered PNG files",
-        got=", ".join(inside) or "an empty folder",
-        remedy="give the folder of one drive, sequence or training set",
-    )
+    raise InputError("no KITTI images found", where=str(source),
+                     expected="image_02/data, image_02 or image_2 with numbered PNG files",
+                     got=", ".join(inside) or "an empty folder",
+                     remedy="give the folder of one drive, sequence or training set")  # fmt: skip
 
 
 def _choose_frames(files: KittiFiles, options: ImportOptions, source: Path) -> list[int]:
@@ -232,12 +226,9 @@ def _single_frame(files: KittiFiles, options: ImportOptions, source: Path) -> in
     if options.frames is not None:
         numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
     if len(numbers) != 1:
-        raise UsageError(
-            "an object-benchmark folder holds unrelated frames; a scene is one of them",
-            where=str(source),
-            expected="--sequence with one frame number, e.g. 000008",
-            got=f"{len(numbers)} frames: {some_numbers(numbers)}",
-        )
+        raise UsageError("an object-benchmark folder holds unrelated frames; a scene is one of them", where=str(source),
+                         expected="--sequence with one frame number, e.g. 000008",
+                         got=f"{len(numbers)} frames: {some_numbers(numbers)}")  # fmt: skip
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(source / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
@@ -259,12 +250,9 @@ def _find_calibration(
         if (folder / "calib_cam_to_cam.txt").is_file():
             log.info(f"kitti: calibration from {folder}/calib_*.txt")
             return read_calibration_day(folder)
-    raise InputError(
-        "no calibration found",
-        where=str(source),
-        expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
-        remedy="download the day's calibration archive and unpack it beside the drive",
-    )
+    raise InputError("no calibration found", where=str(source),
+                     expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
+                     remedy="download the day's calibration archive and unpack it beside the drive")  # fmt: skip
 
 
 # --- time and motion ------------------------------------------------------------------------------------------------
@@ -302,12 +290,9 @@ class _Clock:
             values = np.array([times[n] for n in frames])
             if (np.diff(values) <= 0).any():
                 at = frames[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
-                raise InputError(
-                    "timestamps do not increase",
-                    where=f"{source}: {stream}, frame {at}",
-                    expected="seconds, increasing",
-                    remedy="is the file of another recording, or in another unit?",
-                )
+                raise InputError("timestamps do not increase", where=f"{source}: {stream}, frame {at}",
+                                 expected="seconds, increasing",
+                                 remedy="is the file of another recording, or in another unit?")  # fmt: skip
             seconds(values, "s", f"{source}: {stream}")
         return cls(
             {name: {n: t - start for n, t in times.items()} for name, times in image_s.items()},
@@ -324,13 +309,9 @@ def _first_file(*candidates: Path) -> Path | None:
 def _times_of(path: Path, frames: Sequence[int]) -> dict[int, float]:
     times = kitti_poses.read_timestamps(path)
     if len(times) <= max(frames):
-        raise InputError(
-            "timestamps do not cover the frames",
-            where=str(path),
-            expected=f"at least {max(frames) + 1} lines (line k = frame k)",
-            got=f"{len(times)} lines",
-            remedy="is the file cut off?",
-        )
+        raise InputError("timestamps do not cover the frames", where=str(path),
+                         expected=f"at least {max(frames) + 1} lines (line k = frame k)", got=f"{len(times)} lines",
+                         remedy="is the file cut off?")  # fmt: skip
     return {n: times[n] for n in frames}
 
 
@@ -361,12 +342,9 @@ def _find_motion(
     several = len(frames) > 1
     if packets is not None:
         if calibration.velo_from_imu is None:
-            raise InputError(
-                "calibration does not tell where the IMU is",
-                where=calibration.source,
-                expected="calib_imu_to_velo.txt or Tr_imu_to_velo",
-                remedy="add it, or give a pose file with --poses",
-            )
+            raise InputError("calibration does not tell where the IMU is", where=calibration.source,
+                             expected="calib_imu_to_velo.txt or Tr_imu_to_velo",
+                             remedy="add it, or give a pose file with --poses")  # fmt: skip
         log.info(f"kitti: poses from GPS/IMU packets in {packets}")
         notes.append("poses from GPS/IMU packets")
         raw_scans = any(path.parent.name == "data" for path in files.scans.values())
@@ -393,22 +371,17 @@ def _poses_from_file(
         return np.eye(4)[None]
     if path is None:
         raise InputError(
-            "no vehicle poses found",
-            where=str(files.folders[0]),
+            "no vehicle poses found", where=str(files.folders[0]),
             expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
             remedy="without poses the frames of a moving vehicle cannot be put into one world",
-        )
+        )  # fmt: skip
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
     poses, sensor = kitti_poses.read_pose_file(path, frames)
     missing = [n for n in frames if n not in poses]
     if missing:
-        raise InputError(
-            "pose file lacks frames",
-            where=str(path),
-            got=f"no pose for frames {some_numbers(missing)}",
-            remedy="choose frames with --frames FIRST:END, or give another file with --poses",
-        )
+        raise InputError("pose file lacks frames", where=str(path), got=f"no pose for frames {some_numbers(missing)}",
+                         remedy="choose frames with --frames FIRST:END, or give another file with --poses")  # fmt: skip
     stacked = np.stack([poses[n] for n in frames])
     if sensor == "cam0":
         stacked = invert(calibration.rect0_from_velo) @ stacked @ calibration.rect0_from_velo

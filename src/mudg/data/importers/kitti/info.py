@@ -55,12 +55,8 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
         calibration = KittiCalibration({2: projection}, rect0_from_velo, None, where)
         boxes = _boxes(sample.get("instances", []), rect0_from_velo, where)
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise InputError(
-            "frame record is incomplete",
-            where=where,
-            got=repr(error),
-            expected="data_list[0] with images.CAM2, lidar_points and instances",
-        ) from error
+        raise InputError("frame record is incomplete", where=where, got=repr(error),
+                         expected="data_list[0] with images.CAM2, lidar_points and instances") from error  # fmt: skip
     height, width = decode_image(store.read_bytes(image_path), str(image_path)).shape[:2]
     fit = fit_images(calibration.camera(2, "front", width, height), options)
     world_from_velo = np.eye(4)
@@ -89,10 +85,8 @@ def _boxes(instances: list[dict[str, Any]], rect0_from_velo: np.ndarray, where: 
             raise InputError("box makes no sense", where=f"{where}: instances[{index}]", got=str(item["bbox_3d"]))
         number = int(item["bbox_label_3d"])
         if number >= len(LABELS):
-            raise InputError(
-                "box has a class that does not exist", where=f"{where}: instances[{index}]", got=str(number),
-                expected=f"0 to {len(LABELS) - 1}, or -1 for none",
-            )  # fmt: skip
+            raise InputError("box has a class that does not exist", where=f"{where}: instances[{index}]",
+                             got=str(number), expected=f"0 to {len(LABELS) - 1}, or -1 for none")  # fmt: skip
         label = LABELS[number]
         pose = velo_from_rect0 @ kitti_boxes.rect0_from_box((x, y, z), height, turn)
         left, top, right, bottom = (float(value) for value in item["bbox"])

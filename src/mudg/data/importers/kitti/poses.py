@@ -36,17 +36,11 @@ def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDA
     except ValueError as error:
         raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
     if len(numbers) not in counts:
-        raise InputError(
-            f"{what}: wrong number of values",
-            where=where,
-            expected=" or ".join(str(c) for c in counts),
-            got=str(len(numbers)),
-            remedy="is the file cut off, or of another format?",
-        )
+        raise InputError(f"{what}: wrong number of values", where=where, expected=" or ".join(str(c) for c in counts),
+                         got=str(len(numbers)), remedy="is the file cut off, or of another format?")  # fmt: skip
     if not np.isfinite(numbers).all():
-        raise InputError(
-            f"{what}: a value is not finite", where=where, got=line.strip()[:80], expected="finite numbers"
-        )
+        raise InputError(f"{what}: a value is not finite", where=where, got=line.strip()[:80],
+                         expected="finite numbers")  # fmt: skip
     return numbers
 
 
@@ -95,13 +89,9 @@ def _pose(row: NDArray[np.float64], where: str) -> Matrix:
     matrix = np.vstack([row.reshape(3, 4), [0, 0, 0, 1]])
     problem = rigid_problem(matrix, _POSE_TOLERANCE)
     if problem is not None:
-        raise InputError(
-            "pose is not a rigid motion",
-            where=where,
-            got=problem,
-            expected="a rotation and a translation in metres",
-            remedy="check that the file is row-major 3x4, metres, not scaled or mirrored",
-        )
+        raise InputError("pose is not a rigid motion", where=where, got=problem,
+                         expected="a rotation and a translation in metres",
+                         remedy="check that the file is row-major 3x4, metres, not scaled or mirrored")  # fmt: skip
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     return from_rotation_translation(u @ vt, matrix[:3, 3])
 
@@ -123,12 +113,9 @@ def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.floa
         wheres = {n: f"{path}: line {n + 1}" for n in lines}
     missing = [n for n in frames if n not in lines]
     if missing:
-        raise InputError(
-            "GPS/IMU packets are missing",
-            where=str(path),
-            got=f"no packet for frames {', '.join(str(n) for n in missing[:8])} ({len(missing)} in all)",
-            remedy="copy them, or choose frames with --frames FIRST:END",
-        )
+        raise InputError("GPS/IMU packets are missing", where=str(path),
+                         got=f"no packet for frames {', '.join(str(n) for n in missing[:8])} ({len(missing)} in all)",
+                         remedy="copy them, or choose frames with --frames FIRST:END")  # fmt: skip
     return {n: line_numbers(line, (_OXTS_VALUES,), wheres[n], "GPS/IMU packet") for n, line in lines.items()}
 
 
