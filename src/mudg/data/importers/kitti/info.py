@@ -15,10 +15,11 @@ from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import EgoPath, Scene, Source, View
+from mudg.data.importers.common import rigid_rotation
 from mudg.data.importers.drive_log import path_inside
 from mudg.data.importers.images import fit_images
 from mudg.data.importers.kitti import boxes as kitti_boxes
-from mudg.data.importers.kitti.calib import KittiCalibration, nearest_rotation
+from mudg.data.importers.kitti.calib import KittiCalibration
 from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import SceneWriter, decode_image
@@ -50,7 +51,7 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
         projection = np.array(image_record["cam2img"], np.float64)[:3]
         rect0_from_velo = np.array(image_record["lidar2cam"], np.float64)
         rect0_from_velo = from_rotation_translation(
-            nearest_rotation(rect0_from_velo[:3, :3], f"{where}: lidar2cam"), rect0_from_velo[:3, 3]
+            rigid_rotation(rect0_from_velo[:3, :3], f"{where}: lidar2cam"), rect0_from_velo[:3, 3]
         )
         calibration = KittiCalibration({2: projection}, rect0_from_velo, None, where)
         boxes = _boxes(sample.get("instances", []), rect0_from_velo, where)
