@@ -31,7 +31,7 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras, refuse_untwist
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -122,7 +122,7 @@ def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "Argoverse 2", str(source))
+    refuse_untwist(options, "Argoverse 2", str(source))
     return drive_log.write_log(read_log(_choose_log(source, options), options), out, options)
 
 
@@ -224,7 +224,7 @@ def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     found = sorted(
         (int(path.stem), path) for path in folder.iterdir() if path.stem.isdigit() and path.suffix.lower() in suffixes
     )
-    drive_log.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
+    common.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
     return dict(found)
 
 
@@ -293,7 +293,7 @@ def _stamps(columns: Columns, where: str) -> NDArray[np.int64]:
     if stamps.dtype.kind not in "iu":
         raise InputError("time stamps are not whole numbers", where=f"{where}: timestamp_ns", got=str(stamps.dtype))
     stamps = stamps.astype(np.int64)
-    drive_log.check_epoch(stamps, NANOSECONDS, f"{where}: timestamp_ns")
+    common.check_epoch(stamps, NANOSECONDS, f"{where}: timestamp_ns")
     return stamps
 
 
@@ -308,7 +308,7 @@ def read_ego(path: Path, zero_ns: int) -> EgoPath:
     stamps = _stamps(columns, str(path))
     if len(stamps) == 0:
         raise InputError("table of vehicle poses is empty", where=str(path))
-    return drive_log.ego_path([(int(t) - zero_ns) / NANOSECONDS for t in stamps], _poses(columns, str(path)))
+    return common.ego_path([(int(t) - zero_ns) / NANOSECONDS for t in stamps], _poses(columns, str(path)))
 
 
 def read_mounts(path: Path) -> dict[str, Matrix]:

@@ -38,7 +38,7 @@ from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_npy
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_untwist
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -91,7 +91,7 @@ def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "DGP", str(source))
+    refuse_untwist(options, "DGP", str(source))
     return drive_log.write_log(read_log(_choose_scene(source, options), options), out, options)
 
 
@@ -162,7 +162,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
         images, sweeps = [], []
         cameras: dict[str, Camera] = {}
         for datum in used:
-            path = drive_log.path_inside(folder, datum.record.get("filename"), datum.where)
+            path = path_inside(folder, datum.record.get("filename"), datum.where)
             if datum.kind == "image":
                 name = names[datum.sensor]
                 _add_camera(cameras, calibrations[datum.calibration], name, datum)
@@ -172,7 +172,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
                 sweeps.append(SweepRecord(datum.sensor.lower(), seconds(datum), datum.map_from_sensor, path, read))
         anchors = clouds or [d for d in used if d.sensor == next(iter(chosen.values()))]
         mounts = [calibrations[d.calibration].mount(d.sensor, d.where) for d in anchors]
-        ego = drive_log.ego_path(
+        ego = common.ego_path(
             [seconds(d) for d in anchors], [d.map_from_sensor @ invert(m) for d, m in zip(anchors, mounts, strict=True)]
         )
         tracks, track_notes = _read_tracks(folder, scene, clouds, [seconds(d) for d in clouds])
@@ -223,9 +223,9 @@ def _clock(data: Sequence[_Datum], where: str) -> tuple[int, list[str]]:
     """Ticks of ``stamp_us`` per second, and notes."""
     stamps = np.array([datum.stamp_us for datum in data], np.int64)
     if (stamps > _YEAR_2100_US).all():
-        drive_log.check_epoch(stamps // 10, MICROSECONDS, where)
+        common.check_epoch(stamps // 10, MICROSECONDS, where)
         return 10 * MICROSECONDS, ["dates after 2099: times are read as tenths of a microsecond"]
-    drive_log.check_epoch(stamps, MICROSECONDS, where)
+    common.check_epoch(stamps, MICROSECONDS, where)
     return MICROSECONDS, []
 
 
@@ -253,7 +253,7 @@ class _Calibration:
 
 
 def _read_calibration(folder: Path, key: str) -> _Calibration:
-    path = drive_log.path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
+    path = path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
     record = store.read_json(path)
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
@@ -292,7 +292,7 @@ def _read_tracks(
     for datum, time_s, name in zip(clouds, times_s, files, strict=True):
         if not name:
             continue
-        path = drive_log.path_inside(folder, name, datum.where)
+        path = path_inside(folder, name, datum.where)
         for index, item in enumerate(store.read_json(path)["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
@@ -308,7 +308,7 @@ def _read_tracks(
 
 def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
     key = scene["ontologies"].get(_BOXES_3D)
-    path = drive_log.path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
+    path = path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
     return {int(item["id"]): str(item["name"]) for item in store.read_json(path)["items"]}
 
 

@@ -16,10 +16,10 @@ from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix
 from mudg.base.types import Track
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.kitti.poses import read_lines
+from mudg.data.importers.kitti.scans import azimuth_delay_s
 
 Matrix = NDArray[np.float64]
 MAX_TRACKLET_BYTES = 256 * 1024 * 1024
-TURN_PERIOD_S = 0.1
 LABELS = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
 )
@@ -188,8 +188,3 @@ def _at_scan_times(track: Track, delays_s: Mapping[tuple[str, float], float]) ->
     poses = track.world_from_object.copy()
     poses[:, :3, 3] -= np.gradient(poses[:, :3, 3], track.times_s + late_s, axis=0) * late_s[:, None]
     return replace(track, world_from_object=poses)
-
-
-def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
-    """When a turning sensor looks to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi), seconds after looking forward."""
-    return azimuth_rad / (2 * np.pi) * TURN_PERIOD_S

@@ -143,9 +143,7 @@ def read_calibration_day(folder: Path) -> KittiCalibration:
     """Raw-data calibration of one day: ``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt``, ``calib_imu_to_velo.txt``."""
     path = folder / "calib_cam_to_cam.txt"
     table = read_number_table(path)
-    projections = {
-        n: table_entry(table, (f"P_rect_0{n}",), (3, 4), path) for n in range(4) if f"P_rect_0{n}" in table
-    }
+    projections = {n: table_entry(table, (f"P_rect_0{n}",), (3, 4), path) for n in range(4) if f"P_rect_0{n}" in table}
     rectify = rigid_rotation(table_entry(table, ("R_rect_00",), (3, 3), path), f"{path}: R_rect_00")
     rect0_from_velo = from_rotation_translation(rectify, np.zeros(3)) @ _pose_file(folder / "calib_velo_to_cam.txt")
     imu_path = folder / "calib_imu_to_velo.txt"

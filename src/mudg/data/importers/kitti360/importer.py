@@ -44,7 +44,7 @@ from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.common import deskew, for_each, pose_near, rigid_pose, seconds
 from mudg.data.importers.images import ImageFit
 from mudg.data.importers.kitti import poses as kitti_poses
-from mudg.data.importers.kitti.importer import read_scan
+from mudg.data.importers.kitti.scans import read_scan
 from mudg.data.importers.kitti360.boxes import WORDS, read_boxes
 from mudg.data.importers.kitti360.calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
 from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames

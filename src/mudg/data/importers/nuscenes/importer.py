@@ -36,7 +36,7 @@ from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_untwist
 from mudg.data.importers.nuscenes import tables
 from mudg.data.importers.options import ImportOptions
 
@@ -115,7 +115,7 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "nuScenes", str(source))
+    refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
         from mudg.data.importers.nuscenes.info import import_info_frame
@@ -203,7 +203,7 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
     tracks, notes = _read_tracks(release, samples, zero_us)
     if not sweeps:
         notes.append("no LiDAR sweeps in the tables")
-    ego = drive_log.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
+    ego = common.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
     source = Source("nuscenes", LICENCE, None, (f"release {folder.name}, {scene['name']}", *notes))
     return DriveLog(str(scene["name"]), cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
 
@@ -244,7 +244,7 @@ def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
         stamps[at] = tables.whole(samples[at], "timestamp", samples.where)
         at = tables.text(samples[at], "next", samples.where)
     values = np.array(list(stamps.values()), np.int64)
-    drive_log.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
+    common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
         late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
         raise InputError(
@@ -272,7 +272,7 @@ def _check_all_cameras(there: Mapping[str, str], options: ImportOptions, where: 
 def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: str) -> None:
     """Stamps of images and sweeps are microseconds near their scene."""
     stamps = np.array([tables.whole(row, "timestamp", where) for row in rows], np.int64)
-    drive_log.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
+    common.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
     if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
@@ -305,7 +305,7 @@ class _RowReader:
         return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
 
     def file(self, row: tables.Row) -> Path:
-        return drive_log.path_inside(self.release.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+        return path_inside(self.release.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
 
     def image(self, row: tables.Row, camera: str) -> ImageRecord:
         return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))

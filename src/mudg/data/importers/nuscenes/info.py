@@ -21,7 +21,7 @@ from mudg.base.types import EgoPath, Scene, Source, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import box_size, check_sides
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras, refuse_options
+from mudg.data.importers.layout import chosen_cameras, path_inside, refuse_options
 from mudg.data.importers.nuscenes.importer import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import decode_image
@@ -88,13 +88,13 @@ def _drive_log(
     cameras, images = {}, []
     for name, raw in chosen.items():
         item = sample["images"][raw]
-        image_path = drive_log.path_inside(source, item["img_path"], f"{where}: {raw}")
+        image_path = path_inside(source, item["img_path"], f"{where}: {raw}")
         height, width = decode_image(store.read_bytes(image_path), str(image_path)).shape[:2]
         cameras[name] = camera_from_intrinsics(name, width, height, item["cam2img"], f"{where}: {raw}.cam2img")
         # lidar2cam holds the vehicle's motion between the two moments, which cam2ego alone does not
         lidar_from_cam = invert(common.rigid_pose(item["lidar2cam"], f"{where}: {raw}.lidar2cam"))
         images.append(ImageRecord(name, 0.0, map_from_lidar @ lidar_from_cam, image_path))
-    scan = drive_log.path_inside(source, lidar["lidar_path"], f"{where}: lidar_path")
+    scan = path_inside(source, lidar["lidar_path"], f"{where}: lidar_path")
     sweeps = [SweepRecord(SENSOR, 0.0, map_from_lidar, scan, partial(read_scan, scan))]
     ego = EgoPath(np.zeros(1), map_from_ego[None])
     tracks = _tracks(meta, sample.get("instances", []), map_from_lidar, where)
