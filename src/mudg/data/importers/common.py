@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -395,14 +395,26 @@ def deskew(
     lidar_from_world = invert(world_from_lidar(time_s))
     corrections = [lidar_from_world @ world_from_lidar(time_s + float(moment)) for moment in moments]
     place = (dt_s.astype(np.float64) - low) / (moments[-1] - low) * _DESKEW_STEPS
-    step = np.clip(place.astype(int), 0, _DESKEW_STEPS - 1)
-    out = np.empty_like(xyz)
-    for index in range(_DESKEW_STEPS):
+    return blend_motion(xyz.astype(np.float64), corrections, place).astype(xyz.dtype)
+
+
+def blend_motion(
+    points: NDArray[np.floating], corrections: Sequence[Matrix], place: NDArray[np.floating]
+) -> NDArray[Any]:
+    """Move each of the points [N, 3] by what lies between two of many corrections, blended linearly.
+
+    Args:
+        points: metres; computed in their type.
+        corrections: f64[4, 4] each, at least two.
+        place: [N] number of the correction, with its fraction: 2.5 is halfway between the third and the fourth.
+    """
+    step = np.clip(place.astype(int), 0, len(corrections) - 2)
+    out = np.empty_like(points)
+    for index in range(len(corrections) - 1):
         chosen = step == index
         if chosen.any():
             share = (place[chosen] - index)[:, None]
-            points = xyz[chosen].astype(np.float64)
-            before, after = (transform_points(corrections[n], points) for n in (index, index + 1))
+            before, after = (transform_points(corrections[n], points[chosen]) for n in (index, index + 1))
             out[chosen] = before + share * (after - before)
     return out
 

@@ -107,20 +107,16 @@ def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
         raise InputError(
-            "no DGP scene found",
-            where=str(source),
+            "no DGP scene found", where=str(source),
             expected="scene_<hash>.json beside a calibration folder, here or in sub-folders",
             got=", ".join(sorted(path.name for path in source.iterdir())[:10]) or "an empty folder",
-        )
+        )  # fmt: skip
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
     if len(matching) != 1:
         names = ", ".join(f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes[:8])
-        raise UsageError(
-            "the folder holds several scenes" if matching else "there is no such scene",
-            where=str(source),
-            expected=f"--sequence with the folder or file name of one of {names} ({len(scenes)} in all)",
-            got=options.sequence or "none chosen",
-        )
+        raise UsageError("the folder holds several scenes" if matching else "there is no such scene", where=str(source),
+                         expected=f"--sequence with the folder or file name of one of {names} ({len(scenes)} in all)",
+                         got=options.sequence or "none chosen")  # fmt: skip
     return matching[0]
 
 
@@ -181,9 +177,8 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
         )
         tracks, track_notes = _read_tracks(folder, scene, clouds, [seconds(d) for d in clouds])
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            "scene record is incomplete", where=where, got=repr(error), expected="the fields of a DGP scene"
-        ) from error
+        raise InputError("scene record is incomplete", where=where, got=repr(error),
+                         expected="the fields of a DGP scene") from error  # fmt: skip
     ordered = {name: cameras[name] for name in chosen}
     source = Source("dgp", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
@@ -252,12 +247,8 @@ class _Calibration:
 
     def mount(self, sensor: str, where: str) -> Matrix:
         if sensor not in self.mounts:
-            raise InputError(
-                "calibration lacks a sensor",
-                where=self.where,
-                expected=f"{sensor} ({where})",
-                got=", ".join(self.mounts),
-            )
+            raise InputError("calibration lacks a sensor", where=self.where, expected=f"{sensor} ({where})",
+                             got=", ".join(self.mounts))  # fmt: skip
         return self.mounts[sensor]
 
 
@@ -266,9 +257,8 @@ def _read_calibration(folder: Path, key: str) -> _Calibration:
     record = store.read_json(path)
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
-        raise InputError(
-            "calibration lists differ in length", where=str(path), expected="names, extrinsics, intrinsics"
-        )
+        raise InputError("calibration lists differ in length", where=str(path),
+                         expected="names, extrinsics, intrinsics")  # fmt: skip
     mounts = {n: _pose(value, f"{path}: {n}") for n, value in zip(names, record["extrinsics"], strict=True)}
     return _Calibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
 
@@ -283,12 +273,8 @@ def _add_camera(cameras: dict[str, Camera], calibration: _Calibration, name: str
     width, height = int(datum.record["width"]), int(datum.record["height"])
     camera = Camera(name, width, height, k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5)
     if cameras.setdefault(name, camera) != camera:
-        raise InputError(
-            "images of one camera differ in size or calibration",
-            where=datum.where,
-            expected=str(cameras[name]),
-            got=str(camera),
-        )
+        raise InputError("images of one camera differ in size or calibration", where=datum.where,
+                         expected=str(cameras[name]), got=str(camera))  # fmt: skip
 
 
 # --- boxes and clouds -------------------------------------------------------------------------------------------------
@@ -310,10 +296,8 @@ def _read_tracks(
         for index, item in enumerate(store.read_json(path)["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
-                raise InputError(
-                    "box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
-                    expected=", ".join(str(number) for number in names),
-                )  # fmt: skip
+                raise InputError("box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
+                                 expected=", ".join(str(number) for number in names))  # fmt: skip
             box = item["box"]
             size = box["length"], box["width"], box["height"]
             label = tracks.word(names[item["class_id"]])
@@ -341,12 +325,8 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
             with archive.open(entry) as handle:
                 data = read_npy(handle, entry.file_size, f"{where}: data.npy")
     except _UNREADABLE as error:
-        raise InputError(
-            "cloud is no npz file with an array 'data', or is cut off",
-            where=where,
-            got=str(error),
-            remedy="copy the file again",
-        ) from error
+        raise InputError("cloud is no npz file with an array 'data', or is cut off", where=where, got=str(error),
+                         remedy="copy the file again") from error  # fmt: skip
     columns = [str(name).upper() for name in point_format] or ["X", "Y", "Z", "INTENSITY"]
     if (
         data.ndim != 2
@@ -354,19 +334,13 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
         or data.dtype.kind not in "fiu"
         or not {"X", "Y", "Z"} <= {*columns}
     ):
-        raise InputError(
-            "cloud does not have its columns",
-            where=where,
-            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
-            got=f"{data.dtype} {data.shape}",
-        )
+        raise InputError("cloud does not have its columns", where=where,
+                         expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
+                         got=f"{data.dtype} {data.shape}")  # fmt: skip
     data = data.astype(np.float32)
     if not np.isfinite(data).all():
-        raise InputError(
-            "cloud holds values that are not finite",
-            where=where,
-            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points",
-        )
+        raise InputError("cloud holds values that are not finite", where=where,
+                         got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")  # fmt: skip
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
     return SweepPoints(xyz, np.clip(intensity, 0, 1), np.zeros(len(data), np.float32))

@@ -100,6 +100,11 @@ def some_numbers(numbers: Sequence[int]) -> str:
     return ", ".join(words[:8]) + (f", ... ({len(numbers)} in all)" if len(words) > 8 else "")
 
 
+def first_file(*candidates: Path) -> Path | None:
+    """The first of some paths that is a file."""
+    return next((path for path in candidates if path.is_file()), None)
+
+
 def folder_contents(folder: Path) -> str:
     """The first names in a folder, for messages."""
     return ", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder"
