@@ -36,7 +36,7 @@ from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_untwist
+from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_missing_cameras, refuse_untwist
 from mudg.data.importers.nuscenes import tables
 from mudg.data.importers.options import ImportOptions
 
@@ -165,7 +165,7 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
         channel_of[row["token"]] = tables.text(sensor, "channel", sensors.where)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
     chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, tuple(CAMERAS))}
-    _check_all_cameras(there, options, where)
+    refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
@@ -221,8 +221,8 @@ def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
     while at:
         if at in stamps:
             raise InputError("the chain of key frames runs in a circle", where=samples.where, got=f"back at {at!r}")
-        stamps[at] = tables.whole(samples[at], "timestamp", samples.where)
-        at = tables.text(samples[at], "next", samples.where)
+        stamps[at] = tables.whole(samples.record(at, samples.where), "timestamp", samples.where)
+        at = tables.text(samples.rows[at], "next", samples.where)
     values = np.array(list(stamps.values()), np.int64)
     common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
@@ -231,14 +231,6 @@ def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
             where=f"{samples.where}: record {late!r}", got=f"{stamps[late]} after a later one",
             expected="microseconds, increasing from one key frame to the next", remedy="copy the table again")  # fmt: skip
     return stamps
-
-
-def _check_all_cameras(there: Mapping[str, str], options: ImportOptions, where: str) -> None:
-    absent = [name for raw, name in CAMERAS.items() if raw not in there]
-    if absent and not options.cameras and not options.skip_missing:
-        raise InputError("cameras are missing in the tables", where=where, got=f"no images of {', '.join(absent)}",
-            expected="six cameras",
-            remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing")  # fmt: skip
 
 
 def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: str) -> None:
@@ -286,11 +278,11 @@ class _RowReader:
     def camera(self, row: tables.Row, name: str) -> Camera:
         calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
         where = f"{self.calibrations.where}: record {calibration['token']!r}"
-        width, height = tables.whole(row, "width", self.where), tables.whole(row, "height", self.where)
-        return camera_from_intrinsics(name, width, height, calibration.get("camera_intrinsic"), where)
+        size = tables.whole(row, "width", self.where), tables.whole(row, "height", self.where)
+        return camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), where)
 
 
-def camera_from_intrinsics(name: str, width: int, height: int, intrinsics: Any, where: str) -> Camera:
+def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, where: str) -> Camera:
     """A camera from the release's 3x3 intrinsics, whose pixel centres are whole numbers: half a pixel is added here."""
     try:
         k = np.array(intrinsics, np.float64)
@@ -300,7 +292,7 @@ def camera_from_intrinsics(name: str, width: int, height: int, intrinsics: Any, 
     if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
         raise InputError("intrinsics are malformed", where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
             got=str(intrinsics)[:120])  # fmt: skip
-    return Camera(name, width, height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
+    return Camera(name, *size, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
 
 
 def _pose(row: tables.Row, where: str) -> Matrix:

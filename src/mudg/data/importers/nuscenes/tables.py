@@ -193,17 +193,13 @@ class TokenTable:
             if self.rows.setdefault(token, row) is not row:
                 raise InputError("two records have one token", where=self.where, got=token)
 
-    def __getitem__(self, token: str) -> Row:
-        if token not in self.rows:
-            raise InputError("a token points nowhere", where=self.where, got=f"no record {token!r}",
-                remedy="are the tables of one release, and complete?")  # fmt: skip
+    def record(self, token: Any, where: str) -> Row:
+        """The record of a token; ``where`` says who refers to it."""
+        if not isinstance(token, str) or token not in self.rows:
+            raise InputError("a token points nowhere", where=where, got=repr(token),
+                expected=f"a record of {self.where}", remedy="are the tables of one release, and complete?")  # fmt: skip
         return self.rows[token]
 
     def get(self, row: Row, key: str, where: str) -> Row:
         """The record that field ``key`` of ``row`` (in table ``where``) refers to."""
-        token = row.get(key)
-        if not isinstance(token, str) or token not in self.rows:
-            raise InputError("a token points nowhere", where=f"{where}: record {row.get('token', '?')!r}: {key}",
-                got=repr(token), expected=f"a record of {self.where}",
-                remedy="are the tables of one release, and complete?")  # fmt: skip
-        return self.rows[token]
+        return self.record(row.get(key), f"{where}: record {row.get('token', '?')!r}: {key}")
