@@ -112,8 +112,8 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     "no pose file": ("no vehicle poses", "", lambda r: (r / "derived/poses_velo.txt").unlink()),
     "NaN pose": ("not finite", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "nan", *w[5:]])),
     "text in pose": ("not a number", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "1,5", *w[5:]])),
-    "scaled pose": ("not a rigid motion", "frame 2", lambda r: pose_line(r, 2, scale)),
-    "mirrored pose": ("not a rigid motion", "frame 2", lambda r: pose_line(r, 2, mirror)),
+    "scaled pose": ("is scaled", "frame 2", lambda r: pose_line(r, 2, scale)),
+    "mirrored pose": ("left-handed", "frame 2", lambda r: pose_line(r, 2, mirror)),
     "binary pose file": (
         "not text",
         "poses_velo.txt",
@@ -136,7 +136,7 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         ),
     ),
     "calibration scaled": (
-        "not a rotation",
+        "is scaled",
         "R0_rect",
         lambda r: rewrite(r / "calib.txt", lambda t: t.replace(made.numbers(np.eye(3)), made.numbers(2 * np.eye(3)))),
     ),

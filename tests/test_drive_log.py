@@ -13,10 +13,11 @@ from PIL import Image
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Source, SweepPoints, Track
-from mudg.data.importers import drive_log
+from mudg.data.importers import common
 from mudg.data.importers.box_times import BoxTimes, clip_track, reach_images
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, nearest_index, write_log
+from mudg.data.importers.common import nearest_index
+from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, write_log
 from mudg.data.importers.options import ImportOptions
 
 UP = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
@@ -125,8 +126,8 @@ def test_impossible_motion_is_refused(tmp_path: Path) -> None:
 )
 def test_stamps_in_another_unit_are_refused(stamp: int, per_second: int) -> None:
     with pytest.raises(InputError, match="another unit"):
-        drive_log.check_epoch(np.array([stamp]), per_second, "table")
-    drive_log.check_epoch(np.array([1_532_402_927 * per_second, 1_532_402_947 * per_second]), per_second, "table")
+        common.check_epoch(np.array([stamp]), per_second, "table")
+    common.check_epoch(np.array([1_532_402_927 * per_second, 1_532_402_947 * per_second]), per_second, "table")
 
 
 # --- tracks ---------------------------------------------------------------------------------------------------------
@@ -228,11 +229,11 @@ def test_boxes_without_returns_take_the_delay_of_their_neighbours_and_standing_o
 def test_a_vehicle_that_slides_is_refused_and_one_that_reverses_is_not(tmp_path: Path) -> None:
     drive = made(tmp_path / "log")
     sliding = EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(0.8))
-    drive_log.check_motion(drive.ego, "log")
+    common.check_motion(drive.ego, "log")
     with pytest.raises(InputError, match="where it looks") as caught:
-        drive_log.check_motion(sliding, "log")
+        common.check_motion(sliding, "log")
     assert "46 degrees" in caught.value.got
-    drive_log.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")
+    common.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")
 
 
 def test_tracks_reach_the_images_at_their_ends() -> None:

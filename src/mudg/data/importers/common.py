@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,15 @@ from numpy.typing import ArrayLike, NDArray
 from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, MudgError
-from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, pose_at, transform_points
+from mudg.base.geometry import (
+    from_rotation_translation,
+    invert,
+    matrix_from_quaternion,
+    pose_at,
+    transform_points,
+    yaw_matrix,
+    yaw_of,
+)
 from mudg.base.types import EgoPath
 
 Item = TypeVar("Item")
@@ -41,6 +49,14 @@ POSE_TOLERANCE: Final = 1e-3
 QUATERNION_TOLERANCE: Final = 1e-2
 MAX_EXTRAPOLATION_S: Final = 0.15
 _DESKEW_STEPS: Final = 32
+MAX_SPEED_M_S: Final = 100.0
+_SPEED_OVER_S: Final = 0.05
+_LEAST_UPRIGHT: Final = 0.5
+_DRIVES_M_S: Final = 1.0
+_LEAST_ALONG: Final = 0.8
+_EPOCH_S: Final = (1e8, 4.1e9)
+"""Seconds since 1970 that a recording may carry: 1973 to 2099."""
+_MAX_LOG_S: Final = 4 * 3600.0
 
 
 # --- work over frames -------------------------------------------------------------------------------------------------
@@ -176,6 +192,33 @@ def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, wh
     return since_start
 
 
+def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> None:
+    """Refuse integer time stamps that are not since 1970 in the unit ``per_second`` (10**6 = microseconds)."""
+    unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
+    outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
+    if outside.any():
+        raise InputError(
+            "time stamp is in another unit",
+            where=where,
+            expected=f"{unit} since 1970",
+            got=f"{int(stamps[outside][0])}",
+            remedy=f"convert the stamps to {unit}",
+        )
+    if len(stamps) and int(stamps.max()) - int(stamps.min()) > _MAX_LOG_S * per_second:
+        raise InputError(
+            "time stamps of one log span more than hours",
+            where=where,
+            got=f"{int(stamps.min())} to {int(stamps.max())}",
+            expected=f"{unit}, all of one recording",
+            remedy="are records of another log, or of another unit, mixed in?",
+        )
+
+
+def nearest_index(sorted_times_s: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to the earlier."""
+    return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
+
+
 # --- poses ------------------------------------------------------------------------------------------------------------
 
 
@@ -276,6 +319,61 @@ def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATI
     return end if back is None else end @ invert(back) @ end
 
 
+def world_from_first(map_from_ego: Matrix) -> Matrix:
+    """The world whose origin is the first vehicle pose, its x axis along the first heading, its z axis the map's."""
+    return yaw_matrix(-yaw_of(map_from_ego)) @ from_rotation_translation(np.eye(3), -map_from_ego[:3, 3])
+
+
+def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:
+    """Vehicle path in time order; of poses at one time (within a microsecond) the first is kept."""
+    times = np.asarray(stamps_s, np.float64)
+    order = np.argsort(times, kind="stable")
+    kept = order[np.r_[True, np.diff(times[order]) > 1e-6]]
+    return EgoPath(times[kept], np.stack([poses[i] for i in kept]))
+
+
+def check_motion(ego: EgoPath, where: str) -> None:
+    """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are wrong then."""
+    upright = float(np.median(ego.world_from_ego[:, 2, 2]))
+    if upright < _LEAST_UPRIGHT:
+        raise InputError(
+            "the vehicle does not stand upright",
+            where=where,
+            expected="vehicle and map with z up",
+            got=f"its z axis rises by {upright:.2f} per metre",
+            remedy="check the order of quaternions (w, x, y, z) and the axes",
+        )
+    if len(ego.times_s) < 2:
+        return
+    # over a twentieth of a second at least: pose noise over less is no speed
+    later = np.minimum(np.searchsorted(ego.times_s, ego.times_s + _SPEED_OVER_S), len(ego.times_s) - 1)
+    pairs = np.flatnonzero(ego.times_s[later] - ego.times_s >= _SPEED_OVER_S)
+    first, last = (pairs, later[pairs]) if len(pairs) else (np.array([0]), np.array([len(ego.times_s) - 1]))
+    steps = ego.world_from_ego[last, :3, 3] - ego.world_from_ego[first, :3, 3]
+    speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
+    at = int(speed.argmax())
+    if speed[at] > MAX_SPEED_M_S:
+        raise InputError(
+            "the vehicle moves impossibly fast",
+            where=where,
+            got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
+            expected=f"under {MAX_SPEED_M_S:.0f} m/s",
+            remedy="check the units of times and translations, and that all poses are of one log",
+        )
+    drives = speed > _DRIVES_M_S
+    if drives.any():
+        forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
+        along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
+        if along < _LEAST_ALONG:
+            raise InputError(
+                "the vehicle does not drive where it looks",
+                where=where,
+                expected="vehicle axes x forward, y left, z up",
+                got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
+                remedy="check the order of quaternions (w, x, y, z) and the axes",
+            )
+
+
 def deskew(
     xyz: NDArray[np.float32], dt_s: NDArray[np.float32], world_from_lidar: Callable[[float], Matrix], time_s: float
 ) -> NDArray[np.float32]:
@@ -297,14 +395,26 @@ def deskew(
     lidar_from_world = invert(world_from_lidar(time_s))
     corrections = [lidar_from_world @ world_from_lidar(time_s + float(moment)) for moment in moments]
     place = (dt_s.astype(np.float64) - low) / (moments[-1] - low) * _DESKEW_STEPS
-    step = np.clip(place.astype(int), 0, _DESKEW_STEPS - 1)
-    out = np.empty_like(xyz)
-    for index in range(_DESKEW_STEPS):
+    return blend_motion(xyz.astype(np.float64), corrections, place).astype(xyz.dtype)
+
+
+def blend_motion(
+    points: NDArray[np.floating], corrections: Sequence[Matrix], place: NDArray[np.floating]
+) -> NDArray[Any]:
+    """Move each of the points [N, 3] by what lies between two of many corrections, blended linearly.
+
+    Args:
+        points: metres; computed in their type.
+        corrections: f64[4, 4] each, at least two.
+        place: [N] number of the correction, with its fraction: 2.5 is halfway between the third and the fourth.
+    """
+    step = np.clip(place.astype(int), 0, len(corrections) - 2)
+    out = np.empty_like(points)
+    for index in range(len(corrections) - 1):
         chosen = step == index
         if chosen.any():
             share = (place[chosen] - index)[:, None]
-            points = xyz[chosen].astype(np.float64)
-            before, after = (transform_points(corrections[n], points) for n in (index, index + 1))
+            before, after = (transform_points(corrections[n], points[chosen]) for n in (index, index + 1))
             out[chosen] = before + share * (after - before)
     return out
 

@@ -38,7 +38,7 @@ from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_npy
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_untwist
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -91,7 +91,7 @@ def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "DGP", str(source))
+    refuse_untwist(options, "DGP", str(source))
     return drive_log.write_log(read_log(_choose_scene(source, options), options), out, options)
 
 
@@ -107,20 +107,16 @@ def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
         raise InputError(
-            "no DGP scene found",
-            where=str(source),
+            "no DGP scene found", where=str(source),
             expected="scene_<hash>.json beside a calibration folder, here or in sub-folders",
             got=", ".join(sorted(path.name for path in source.iterdir())[:10]) or "an empty folder",
-        )
+        )  # fmt: skip
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
     if len(matching) != 1:
         names = ", ".join(f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes[:8])
-        raise UsageError(
-            "the folder holds several scenes" if matching else "there is no such scene",
-            where=str(source),
-            expected=f"--sequence with the folder or file name of one of {names} ({len(scenes)} in all)",
-            got=options.sequence or "none chosen",
-        )
+        raise UsageError("the folder holds several scenes" if matching else "there is no such scene", where=str(source),
+                         expected=f"--sequence with the folder or file name of one of {names} ({len(scenes)} in all)",
+                         got=options.sequence or "none chosen")  # fmt: skip
     return matching[0]
 
 
@@ -166,7 +162,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
         images, sweeps = [], []
         cameras: dict[str, Camera] = {}
         for datum in used:
-            path = drive_log.path_inside(folder, datum.record.get("filename"), datum.where)
+            path = path_inside(folder, datum.record.get("filename"), datum.where)
             if datum.kind == "image":
                 name = names[datum.sensor]
                 _add_camera(cameras, calibrations[datum.calibration], name, datum)
@@ -176,14 +172,13 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
                 sweeps.append(SweepRecord(datum.sensor.lower(), seconds(datum), datum.map_from_sensor, path, read))
         anchors = clouds or [d for d in used if d.sensor == next(iter(chosen.values()))]
         mounts = [calibrations[d.calibration].mount(d.sensor, d.where) for d in anchors]
-        ego = drive_log.ego_path(
+        ego = common.ego_path(
             [seconds(d) for d in anchors], [d.map_from_sensor @ invert(m) for d, m in zip(anchors, mounts, strict=True)]
         )
         tracks, track_notes = _read_tracks(folder, scene, clouds, [seconds(d) for d in clouds])
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            "scene record is incomplete", where=where, got=repr(error), expected="the fields of a DGP scene"
-        ) from error
+        raise InputError("scene record is incomplete", where=where, got=repr(error),
+                         expected="the fields of a DGP scene") from error  # fmt: skip
     ordered = {name: cameras[name] for name in chosen}
     source = Source("dgp", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
@@ -228,9 +223,9 @@ def _clock(data: Sequence[_Datum], where: str) -> tuple[int, list[str]]:
     """Ticks of ``stamp_us`` per second, and notes."""
     stamps = np.array([datum.stamp_us for datum in data], np.int64)
     if (stamps > _YEAR_2100_US).all():
-        drive_log.check_epoch(stamps // 10, MICROSECONDS, where)
+        common.check_epoch(stamps // 10, MICROSECONDS, where)
         return 10 * MICROSECONDS, ["dates after 2099: times are read as tenths of a microsecond"]
-    drive_log.check_epoch(stamps, MICROSECONDS, where)
+    common.check_epoch(stamps, MICROSECONDS, where)
     return MICROSECONDS, []
 
 
@@ -252,23 +247,18 @@ class _Calibration:
 
     def mount(self, sensor: str, where: str) -> Matrix:
         if sensor not in self.mounts:
-            raise InputError(
-                "calibration lacks a sensor",
-                where=self.where,
-                expected=f"{sensor} ({where})",
-                got=", ".join(self.mounts),
-            )
+            raise InputError("calibration lacks a sensor", where=self.where, expected=f"{sensor} ({where})",
+                             got=", ".join(self.mounts))  # fmt: skip
         return self.mounts[sensor]
 
 
 def _read_calibration(folder: Path, key: str) -> _Calibration:
-    path = drive_log.path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
+    path = path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
     record = store.read_json(path)
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
-        raise InputError(
-            "calibration lists differ in length", where=str(path), expected="names, extrinsics, intrinsics"
-        )
+        raise InputError("calibration lists differ in length", where=str(path),
+                         expected="names, extrinsics, intrinsics")  # fmt: skip
     mounts = {n: _pose(value, f"{path}: {n}") for n, value in zip(names, record["extrinsics"], strict=True)}
     return _Calibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
 
@@ -283,12 +273,8 @@ def _add_camera(cameras: dict[str, Camera], calibration: _Calibration, name: str
     width, height = int(datum.record["width"]), int(datum.record["height"])
     camera = Camera(name, width, height, k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5)
     if cameras.setdefault(name, camera) != camera:
-        raise InputError(
-            "images of one camera differ in size or calibration",
-            where=datum.where,
-            expected=str(cameras[name]),
-            got=str(camera),
-        )
+        raise InputError("images of one camera differ in size or calibration", where=datum.where,
+                         expected=str(cameras[name]), got=str(camera))  # fmt: skip
 
 
 # --- boxes and clouds -------------------------------------------------------------------------------------------------
@@ -306,14 +292,12 @@ def _read_tracks(
     for datum, time_s, name in zip(clouds, times_s, files, strict=True):
         if not name:
             continue
-        path = drive_log.path_inside(folder, name, datum.where)
+        path = path_inside(folder, name, datum.where)
         for index, item in enumerate(store.read_json(path)["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
-                raise InputError(
-                    "box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
-                    expected=", ".join(str(number) for number in names),
-                )  # fmt: skip
+                raise InputError("box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
+                                 expected=", ".join(str(number) for number in names))  # fmt: skip
             box = item["box"]
             size = box["length"], box["width"], box["height"]
             label = tracks.word(names[item["class_id"]])
@@ -324,7 +308,7 @@ def _read_tracks(
 
 def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
     key = scene["ontologies"].get(_BOXES_3D)
-    path = drive_log.path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
+    path = path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
     return {int(item["id"]): str(item["name"]) for item in store.read_json(path)["items"]}
 
 
@@ -341,12 +325,8 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
             with archive.open(entry) as handle:
                 data = read_npy(handle, entry.file_size, f"{where}: data.npy")
     except _UNREADABLE as error:
-        raise InputError(
-            "cloud is no npz file with an array 'data', or is cut off",
-            where=where,
-            got=str(error),
-            remedy="copy the file again",
-        ) from error
+        raise InputError("cloud is no npz file with an array 'data', or is cut off", where=where, got=str(error),
+                         remedy="copy the file again") from error  # fmt: skip
     columns = [str(name).upper() for name in point_format] or ["X", "Y", "Z", "INTENSITY"]
     if (
         data.ndim != 2
@@ -354,19 +334,13 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
         or data.dtype.kind not in "fiu"
         or not {"X", "Y", "Z"} <= {*columns}
     ):
-        raise InputError(
-            "cloud does not have its columns",
-            where=where,
-            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
-            got=f"{data.dtype} {data.shape}",
-        )
+        raise InputError("cloud does not have its columns", where=where,
+                         expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
+                         got=f"{data.dtype} {data.shape}")  # fmt: skip
     data = data.astype(np.float32)
     if not np.isfinite(data).all():
-        raise InputError(
-            "cloud holds values that are not finite",
-            where=where,
-            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points",
-        )
+        raise InputError("cloud holds values that are not finite", where=where,
+                         got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")  # fmt: skip
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
     return SweepPoints(xyz, np.clip(intensity, 0, 1), np.zeros(len(data), np.float32))

@@ -14,7 +14,7 @@ A scene's cameras are pinhole cameras: projection, fusion and rasteriser know no
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -184,6 +184,17 @@ def fit_images(
         out = out.resized(*size)
     note = f"camera {camera.name}: images {'; '.join(words)}" if words else ""
     return ImageFit(out, camera, note, table)
+
+
+def image_notes(fits: Mapping[str, ImageFit]) -> list[str]:
+    """What is done to the images of the cameras, for ``Source.notes``; nothing where they are kept as they are."""
+    return [fit.words for fit in fits.values() if fit.words]
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, which is decoded to prove that it is one."""
+    height, width = decode_image(store.read_bytes(path), str(path)).shape[:2]
+    return width, height
 
 
 def resized(width: int, height: int, resolution: Resolution | None, where: str = "") -> tuple[int, int]:

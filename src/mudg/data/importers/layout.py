@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.schema import ref_problem
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +100,36 @@ def some_numbers(numbers: Sequence[int]) -> str:
     return ", ".join(words[:8]) + (f", ... ({len(numbers)} in all)" if len(words) > 8 else "")
 
 
+def first_file(*candidates: Path) -> Path | None:
+    """The first of some paths that is a file."""
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def folder_contents(folder: Path) -> str:
+    """The first names in a folder, for messages."""
+    return ", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder"
+
+
+def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOptions, where: Path, kind: str) -> Item:
+    """The one log that ``options.sequence`` means.
+
+    Args:
+        matching: logs that fit it; all of them where none was chosen.
+        names: of all logs that are there, for the message.
+        options: ``sequence`` is used.
+        where: folder that holds them.
+        kind: word for one: log, scene, drive, sequence.
+
+    Raises:
+        UsageError: none fits, or several do.
+    """
+    if len(matching) == 1:
+        return matching[0]
+    listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+    raise UsageError(f"the folder holds several {kind}s" if matching else f"there is no such {kind}", where=str(where),
+        expected=f"--sequence with one of {listed}", got=options.sequence or "none chosen")  # fmt: skip
+
+
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
     """The data set's names of the cameras to import, in the order of ``available``.
 
@@ -124,6 +158,22 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     return [name for name in available if name in wanted]
 
 
+def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: ImportOptions, where: object) -> None:
+    """Refuse a log that lacks cameras of its data set, unless cameras were chosen or ``skip_missing`` says otherwise.
+
+    Args:
+        there, usual: the cameras' names in the scene.
+        options: ``cameras`` and ``skip_missing`` are used.
+        where: the log, for messages.
+    """
+    there, usual = list(there), list(usual)
+    absent = [name for name in usual if name not in there]
+    if absent and not options.cameras and not options.skip_missing:
+        raise InputError("cameras are missing in the log", where=str(where), got=f"no images of {', '.join(absent)}",
+            expected=f"{len(usual)} cameras",
+            remedy=f"choose those that are there with --cameras {' '.join(there)}, or add --skip-missing")  # fmt: skip
+
+
 def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
     """Refuse options of other formats that were set here: better than to do something else than asked.
 
@@ -135,3 +185,25 @@ def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
         if getattr(options, name) != getattr(default, name):
             flag = "--" + name.replace("_", "-")
             raise UsageError(f"{title} logs have no use for {flag}", where=flag, remedy="leave it out")
+
+
+def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
+    """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its sweeps."""
+    if options.untwist == "yes":
+        raise UsageError(
+            f"sweeps of {dataset} are already compensated for the vehicle's motion",
+            where=where,
+            got="--untwist yes",
+            remedy="leave --untwist out",
+        )
+    refuse_options(options, dataset, "poses", "boxes")
+
+
+def path_inside(root: Path, name: Any, where: str) -> Path:
+    """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
+    problem = ref_problem(name)
+    if problem is not None:
+        raise InputError(
+            f"file name {problem}", where=where, got=repr(name)[:120], expected="a relative path inside the log"
+        )
+    return root / name

@@ -167,10 +167,8 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     rows, columns = _whole(node, "rows", f"{where}.{key}"), _whole(node, "cols", f"{where}.{key}")
     words = (node.findtext("data") or "").split()
     if rows * columns != len(words) or not 0 < rows * columns <= _MAX_VALUES:
-        raise InputError(
-            "matrix does not have the size it declares", where=f"{where}.{key}", expected=f"{rows} x {columns} numbers",
-            got=f"{len(words)} values",
-        )  # fmt: skip
+        raise InputError("matrix does not have the size it declares", where=f"{where}.{key}",
+                         expected=f"{rows} x {columns} numbers", got=f"{len(words)} values")  # fmt: skip
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:

@@ -61,10 +61,9 @@ class Kitti360Calibration:
         declared = _entry(table, f"S_rect_{camera[-2:]}", 2, path)
         _check_size(size, (int(declared[0]), int(declared[1])), f"{path}: S_rect_{camera[-2:]}")
         if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
-            raise InputError(
-                "projection matrix is not of a rectified pinhole camera", where=f"{path}: P_rect_{camera[-2:]}",
-                expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()),
-            )  # fmt: skip
+            raise InputError("projection matrix is not of a rectified pinhole camera",
+                             where=f"{path}: P_rect_{camera[-2:]}", expected="no skew, last row 0 0 1",
+                             got=str(projection[:, :3].tolist()))  # fmt: skip
         fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2]
         # KITTI counts pixels from the centre of the top-left one
         return fit_images(Camera(name, *size, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5), options)
@@ -132,20 +131,17 @@ def _entry(table: dict[str, NDArray[np.float64]], key: str, count: int, path: Pa
     if key not in table:
         raise InputError(f"calibration lacks {key}", where=str(path), got=", ".join(table) or "no entries")
     if table[key].size != count:
-        raise InputError(
-            "calibration entry has the wrong number of values", where=f"{path}: {key}", expected=f"{count} numbers",
-            got=str(table[key].size), remedy="is the file cut off?",
-        )  # fmt: skip
+        raise InputError("calibration entry has the wrong number of values", where=f"{path}: {key}",
+                         expected=f"{count} numbers", got=str(table[key].size),
+                         remedy="is the file cut off?")  # fmt: skip
     return table[key]
 
 
 def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
     if size != declared:
-        raise InputError(
-            "images do not have the size that the calibration is for", where=where,
-            expected=f"{declared[0]}x{declared[1]}", got=f"{size[0]}x{size[1]}",
-            remedy="use the images as the data set ships them",
-        )  # fmt: skip
+        raise InputError("images do not have the size that the calibration is for", where=where,
+                         expected=f"{declared[0]}x{declared[1]}", got=f"{size[0]}x{size[1]}",
+                         remedy="use the images as the data set ships them")  # fmt: skip
 
 
 def _read_fisheye(path: Path) -> dict[str, float]:
@@ -153,10 +149,8 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     text = store.read_bytes(path).decode("utf-8", "replace")
     model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
     if model is None or model[1] != "MEI":
-        raise InputError(
-            "fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
-            got=model[1] if model else "no model_type",
-        )  # fmt: skip
+        raise InputError("fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
+                         got=model[1] if model else "no model_type")  # fmt: skip
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
         try:

@@ -44,7 +44,7 @@ from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.common import deskew, for_each, pose_near, rigid_pose, seconds
 from mudg.data.importers.images import ImageFit
 from mudg.data.importers.kitti import poses as kitti_poses
-from mudg.data.importers.kitti.importer import read_scan
+from mudg.data.importers.kitti.scans import read_scan
 from mudg.data.importers.kitti360.boxes import WORDS, read_boxes
 from mudg.data.importers.kitti360.calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
 from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames
@@ -184,10 +184,9 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
     wanted = options.sequence or (drives[0] if len(drives) == 1 else "")
     matching = [d for d in drives if wanted and (d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}"))]
     if len(matching) != 1:
-        raise UsageError(
-            "there is no such drive" if wanted else "the folder holds several drives", where=str(raw),
-            expected="--sequence with one of " + ", ".join(drives[:12]), got=wanted or "none chosen",
-        )  # fmt: skip
+        raise UsageError("there is no such drive" if wanted else "the folder holds several drives", where=str(raw),
+                         expected="--sequence with one of " + ", ".join(drives[:12]),
+                         got=wanted or "none chosen")  # fmt: skip
     return _Folders(source, matching[0])
 
 
@@ -275,10 +274,9 @@ class _Motion:
         found = [options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]
         path = next((p for p in found if p is not None and p.is_file()), None)
         if path is None:
-            raise InputError(
-                "no vehicle poses found", where=str(options.poses or here), expected="poses.txt or cam0_to_world.txt",
-                remedy="download the data set's vehicle poses",
-            )  # fmt: skip
+            raise InputError("no vehicle poses found", where=str(options.poses or here),
+                             expected="poses.txt or cam0_to_world.txt",
+                             remedy="download the data set's vehicle poses")  # fmt: skip
         notes.append(f"poses from {path.name}")
         numbers, poses, before = [], [], -1
         for index, line in enumerate(kitti_poses.read_lines(path)):
@@ -286,19 +284,16 @@ class _Motion:
             row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
             number = int(row[0])
             if number != row[0] or number <= before:
-                raise InputError(
-                    "first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
-                    remedy="is the file of another kind?",
-                )  # fmt: skip
+                raise InputError("first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
+                                 remedy="is the file of another kind?")  # fmt: skip
             before = number
             if number < len(clock) and np.isfinite(clock[number]):
                 pose = rigid_pose(row[1:].reshape(-1, 4), where)
                 numbers.append(number)
                 poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
         if not poses:
-            raise InputError(
-                "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
-            )
+            raise InputError("no pose belongs to a frame", where=str(path),
+                             expected=f"frame numbers up to {len(clock) - 1}")  # fmt: skip
         times = clock[numbers]
         if (np.diff(times) <= 0).any():
             at = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
@@ -404,9 +399,8 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
         return {}
     ids = _grey(path)
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
-        raise InputError(
-            "semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits"
-        )
+        raise InputError("semantic image holds ids that do not exist", where=str(path),
+                         expected=f"0..{_LAST_ID}, 8 bits")  # fmt: skip
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
@@ -423,9 +417,8 @@ def _grey(path: Path) -> NDArray[Any]:
     try:
         with Image.open(path, formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
-                raise InputError(
-                    "label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits"
-                )
+                raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}",
+                                 expected="8 or 16 bits")  # fmt: skip
             array = np.array(image)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error

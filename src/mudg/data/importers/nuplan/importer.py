@@ -117,10 +117,9 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
         return databases[log_name], scene
     if len(databases) == 1 and not scene:
         return next(iter(databases.values())), log_name
-    raise UsageError(
-        "the folder holds several logs" if not log_name else "there is no such log", where=str(source),
-        expected="--sequence with one of " + ", ".join(list(databases)[:8]), got=log_name or "none chosen",
-    )  # fmt: skip
+    raise UsageError("the folder holds several logs" if not log_name else "there is no such log", where=str(source),
+                     expected="--sequence with one of " + ", ".join(list(databases)[:8]),
+                     got=log_name or "none chosen")  # fmt: skip
 
 
 def files_of_nuplan(source: Path, options: ImportOptions) -> LogFiles:
@@ -182,10 +181,8 @@ class _Plan:
         name = opened.name()
         blobs = _blobs(opened.path, name)
         if scene and scene not in opened.scenes():
-            raise UsageError(
-                "the log has no such scene", where=str(opened.path), got=scene,
-                expected=", ".join(opened.scenes()[:12]) or "no scenes",
-            )  # fmt: skip
+            raise UsageError("the log has no such scene", where=str(opened.path), got=scene,
+                             expected=", ".join(opened.scenes()[:12]) or "no scenes")  # fmt: skip
         every = list(opened.clouds(scene))
         first, end = options.frames or (0, len(every))
         chosen = every[first:end]
@@ -242,16 +239,13 @@ def _moments(
     inner = [g for g in groups[1:-1] if {s.channel for s in g} != set(names)]
     if inner and not options.skip_missing:
         absent = sorted(set(names) - {shot.channel for shot in inner[0]})
-        raise InputError(
-            "a moment lacks images of some cameras", where=f"{where}: image at {inner[0][0].time_us}",
-            got=f"no {', '.join(absent)}; {len(inner)} such moments", expected="every chosen camera",
-            remedy="choose cameras with --cameras, or add --skip-missing",
-        )  # fmt: skip
+        raise InputError("a moment lacks images of some cameras", where=f"{where}: image at {inner[0][0].time_us}",
+                         got=f"no {', '.join(absent)}; {len(inner)} such moments", expected="every chosen camera",
+                         remedy="choose cameras with --cameras, or add --skip-missing")  # fmt: skip
     if not whole:
-        raise InputError(
-            "no moment has images of all cameras", where=where, got=f"{len(shots)} images", expected=", ".join(names),
-            remedy="choose cameras with --cameras, or other frames with --frames",
-        )  # fmt: skip
+        raise InputError("no moment has images of all cameras", where=where, got=f"{len(shots)} images",
+                         expected=", ".join(names),
+                         remedy="choose cameras with --cameras, or other frames with --frames")  # fmt: skip
     return whole, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
 
@@ -297,10 +291,9 @@ def _write(opened: NuplanLog, plan: _Plan, out: Path, options: ImportOptions) ->
     ego = _ego_path(plan, start_us, str(opened.path))
     first = ego.pose_at(0.0)
     if first is None:
-        raise InputError(
-            "vehicle poses do not cover the log", where=f"{opened.path}: ego_pose", expected=f"a pose at {start_us} us",
-            got=f"{len(plan.ego_us)} poses near it", remedy="are pose and cloud times both in microseconds?",
-        )  # fmt: skip
+        raise InputError("vehicle poses do not cover the log", where=f"{opened.path}: ego_pose",
+                         expected=f"a pose at {start_us} us", got=f"{len(plan.ego_us)} poses near it",
+                         remedy="are pose and cloud times both in microseconds?")  # fmt: skip
     world_from_source = yaw_matrix(-yaw_of(first)) @ from_rotation_translation(np.eye(3), -first[:3, 3])
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {channel: _fit(camera, options) for channel, camera in plan.cameras.items()}
@@ -356,10 +349,9 @@ def _name(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> str:
 def _ego_path(plan: _Plan, start_us: int, where: str) -> EgoPath:
     """The vehicle in the log's world and the scene's clock."""
     if not len(plan.ego_us):
-        raise InputError(
-            "no vehicle poses at the time of the clouds", where=f"{where}: ego_pose.timestamp",
-            expected="microseconds, as lidar_pc.timestamp", remedy="are the two in different units?",
-        )  # fmt: skip
+        raise InputError("no vehicle poses at the time of the clouds", where=f"{where}: ego_pose.timestamp",
+                         expected="microseconds, as lidar_pc.timestamp",
+                         remedy="are the two in different units?")  # fmt: skip
     return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
 
 
