@@ -71,12 +71,13 @@ class _FieldProblem(ValueError):
         self.problem = problem
 
 
-def checked_by(check: Callable[[Any], Value]) -> Callable[[Any], Value]:
+def checked_by(check: Callable[..., Value]) -> Callable[..., Value]:
     """``check`` as the function of a pydantic validator: an ``InputError`` it raises gets the place of the field."""
 
-    def validate(value: Any) -> Value:
+    @functools.wraps(check)  # pydantic reads the signature
+    def validate(*values: Any) -> Value:
         try:
-            return check(value)
+            return check(*values)
         except MudgError as problem:
             raise _FieldProblem(problem) from problem
 

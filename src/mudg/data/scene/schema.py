@@ -117,7 +117,7 @@ def check_box_size(size_m: list[float]) -> list[float]:
     return size_m
 
 
-def _sixteen_numbers(value: Any) -> list[Any]:
+def sixteen_numbers(value: Any) -> list[Any]:
     """A 3x4 or 4x4 matrix, flat or in rows, as 16 values row by row."""
     numbers = value
     if isinstance(value, list) and len(value) in (3, 4) and all(isinstance(row, list) for row in value):
@@ -143,7 +143,7 @@ def _known_labels(value: Any) -> Any:
 
 FileRef = Annotated[str, after(check_ref)]
 Name = Annotated[str, after(check_name)]
-PoseNumbers = Annotated[list[Number], BeforeValidator(checked_by(_sixteen_numbers))]
+PoseNumbers = Annotated[list[Number], BeforeValidator(checked_by(sixteen_numbers))]
 """A matrix as 16 finite numbers. Whether it is rigid is checked by the type that is made of it."""
 BoxSize = Annotated[list[Number], after(check_box_size)]
 LabelRefs = Annotated[dict[str, FileRef], BeforeValidator(checked_by(_known_labels))]
@@ -157,7 +157,7 @@ def matrices_of(poses: list[list[float]]) -> NDArray[np.float64]:
 # --- records --------------------------------------------------------------------------------------------------------
 
 
-class CameraRecord(StrictRecord):
+class CameraEntry(StrictRecord):
     """Intrinsics in pixels; the camera's name is its key."""
 
     width: int
@@ -170,7 +170,7 @@ class CameraRecord(StrictRecord):
     readout_s: Number = 0.0
 
 
-class FrameRecord(StrictRecord):
+class FrameEntry(StrictRecord):
     """One image."""
 
     id: str
@@ -181,7 +181,7 @@ class FrameRecord(StrictRecord):
     labels: LabelRefs = {}
 
 
-class SweepRecord(StrictRecord):
+class SweepEntry(StrictRecord):
     """One LiDAR sweep."""
 
     id: str
@@ -191,7 +191,7 @@ class SweepRecord(StrictRecord):
     points: FileRef
 
 
-class TrackRecord(StrictRecord):
+class TrackEntry(StrictRecord):
     """One tracked box."""
 
     id: str
@@ -201,14 +201,14 @@ class TrackRecord(StrictRecord):
     world_from_object: list[PoseNumbers]
 
 
-class EgoRecord(StrictRecord):
+class EgoEntry(StrictRecord):
     """The path of the vehicle."""
 
     times_s: Annotated[list[Number], Field(min_length=1)]
     world_from_ego: list[PoseNumbers]
 
 
-class SourceRecord(StrictRecord):
+class SourceEntry(StrictRecord):
     """Where the log comes from and under which licence."""
 
     dataset: str
@@ -217,22 +217,22 @@ class SourceRecord(StrictRecord):
     notes: list[str] = []
 
 
-class SceneRecord(StrictRecord):
+class SceneIndex(StrictRecord):
     """The top of ``scene.json``; frames and sweeps are checked one by one."""
 
     format: str
     schema_version: int
     id: str
-    source: SourceRecord
+    source: SourceEntry
     cameras: dict[str, Any]
     frames: list[Any]
-    ego: EgoRecord
+    ego: EgoEntry
     sweeps: list[Any] = []
     split: dict[str, Literal["train", "test"]] = {}
     conventions: Any = None
 
 
-class TracksRecord(StrictRecord):
+class TracksIndex(StrictRecord):
     """The top of ``tracks.json``; tracks are checked one by one."""
 
     format: str
@@ -243,7 +243,7 @@ class TracksRecord(StrictRecord):
 def parse_camera(name: str, value: object, where: str) -> Camera:
     """Parse and check one camera; InputError names ``where`` and the field."""
     check_name(name, where)
-    record = parse_record(CameraRecord, value, where)
+    record = parse_record(CameraEntry, value, where)
     size, longest = (record.width, record.height), max(record.width, record.height)
     for key, side in zip(("width", "height"), size, strict=True):
         if not 1 <= side <= MAX_IMAGE_SIDE_PX:
@@ -272,7 +272,7 @@ def parse_camera(name: str, value: object, where: str) -> Camera:
 
 def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Frame:
     """Parse one frame; its camera must be known."""
-    record = parse_record(FrameRecord, value, where)
+    record = parse_record(FrameEntry, value, where)
     camera = cameras.get(record.camera)
     if camera is None:
         what = f"frame names the camera {record.camera!r}, which the scene does not have"
@@ -287,7 +287,7 @@ def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Fra
 
 def parse_sweep(value: object, where: str) -> Sweep:
     """Parse one LiDAR sweep record."""
-    record = parse_record(SweepRecord, value, where)
+    record = parse_record(SweepEntry, value, where)
     pose = matrices_of([record.world_from_lidar])[0]
     with named_by(where):
         return Sweep(record.id, record.sensor, record.time_s, pose, Ref(record.points))
@@ -295,7 +295,7 @@ def parse_sweep(value: object, where: str) -> Sweep:
 
 def parse_track(value: object, where: str) -> Track:
     """Parse one tracked box."""
-    record = parse_record(TrackRecord, value, where)
+    record = parse_record(TrackEntry, value, where)
     size_m, times_s = np.array(record.size_m), np.array(record.times_s)
     with named_by(where):
         return Track(record.id, record.label, size_m, times_s, matrices_of(record.world_from_object))
@@ -324,7 +324,7 @@ def parse_scene(
         InputError: the frame of the file itself is wrong, or ``complain`` raised.
     """
     _check_format(scene_json, FORMAT, where)
-    top = parse_record(SceneRecord, scene_json, f"{where}: ")
+    top = parse_record(SceneIndex, scene_json, f"{where}: ")
     if not top.cameras:
         raise InputError("scene has no cameras", where=f"{where}: cameras", expected="at least one camera by name")
     cameras = parse_table(top.cameras, f"{where}: cameras", parse_camera, complain)
@@ -334,7 +334,7 @@ def parse_scene(
     if tracks_json is not None:
         where_tracks = where.replace("scene.json", "tracks.json")
         _check_format(tracks_json, TRACKS_FORMAT, where_tracks)
-        listed = parse_record(TracksRecord, tracks_json, f"{where_tracks}: ").tracks
+        listed = parse_record(TracksIndex, tracks_json, f"{where_tracks}: ").tracks
         tracks = parse_each(listed, f"{where_tracks}: tracks", parse_track, complain)
     with named_by(f"{where}: ego"):
         ego = EgoPath(np.array(top.ego.times_s), matrices_of(top.ego.world_from_ego))
@@ -383,12 +383,17 @@ def _check_format(top: dict[str, Any], name: str, where: str) -> None:
         )  # fmt: skip
 
 
+def repeated(names: Iterable[str]) -> list[str]:
+    """The names that occur more than once, sorted."""
+    return sorted(name for name, count in Counter(names).items() if count > 1)
+
+
 def check_relations(scene: Scene, where: str, complain: Complain = raise_first) -> None:
     """Checks that span records: frames exist, ids are unique, times increase per sensor, the split names real frames."""
     if not scene.frames:
         complain(InputError("scene has no frames", where=f"{where}: frames", expected="at least one image"))
     for kind, records in (("frames", scene.frames), ("sweeps", scene.sweeps), ("tracks", scene.tracks)):
-        twice = sorted(name for name, count in Counter(record.id for record in records).items() if count > 1)
+        twice = repeated(record.id for record in records)
         if twice:
             got = ", ".join(twice[:5])
             complain(InputError("an id occurs twice", where=f"{where}: {kind}", got=got, expected="unique ids"))

@@ -195,12 +195,15 @@ class SceneWriter:
         where, content = f"{scene.root}: {frame.image.path}", files.read(frame.image.path)
         check = is_grey if files.is_hashed(frame.image.path) else check_image
         self._add_image_file(frame.id, frame.view, content, check(content, where, camera))
-        for name in {**(labels or {}), **frame.labels}:
+        given = labels or {}
+        for name in dict.fromkeys((*schema.LABEL_NAMES, *given)):  # in one order, whatever that of ``labels``
+            if name not in given and name not in frame.labels:
+                continue
             ref = frame.labels.get(name)
             if ref is not None and ref.path == label_ref(name, frame.id) and files.is_hashed(ref.path):
                 self._add_label_file(frame.id, name, files.read(ref.path))
             else:
-                array = (labels or {})[name] if ref is None else read_label(scene, frame, name)
+                array = given[name] if ref is None else read_label(scene, frame, name)
                 self.add_label(frame.id, name, array)
 
     def copy_all_but_frames(self, scene: Scene) -> None:
