@@ -160,6 +160,52 @@ def test_zip_reads_like_the_folder_also_inside_one_folder(tmp_path: Path) -> Non
     assert not [f for f in check_scene(packed) if f.level == "error"]
 
 
+def copied(scene: Scene, root: Path, labels: dict[str, np.ndarray] | None = None) -> Scene:
+    with SceneWriter(root, scene.id, scene.source) as writer:
+        writer.copy_all_but_frames(scene)
+        for frame in scene.frames:
+            writer.copy_frame(scene, frame, labels)
+        return writer.finish()
+
+
+def test_a_copy_is_the_same_to_the_byte_also_from_a_zip_or_without_hashes(tmp_path: Path) -> None:
+    first = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "first")
+    scene = copied(first, tmp_path / "scene")  # labels of a frame in the order of every copy
+    files = {name: (tmp_path / "scene" / name).read_bytes() for name in store.list_files(tmp_path / "scene")}
+    copied(scene, tmp_path / "folder")
+    copied(read_scene(write_zip(tmp_path / "scene", tmp_path / "scene.zip")), tmp_path / "zip")
+    (tmp_path / "scene" / "manifest.json").unlink()
+    copied(read_scene(tmp_path / "scene"), tmp_path / "checked")
+    for copy in ("folder", "zip", "checked"):
+        assert {name: (tmp_path / copy / name).read_bytes() for name in store.list_files(tmp_path / copy)} == files
+    for name in set(files) - {"scene.json", "manifest.json"}:
+        assert (tmp_path / "first" / name).read_bytes() == files[name]
+
+
+def test_a_copy_refuses_what_is_damaged_with_hashes_and_without(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path / "scene")
+    file = tmp_path / "scene" / scene.sweeps[1].points.path
+    file.write_bytes(file.read_bytes()[:-3])
+    with pytest.raises(IntegrityError, match="differs from what was written"):
+        copied(scene, tmp_path / "a")
+    (tmp_path / "scene" / "manifest.json").unlink()
+    with pytest.raises(InputError, match="safetensors"):
+        copied(scene, tmp_path / "b")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene"]
+
+
+def test_labels_are_stored_in_one_order(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path / "scene")
+    arrays = {"sky": np.zeros((20, 32), bool), "depth": np.ones((20, 32), np.float32), "ego": np.ones((20, 32), bool)}
+    texts = set()
+    for number, names in enumerate((("sky", "depth", "ego"), ("ego", "sky", "depth"))):
+        copied(scene, tmp_path / str(number), {name: arrays[name] for name in names})
+        texts.add((tmp_path / str(number) / "scene.json").read_bytes())
+    assert len(texts) == 1
+    with pytest.raises(InputError, match="no such label"):
+        copied(scene, tmp_path / "x", {"skyy": arrays["sky"]})
+
+
 def test_frames_come_in_time_order_whatever_the_order_of_writing(tmp_path: Path) -> None:
     side = replace(CAMERA, name="side")
     with SceneWriter(tmp_path / "s", "s", Source("t", "n")) as writer:

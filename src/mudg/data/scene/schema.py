@@ -244,30 +244,25 @@ def parse_camera(name: str, value: object, where: str) -> Camera:
     """Parse and check one camera; InputError names ``where`` and the field."""
     check_name(name, where)
     record = parse_record(CameraEntry, value, where)
-    size, longest = (record.width, record.height), max(record.width, record.height)
-    for key, side in zip(("width", "height"), size, strict=True):
-        if not 1 <= side <= MAX_IMAGE_SIDE_PX:
-            expected = f"1..{MAX_IMAGE_SIDE_PX} pixels"
-            raise InputError("image size makes no sense", where=place(where, key), expected=expected, got=str(side))
-    for key, focal in (("fx", record.fx), ("fy", record.fy)):
-        if not 0.01 * longest <= focal <= 1000 * longest:
-            raise InputError(
-                "focal length makes no sense", where=place(where, key), got=f"{focal:g} pixels",
-                expected=f"pixels, between {0.01 * longest:g} and {1000 * longest:g} for this image size",
-                remedy="give the focal length in pixels, not millimetres, and not zero",
-            )  # fmt: skip
-    for key, centre, side in zip(("cx", "cy"), (record.cx, record.cy), size, strict=True):
-        if not -side <= centre <= 2 * side:
-            raise InputError(
-                "principal point lies far outside the image", where=place(where, key), got=f"{centre:g} pixels",
-                expected=f"pixels, usually near {side / 2:g}", remedy="check units and whether the image was cropped",
-            )  # fmt: skip
-    if not 0 <= record.readout_s < 1:
-        where, expected = place(where, "readout_s"), "0 (global shutter) to 1 s"
-        raise InputError(
-            "rolling-shutter readout makes no sense", where=where, expected=expected, got=f"{record.readout_s:g}"
-        )
-    return Camera(name, *size, record.fx, record.fy, record.cx, record.cy, tuple(record.distortion), record.readout_s)
+    width, height, longest = record.width, record.height, max(record.width, record.height)
+    focal = "give the focal length in pixels, not millimetres, and not zero"
+    cropped = "check units and whether the image was cropped"
+    limits = (
+        ("width", "image size makes no sense", 1, MAX_IMAGE_SIDE_PX, ""),
+        ("height", "image size makes no sense", 1, MAX_IMAGE_SIDE_PX, ""),
+        ("fx", "focal length makes no sense", 0.01 * longest, 1000 * longest, focal),
+        ("fy", "focal length makes no sense", 0.01 * longest, 1000 * longest, focal),
+        ("cx", "principal point lies far outside the image", -width, 2 * width, cropped),
+        ("cy", "principal point lies far outside the image", -height, 2 * height, cropped),
+        ("readout_s", "rolling-shutter readout makes no sense", 0, 1, ""),
+    )
+    for key, what, least, most, remedy in limits:
+        value = getattr(record, key)
+        if not least <= value <= most:
+            expected = f"{least:g} to {most:g} {'s' if key == 'readout_s' else 'pixels'}"
+            raise InputError(what, where=place(where, key), expected=expected, got=f"{value:g}", remedy=remedy)
+    intrinsics = (record.fx, record.fy, record.cx, record.cy)
+    return Camera(name, width, height, *intrinsics, tuple(record.distortion), record.readout_s)
 
 
 def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Frame:

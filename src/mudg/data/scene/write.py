@@ -252,18 +252,12 @@ class SceneWriter:
         self.add_notes(note for note in grey if note not in self._source.notes)
         order = {name: index for index, name in enumerate(self._cameras)}
         frames = sorted(self._frames.values(), key=lambda f: (f.view.time_s, order[f.view.camera.name]))
-        split: dict[str, Literal["train", "test"]] = {f.id: self._split.get(f.id, "train") for f in frames}
+        sweeps = sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))
+        split: dict[str, Literal["train", "test"]] = {**dict.fromkeys((f.id for f in frames), "train"), **self._split}
         scene = Scene(
-            id=self._scene_id,
-            root=str(self.root),
-            cameras=dict(self._cameras),
-            frames=tuple(frames),
-            sweeps=tuple(sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))),
-            tracks=tuple(self._tracks.values()),
-            ego=self._ego,
-            split={**split, **self._split},
-            source=self._source,
-        )
+            self._scene_id, str(self.root), self._cameras, tuple(frames), tuple(sweeps), tuple(self._tracks.values()),
+            self._ego, split, self._source,
+        )  # fmt: skip
         schema.check_relations(scene, where)
         self._write("tracks.json", schema.tracks_to_json_text(scene.tracks).encode())
         self._write("scene.json", schema.scene_to_json_text(scene).encode())
@@ -312,7 +306,7 @@ class SceneWriter:
     def _write(self, ref: str, content: bytes) -> None:
         store.write_in_tree(self._partial / ref, content)
         with self._lock:
-            self._hashes[ref] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            self._hashes[ref] = _manifest_entry(content)
 
 
 def _partial_folder(root: Path) -> Path:
@@ -330,6 +324,10 @@ def _partial_folder(root: Path) -> Path:
     return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
 
 
+def _manifest_entry(content: bytes) -> dict[str, Any]:
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
 def _sweep_ref(sweep_id: str) -> Ref:
     return Ref(f"lidar/{sweep_id}.safetensors")
 
@@ -341,7 +339,7 @@ def _jpeg(array: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def write_zip(scene_dir: Path | str, zip_path: Path | str) -> Path:
-    """Pack a scene directory into one stored zip (no compression: members are read by offset); returns ``zip_path``.
+    """Pack a scene directory into one portable file: a stored zip (members are read by offset); returns ``zip_path``.
 
     The scene is read first, so that a broken one is refused. Bookkeeping of the run that made it is left out.
     """
@@ -352,11 +350,11 @@ def write_zip(scene_dir: Path | str, zip_path: Path | str) -> Path:
     names = ["scene.json", *sorted({ref.path for _, ref in all_refs(scene)})]
     names[1:1] = ["tracks.json"] if (scene_dir / "tracks.json").is_file() else []
     files = open_files(scene_dir)
-    listed: dict[str, dict[str, Any]] = {}
+    listed = {}
     with store.atomic_path(zip_path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name in names:
             content = files.read(name)
-            listed[name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            listed[name] = _manifest_entry(content)
             archive.writestr(zipfile.ZipInfo(name), content)
         archive.writestr(zipfile.ZipInfo(store.MANIFEST), store.json_text({"schema": 1, "files": listed}))
     return zip_path
