@@ -27,7 +27,8 @@ from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.types import Frame, Scene
 from mudg.data.scene import SceneWriter, read_image, read_scene
 from mudg.models.labels.ground import driven_path
-from mudg.models.labels.labellers import LabelInput, Labels, labeller
+from mudg.models.labels.inputs import LabelInput, Labels
+from mudg.models.labels.labellers import labeller
 from mudg.report.annotate_page import write_page
 from mudg.stages import batch
 from mudg.stages.config import AnnotateConfig
