@@ -31,14 +31,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError
 from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_npy
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_untwist
+from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, path_inside, refuse_untwist, the_only
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -54,22 +54,12 @@ _UNREADABLE: Final = (
 """What a damaged archive raises."""
 
 LABELS: Final[Mapping[str, str]] = {
-    "Car": "car",
-    "Truck": "truck",
-    "Bus/RV/Caravan": "bus",
-    "Bus": "bus",
-    "Motorcycle": "motorcycle",
-    "Motorcyclist": "rider",
-    "Bicycle": "bicycle",
-    "Bicyclist": "rider",
-    "Person": "pedestrian",
-    "Pedestrian": "pedestrian",
-    "Train": "train",
-    "Trailer": "trailer",
-    "Towed Object": "towed_object",
+    "Car": "car", "Truck": "truck", "Bus/RV/Caravan": "bus", "Bus": "bus", "Motorcycle": "motorcycle",
+    "Motorcyclist": "rider", "Bicycle": "bicycle", "Bicyclist": "rider", "Person": "pedestrian",
+    "Pedestrian": "pedestrian", "Train": "train", "Trailer": "trailer", "Towed Object": "towed_object",
     "Wheeled Slow": "wheeled_slow",
-}
-"""Names of common ontologies in the product's words."""
+}  # fmt: skip
+"""Class names of common ontologies -> the labels of this package."""
 
 
 def looks_like_dgp(source: Path) -> bool:
@@ -106,18 +96,11 @@ def _scenes(source: Path) -> list[Path]:
 def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
-        raise InputError(
-            "no DGP scene found", where=str(source),
-            expected="scene_<hash>.json beside a calibration folder, here or in sub-folders",
-            got=", ".join(sorted(path.name for path in source.iterdir())[:10]) or "an empty folder",
-        )  # fmt: skip
+        raise InputError("no DGP scene found", where=str(source), got=folder_contents(source),
+                         expected="scene_<hash>.json beside a calibration folder, here or in sub-folders")  # fmt: skip
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
-    if len(matching) != 1:
-        names = ", ".join(f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes[:8])
-        raise UsageError("the folder holds several scenes" if matching else "there is no such scene", where=str(source),
-                         expected=f"--sequence with the folder or file name of one of {names} ({len(scenes)} in all)",
-                         got=options.sequence or "none chosen")  # fmt: skip
-    return matching[0]
+    names = [f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes]
+    return the_only(matching, names, options, source, "scene")
 
 
 def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
@@ -238,7 +221,7 @@ def _pose(value: Mapping[str, Any], where: str) -> Matrix:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Calibration:
+class _DgpCalibration:
     """One calibration file: intrinsics records and vehicle-from-sensor f64[4, 4] by sensor."""
 
     intrinsics: Mapping[str, Mapping[str, Any]]
@@ -252,7 +235,7 @@ class _Calibration:
         return self.mounts[sensor]
 
 
-def _read_calibration(folder: Path, key: str) -> _Calibration:
+def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
     path = path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
     record = store.read_json(path)
     names = [str(name) for name in record["names"]]
@@ -260,10 +243,10 @@ def _read_calibration(folder: Path, key: str) -> _Calibration:
         raise InputError("calibration lists differ in length", where=str(path),
                          expected="names, extrinsics, intrinsics")  # fmt: skip
     mounts = {n: _pose(value, f"{path}: {n}") for n, value in zip(names, record["extrinsics"], strict=True)}
-    return _Calibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
+    return _DgpCalibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
 
 
-def _add_camera(cameras: dict[str, Camera], calibration: _Calibration, name: str, datum: _Datum) -> None:
+def _add_camera(cameras: dict[str, Camera], calibration: _DgpCalibration, name: str, datum: _Datum) -> None:
     """The datum's camera; all images of a scene must share it. Half a pixel is added: pixel centres are whole numbers here."""
     calibration.mount(datum.sensor, datum.where)
     k = {key: float(calibration.intrinsics[datum.sensor].get(key, 0.0)) for key in ("fx", "fy", "cx", "cy", "skew")}

@@ -31,7 +31,7 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_cloud
-from mudg.data.importers.common import seconds, world_from_first
+from mudg.data.importers.common import nearest_index, seconds, world_from_first
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, brown_conrady, fit_images, image_notes
 from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
@@ -259,22 +259,15 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]
     alone = []
     for found in by_camera.values():
         times = np.array([shot.time_us for shot in found], np.int64)
-        late = times - beats[_nearest(beats, times)]
+        late = times - beats[nearest_index(beats, times)]
         usual = float(np.median(late[np.abs(late) <= half_us])) if (np.abs(late) <= half_us).any() else 0.0
-        for shot, index in zip(found, _nearest(beats, times - usual), strict=True):
+        for shot, index in zip(found, nearest_index(beats, times - usual), strict=True):
             taken = any(other.channel == shot.channel for other in groups[int(index)])
             if taken or abs(shot.time_us - usual - beats[index]) >= half_us:
                 alone.append([shot])
             else:
                 groups[int(index)].append(shot)
     return sorted([*groups.values(), *alone], key=lambda group: min(shot.time_us for shot in group))
-
-
-def _nearest(beats: NDArray[np.int64], times: NDArray[Any]) -> NDArray[np.intp]:
-    """Index of the nearest of growing ``beats`` for each time."""
-    after = np.searchsorted(beats, times).clip(1, len(beats) - 1) if len(beats) > 1 else np.zeros(len(times), int)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(times - beats[before]) <= np.abs(times - beats[after]), before, after)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
