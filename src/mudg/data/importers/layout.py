@@ -158,6 +158,22 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     return [name for name in available if name in wanted]
 
 
+def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: ImportOptions, where: object) -> None:
+    """Refuse a log that lacks cameras of its data set, unless cameras were chosen or ``skip_missing`` says otherwise.
+
+    Args:
+        there, usual: the cameras' names in the scene.
+        options: ``cameras`` and ``skip_missing`` are used.
+        where: the log, for messages.
+    """
+    there, usual = list(there), list(usual)
+    absent = [name for name in usual if name not in there]
+    if absent and not options.cameras and not options.skip_missing:
+        raise InputError("cameras are missing in the log", where=str(where), got=f"no images of {', '.join(absent)}",
+            expected=f"{len(usual)} cameras",
+            remedy=f"choose those that are there with --cameras {' '.join(there)}, or add --skip-missing")  # fmt: skip
+
+
 def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
     """Refuse options of other formats that were set here: better than to do something else than asked.
 

@@ -82,9 +82,8 @@ def gunzip(content: bytes, where: str) -> bytes:
     if len(unpacked) > MAX_BYTES:
         raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
     if not unpacker.eof:
-        raise InputError(
-            "gzip file is cut off", where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again"
-        )
+        raise InputError("gzip file is cut off", where=where, got=f"{len(content)} bytes, no end",
+            remedy="copy the file again")  # fmt: skip
     return unpacked
 
 
@@ -94,13 +93,10 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     try:
         return _columns(value)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            "pickle is not a plain data frame",
-            where=where,
+        raise InputError("pickle is not a plain data frame", where=where,
             expected="a table of numbers and texts as pandas 0.2x to 2.x writes it",
             got=f"{type(error).__name__}: {error}"[:200],
-            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2",
-        ) from error
+            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2") from error  # fmt: skip
 
 
 def _columns(frame: Any) -> dict[str, NDArray[Any]]:
