@@ -73,8 +73,8 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
         columns, where = line.split(), f"{path}: line {index + 1}"
         if len(columns) - skip not in (15, 16):
             raise InputError("label line has the wrong number of columns", where=where, got=str(len(columns)),
-                             expected=f"{15 + skip} (or {16 + skip} with a score)",
-                             remedy="is this a tracking or an object label file?")  # fmt: skip
+                expected=f"{15 + skip} (or {16 + skip} with a score)",
+                remedy="is this a tracking or an object label file?")  # fmt: skip
         if columns[skip] == "DontCare":
             continue
         try:
@@ -87,7 +87,7 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
         height, width, length = values[7:10]
         if min(height, width, length) <= 0:
             raise InputError("box size is not positive", where=where, expected="height, width, length in metres",
-                             got=str(values[7:10]))  # fmt: skip
+                got=str(values[7:10]))  # fmt: skip
         pose = velo_from_rect0 @ rect0_from_box(values[10:13], height, values[13])
         left, top, right, bottom = values[3:7]
         size_m, box2d_px = (length, width, height), (left, top, right, bottom)
@@ -102,7 +102,7 @@ def read_tracklets(path: Path) -> list[KittiBox]:
         raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
     if b"<!ENTITY" in content:
         raise InputError("tracklet file declares XML entities, which no KITTI file does", where=str(path),
-                         remedy="use the file from the data set")  # fmt: skip
+            remedy="use the file from the data set")  # fmt: skip
     try:
         root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
     except ElementTree.ParseError as error:

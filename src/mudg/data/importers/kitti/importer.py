@@ -219,11 +219,10 @@ def _refuse_without_images(source: Path, options: ImportOptions) -> None:
     sequences = sorted(path.name for path in folders if path.name != "data")
     if sequences:
         raise UsageError("the folder holds several sequences", where=str(source),
-                         expected="--sequence with one of " + ", ".join(sequences[:12]),
-                         got=options.sequence or "none chosen")  # fmt: skip
+            expected="--sequence with one of " + ", ".join(sequences[:12]), got=options.sequence or "none chosen")  # fmt: skip
     raise InputError("no KITTI images found", where=str(source), got=folder_contents(source),
-                     expected="image_02/data, image_02 or image_2 with numbered PNG files",
-                     remedy="give the folder of one drive, sequence or training set")  # fmt: skip
+        expected="image_02/data, image_02 or image_2 with numbered PNG files",
+        remedy="give the folder of one drive, sequence or training set")  # fmt: skip
 
 
 def _choose_frames(files: KittiFiles, options: ImportOptions) -> list[int]:
@@ -245,8 +244,8 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
         numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
     if len(numbers) != 1:
         raise UsageError("an object-benchmark folder holds unrelated frames; a scene is one of them",
-                         where=str(files.folder), expected="--sequence with one frame number, e.g. 000008",
-                         got=f"{len(numbers)} frames: {some_numbers(numbers)}")  # fmt: skip
+            where=str(files.folder), expected="--sequence with one frame number, e.g. 000008",
+            got=f"{len(numbers)} frames: {some_numbers(numbers)}")  # fmt: skip
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(files.folder / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
@@ -267,8 +266,8 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
             log.info(f"kitti: calibration from {day}/calib_*.txt")
             return read_calibration_day(day)
     raise InputError("no calibration found", where=str(folder),
-                     expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
-                     remedy="download the day's calibration archive and unpack it beside the drive")  # fmt: skip
+        expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
+        remedy="download the day's calibration archive and unpack it beside the drive")  # fmt: skip
 
 
 # --- time and motion ------------------------------------------------------------------------------------------------
@@ -301,8 +300,8 @@ def _times_of(path: Path, frames: Sequence[int]) -> dict[int, float]:
     times = kitti_poses.read_timestamps(path)
     if len(times) <= max(frames):
         raise InputError("timestamps do not cover the frames", where=str(path),
-                         expected=f"at least {max(frames) + 1} lines (line k = frame k)", got=f"{len(times)} lines",
-                         remedy="is the file cut off?")  # fmt: skip
+            expected=f"at least {max(frames) + 1} lines (line k = frame k)", got=f"{len(times)} lines",
+            remedy="is the file cut off?")  # fmt: skip
     return {n: times[n] for n in frames}
 
 
@@ -319,8 +318,7 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
     else:
         if calibration.velo_from_imu is None:
             raise InputError("calibration does not tell where the IMU is", where=calibration.source,
-                             expected="calib_imu_to_velo.txt or Tr_imu_to_velo",
-                             remedy="add it, or give a pose file with --poses")  # fmt: skip
+                expected="calib_imu_to_velo.txt or Tr_imu_to_velo", remedy="add it, or give a pose file with --poses")  # fmt: skip
         log.info(f"kitti: poses from GPS/IMU packets in {packets}")
         notes.append("poses from GPS/IMU packets")
         ego = _ego_from_packets(packets, frames, recording.clock)
@@ -343,15 +341,15 @@ def _poses_from_file(recording: _Recording, options: ImportOptions, notes: list[
         return np.eye(4)[None]
     if path is None:
         raise InputError("no vehicle poses found", where=str(folder),
-                         expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
-                         remedy="without poses the frames of a moving vehicle cannot be put into one world")  # fmt: skip
+            expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
+            remedy="without poses the frames of a moving vehicle cannot be put into one world")  # fmt: skip
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
     poses, sensor = kitti_poses.read_pose_file(path, frames)
     missing = [n for n in frames if n not in poses]
     if missing:
         raise InputError("pose file lacks frames", where=str(path), got=f"no pose for frames {some_numbers(missing)}",
-                         remedy="choose frames with --frames FIRST:END, or give another file with --poses")  # fmt: skip
+            remedy="choose frames with --frames FIRST:END, or give another file with --poses")  # fmt: skip
     stacked = np.stack([poses[n] for n in frames])
     if sensor == "cam0":
         rect0_from_velo = recording.calibration.rect0_from_velo

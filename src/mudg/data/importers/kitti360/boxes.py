@@ -134,8 +134,7 @@ def _refuse_entities(content: bytes, where: str, first: bool) -> None:
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content or b"\0" in content or other:
         raise InputError(
             "box file declares a document type, entities or another encoding, which the data set's files do not",
-            where=where, remedy="use the file from the data set",
-        )  # fmt: skip
+            where=where, remedy="use the file from the data set")  # fmt: skip
 
 
 def _label(item: ElementTree.Element, where: str) -> str:
@@ -169,7 +168,7 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     words = (node.findtext("data") or "").split()
     if rows * columns != len(words) or not 0 < rows * columns <= _MAX_VALUES:
         raise InputError("matrix does not have the size it declares", where=f"{where}.{key}",
-                         expected=f"{rows} x {columns} numbers", got=f"{len(words)} values")  # fmt: skip
+            expected=f"{rows} x {columns} numbers", got=f"{len(words)} values")  # fmt: skip
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
@@ -188,10 +187,8 @@ def _shape(
     the annotation tool called x does not matter for the box.
     """
     if transform.shape != (4, 4) or vertices.shape[1] != 3 or np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(
-            "box is not a 4x4 transform of 3-D vertices", where=where,
-            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}",
-        )  # fmt: skip
+        raise InputError("box is not a 4x4 transform of 3-D vertices", where=where,
+            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}")  # fmt: skip
     low, high = vertices.min(0), vertices.max(0)
     scale = np.linalg.norm(transform[:3, :3], axis=0)
     sizes = scale * (high - low)

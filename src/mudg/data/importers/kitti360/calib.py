@@ -124,8 +124,8 @@ def _rigid_file(path: Path) -> Matrix:
 def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
     if size != declared:
         raise InputError("images do not have the size that the calibration is for", where=where,
-                         expected=f"{declared[0]}x{declared[1]}", got=f"{size[0]}x{size[1]}",
-                         remedy="use the images as the data set ships them")  # fmt: skip
+            expected=f"{declared[0]}x{declared[1]}", got=f"{size[0]}x{size[1]}",
+            remedy="use the images as the data set ships them")  # fmt: skip
 
 
 def _read_fisheye(path: Path) -> dict[str, float]:
@@ -134,7 +134,7 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
     if model is None or model[1] != "MEI":
         raise InputError("fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
-                         got=model[1] if model else "no model_type")  # fmt: skip
+            got=model[1] if model else "no model_type")  # fmt: skip
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
         try:
@@ -144,7 +144,7 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     missing = [key for key in _FISHEYE_VALUES if key not in found]
     if missing:
         raise InputError("fisheye calibration is incomplete", where=str(path), expected=", ".join(_FISHEYE_VALUES),
-                         got=f"no {', '.join(missing)}", remedy="is the file cut off?")  # fmt: skip
+            got=f"no {', '.join(missing)}", remedy="is the file cut off?")  # fmt: skip
     if found["xi"] < 0 or found["gamma1"] <= 0 or found["gamma2"] <= 0:
         raise InputError("fisheye calibration makes no sense", where=str(path), expected="xi >= 0, gamma1 and gamma2 > 0",
                          got=f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}")  # fmt: skip

@@ -182,7 +182,7 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
     raw = source / "data_2d_raw"
     if not raw.is_dir():
         raise InputError("no KITTI-360 recording found", where=str(source), got=folder_contents(source),
-                         expected="data_2d_raw, data_poses and calibration in it")  # fmt: skip
+            expected="data_2d_raw, data_poses and calibration in it")  # fmt: skip
     drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
     wanted = options.sequence
     matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
@@ -241,10 +241,9 @@ def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.floa
     elif len(stamps) == len(files) > 0:
         times[list(files)] = stamps
     else:
-        raise InputError(
-            "timestamps do not cover the frames", where=str(path), got=f"{len(given)} lines, {len(files)} files",
-            expected=f"at least {last + 1} lines (line k = frame k), or one per file", remedy="is the file cut off?",
-        )  # fmt: skip
+        raise InputError("timestamps do not cover the frames", where=str(path),
+            got=f"{len(given)} lines, {len(files)} files",
+            expected=f"at least {last + 1} lines (line k = frame k), or one per file", remedy="is the file cut off?")  # fmt: skip
     return times
 
 
@@ -259,8 +258,8 @@ def _read_motion(
     here = folders.root / "data_poses" / folders.drive
     path = first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
     if path is None:
-        raise InputError("no vehicle poses found", where=str(options.poses or here), expected="poses.txt or cam0_to_world.txt",
-                         remedy="download the data set's vehicle poses")  # fmt: skip
+        raise InputError("no vehicle poses found", where=str(options.poses or here),
+            expected="poses.txt or cam0_to_world.txt", remedy="download the data set's vehicle poses")  # fmt: skip
     notes.append(f"poses from {path.name}")
     numbers, poses, before = [], [], -1
     for index, line in enumerate(kitti_poses.read_lines(path)):
@@ -269,16 +268,15 @@ def _read_motion(
         number = int(row[0])
         if number != row[0] or number <= before:
             raise InputError("first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
-                             remedy="is the file of another kind?")  # fmt: skip
+                remedy="is the file of another kind?")  # fmt: skip
         before = number
         if number < len(clock) and np.isfinite(clock[number]):
             pose = rigid_pose(row[1:].reshape(-1, 4), where)
             numbers.append(number)
             poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
     if not poses:
-        raise InputError(
-            "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
-        )
+        raise InputError("no pose belongs to a frame", where=str(path),
+            expected=f"frame numbers up to {len(clock) - 1}")  # fmt: skip
     times = clock[numbers]
     if (np.diff(times) <= 0).any():
         frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
@@ -369,7 +367,7 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
     ids = _grey(path)
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
         raise InputError("semantic image holds ids that do not exist", where=str(path),
-                         expected=f"0..{_LAST_ID}, 8 bits")  # fmt: skip
+            expected=f"0..{_LAST_ID}, 8 bits")  # fmt: skip
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
@@ -387,7 +385,7 @@ def _grey(path: Path) -> NDArray[Any]:
         with Image.open(path, formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
                 raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}",
-                                 expected="8 or 16 bits")  # fmt: skip
+                    expected="8 or 16 bits")  # fmt: skip
             array = np.array(image)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error

@@ -80,7 +80,7 @@ class NuplanLog:
                 yield row
         except (sqlite3.Error, OverflowError) as error:
             raise InputError("log database is damaged", where=str(self.path), got=str(error),
-                             remedy="copy the file again") from error  # fmt: skip
+                remedy="copy the file again") from error  # fmt: skip
 
     def check(self) -> None:
         """Refuse a database that is not a nuPlan log."""
@@ -90,14 +90,12 @@ class NuplanLog:
         for table, columns in SCHEMA.items():
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
                 raise InputError(f"database has no table {table!r}", where=str(self.path), expected=", ".join(SCHEMA),
-                                 got=", ".join(sorted(tables)) or "no tables",
-                                 remedy="is it a nuPlan log (v1.1)?")  # fmt: skip
+                    got=", ".join(sorted(tables)) or "no tables", remedy="is it a nuPlan log (v1.1)?")  # fmt: skip
             there = {str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")}
             missing = [column for column in columns if column not in there]
             if missing:
                 raise InputError(f"table {table!r} lacks columns", where=str(self.path), expected=", ".join(columns),
-                                 got=f"no {', '.join(missing)}",
-                                 remedy="is it a nuPlan log of version 1.1?")  # fmt: skip
+                    got=f"no {', '.join(missing)}", remedy="is it a nuPlan log of version 1.1?")  # fmt: skip
 
     def name(self) -> str:
         """The log's name, e.g. ``2021.05.12.22.00.38_veh-35_01008_01518``."""
@@ -120,8 +118,7 @@ class NuplanLog:
                 or min(matrix[0, 0], matrix[1, 1]) <= 0
             ):
                 raise InputError("intrinsics are not of a pinhole camera", where=f"{where}.intrinsic",
-                                 got=str(matrix.tolist()),
-                                 expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")  # fmt: skip
+                    got=str(matrix.tolist()), expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")  # fmt: skip
             found[bytes(token)] = NuplanCamera(
                 str(channel),
                 self._pose(values[0], values[1], where),
@@ -169,7 +166,7 @@ class NuplanLog:
                 world_from_ego @ ego_from_lidar[bytes(lidar)],
             )
         raise InputError("point cloud has no vehicle pose", where=f"{self.path}: lidar_pc {token.hex()}.ego_pose_token",
-                         expected="a token of ego_pose")  # fmt: skip
+            expected="a token of ego_pose")  # fmt: skip
 
     def ego_poses(self, first_us: int, last_us: int) -> tuple[NDArray[np.int64], Matrix]:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
@@ -205,7 +202,7 @@ class NuplanLog:
             where = f"{self.path}: lidar_box of track {bytes(track or b'').hex()}"
             if label is None:
                 raise InputError("box names a track or class that is not there", where=where,
-                                 expected="tokens of track and category", remedy="copy the file again")  # fmt: skip
+                    expected="tokens of track and category", remedy="copy the file again")  # fmt: skip
             yield bytes(cloud), bytes(track).hex(), str(label), tuple(_finite(number, where) for number in numbers)
 
     def scenes(self) -> list[str]:
@@ -217,7 +214,7 @@ class NuplanLog:
             value = int(value)
         if not isinstance(value, int):
             raise InputError("timestamp is no whole number", where=f"{self.path}: {table}.timestamp",
-                             got=repr(value)[:40])  # fmt: skip
+                got=repr(value)[:40])  # fmt: skip
         return value
 
     def _ego(self, row: list[Any], where: str) -> Matrix:
@@ -239,7 +236,7 @@ class NuplanLog:
             flat += [_finite(value, where) for value in (item if isinstance(item, list | tuple) else [item])]
         if count is not None and len(flat) != count:
             raise InputError("calibration has the wrong number of values", where=where, expected=str(count),
-                             got=str(len(flat)))  # fmt: skip
+                got=str(len(flat)))  # fmt: skip
         return flat
 
 
@@ -254,7 +251,7 @@ def _blob_name(value: Any, where: str) -> str:
     parts = value.split("/") if isinstance(value, str) else []
     if not parts or any(part in ("", ".", "..") or "\\" in part or ":" in part or "\0" in part for part in parts):
         raise InputError("file name leads out of the sensor blobs", where=where, got=repr(value)[:80],
-                         expected="a relative path, e.g. LOG/CAM_F0/0123456789abcdef.jpg")  # fmt: skip
+            expected="a relative path, e.g. LOG/CAM_F0/0123456789abcdef.jpg")  # fmt: skip
     return str(value)
 
 
@@ -279,8 +276,7 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
         yield opened
     except sqlite3.Error as error:
         raise InputError("file is not a readable SQLite database", where=str(path), got=str(error),
-                         expected="a nuPlan log (.db)",
-                         remedy="is it cut off, or still packed?") from error  # fmt: skip
+            expected="a nuPlan log (.db)", remedy="is it cut off, or still packed?") from error  # fmt: skip
     finally:
         if connection is not None:
             connection.close()

@@ -107,7 +107,7 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
     databases = {path.stem: path for path in _databases(source)}
     if not databases:
         raise InputError("no nuPlan log found", where=str(source), expected="*.db here or in splits/*",
-                         got=folder_contents(source))  # fmt: skip
+            got=folder_contents(source))  # fmt: skip
     log_name, _, scene = options.sequence.partition("/")
     if log_name in databases:
         return databases[log_name], scene
@@ -129,11 +129,9 @@ def _blobs(path: Path, name: str) -> Path:
     for folder in path.resolve().parents[:5]:
         if (folder / "sensor_blobs" / name).is_dir():
             return folder / "sensor_blobs"
-    raise InputError(
-        "sensor blobs of the log were not found", where=str(path),
+    raise InputError("sensor blobs of the log were not found", where=str(path),
         expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
-        remedy="download the camera and LiDAR blobs of this log; the database alone holds no images",
-    )  # fmt: skip
+        remedy="download the camera and LiDAR blobs of this log; the database alone holds no images")  # fmt: skip
 
 
 # --- what is imported -------------------------------------------------------------------------------------------------
@@ -177,7 +175,7 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     blobs = _blobs(opened.path, name)
     if scene and scene not in opened.scenes():
         raise UsageError("the log has no such scene", where=where, got=scene,
-                         expected=", ".join(opened.scenes()[:12]) or "no scenes")  # fmt: skip
+            expected=", ".join(opened.scenes()[:12]) or "no scenes")  # fmt: skip
     every = list(opened.clouds(scene))
     first, end = options.frames or (0, len(every))
     chosen = every[first:end]
@@ -216,8 +214,8 @@ def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: Imp
     """Refuse a log of which files are missing, unless that is allowed."""
     if missing and not options.skip_missing:
         raise InputError(f"file of a {what} is missing", where=str(missing[0]),
-                         got=f"{len(missing)} of {total} are missing", remedy="download the log's sensor blobs, "
-                         "choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+            got=f"{len(missing)} of {total} are missing", remedy="download the log's sensor blobs, "
+            "choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
 
 
 def _moments(
@@ -233,12 +231,11 @@ def _moments(
     if inner and not options.skip_missing:
         absent = sorted(set(names) - {shot.channel for shot in inner[0]})
         raise InputError("a moment lacks images of some cameras", where=f"{where}: image at {inner[0][0].time_us}",
-                         got=f"no {', '.join(absent)}; {len(inner)} such moments", expected="every chosen camera",
-                         remedy="choose cameras with --cameras, or add --skip-missing")  # fmt: skip
+            got=f"no {', '.join(absent)}; {len(inner)} such moments", expected="every chosen camera",
+            remedy="choose cameras with --cameras, or add --skip-missing")  # fmt: skip
     if not kept:
         raise InputError("no moment has images of all cameras", where=where, got=f"{len(shots)} images",
-                         expected=", ".join(names),
-                         remedy="choose cameras with --cameras, or other frames with --frames")  # fmt: skip
+            expected=", ".join(names), remedy="choose cameras with --cameras, or other frames with --frames")  # fmt: skip
     cut = len(groups) - len(kept)
     return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
@@ -279,8 +276,8 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     first = ego.pose_at(0.0)
     if first is None:
         raise InputError("vehicle poses do not cover the log", where=f"{opened.path}: ego_pose",
-                         expected=f"a pose at {start_us} us", got=f"{len(plan.ego_us)} poses near it",
-                         remedy="are pose and cloud times both in microseconds?")  # fmt: skip
+            expected=f"a pose at {start_us} us", got=f"{len(plan.ego_us)} poses near it",
+            remedy="are pose and cloud times both in microseconds?")  # fmt: skip
     world_from_source = world_from_first(first)
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
@@ -331,8 +328,7 @@ def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
     """The vehicle in the log's world and the scene's clock."""
     if not len(plan.ego_us):
         raise InputError("no vehicle poses at the time of the clouds", where=f"{where}: ego_pose.timestamp",
-                         expected="microseconds, as lidar_pc.timestamp",
-                         remedy="are the two in different units?")  # fmt: skip
+            expected="microseconds, as lidar_pc.timestamp", remedy="are the two in different units?")  # fmt: skip
     return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
 
 
