@@ -31,12 +31,9 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
     except (TypeError, ValueError) as error:
         raise InputError("box size is not made of numbers", where=where, got=str(error)) from error
     if not all(np.isfinite(side) and 0 < side <= MAX_SIDE_M for side in size):
-        raise InputError(
-            "box size makes no sense",
-            where=where,
+        raise InputError("box size makes no sense", where=where,
             expected=f"length, width and height in metres, above 0 and at most {MAX_SIDE_M:g}",
-            got=f"length {length}, width {width}, height {height}",
-        )
+            got=f"length {length}, width {width}, height {height}")  # fmt: skip
     return size
 
 
@@ -122,12 +119,8 @@ class BoxTracks:
             times = rows[:, 0]
             if (np.diff(times) <= 0).any():
                 at = float(times[int(np.flatnonzero(np.diff(times) <= 0)[0])])
-                raise InputError(
-                    "an object has two boxes at one moment",
-                    where=f"{self._where}: object {name}",
-                    got=f"time {at:.3f} s of the log",
-                    remedy="are two logs mixed?",
-                )
+                raise InputError("an object has two boxes at one moment", where=f"{self._where}: object {name}",
+                    got=f"time {at:.3f} s of the log", remedy="are two logs mixed?")  # fmt: skip
             size = np.median(rows[:, 2:5], axis=0)
             label = max(member.labels, key=lambda word: member.labels[word])
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -169,14 +162,9 @@ def check_sides(tracks: Sequence[Track], where: str) -> None:
     wide = [track for track in vehicles if track.size_m[1] > track.size_m[0]]
     if vehicles and 2 * len(wide) > len(vehicles):
         length, width, _ = wide[0].size_m
-        raise InputError(
-            "length and width of boxes are swapped",
-            where=where,
-            expected="vehicles longer than wide",
+        raise InputError("length and width of boxes are swapped", where=where, expected="vehicles longer than wide",
             got=f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
-            f"{length:.2f} m long, {width:.2f} m wide",
-            remedy="check the order in which the sizes were written",
-        )
+            f"{length:.2f} m long, {width:.2f} m wide", remedy="check the order in which the sizes were written")  # fmt: skip
 
 
 def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:

@@ -144,10 +144,8 @@ class ImageFit:
         """Labels [H, W] of the recorded size -> [h, w] of the scene's: each pixel takes the nearest recorded one, none are mixed."""
         height, width = self.recorded.height, self.recorded.width
         if ids.shape != (height, width):
-            raise InputError(
-                "label does not have its camera's size", where=f"camera {self.camera.name}",
-                expected=f"[{height}, {width}]", got=str(list(ids.shape)),
-            )  # fmt: skip
+            raise InputError("label does not have its camera's size", where=f"camera {self.camera.name}",
+                expected=f"[{height}, {width}]", got=str(list(ids.shape)))  # fmt: skip
         if self.table is not None:
             ids = self.table.nearest(ids)
         if (self.camera.height, self.camera.width) == (height, width):
@@ -205,10 +203,8 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
         scale = min(1.0, resolution / max(width, height))
         return max(1, round(width * scale)), max(1, round(height * scale))
     if resolution[0] > width or resolution[1] > height:
-        raise UsageError(
-            "images are never enlarged", where=where or "--resolution", expected=f"at most {width}x{height}",
-            got=f"{resolution[0]}x{resolution[1]}",
-        )  # fmt: skip
+        raise UsageError("images are never enlarged", where=where or "--resolution",
+            expected=f"at most {width}x{height}", got=f"{resolution[0]}x{resolution[1]}")  # fmt: skip
     return resolution
 
 
@@ -230,11 +226,9 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
         return camera
     problem = _border_problem(at(high), camera, lens)
     if problem is not None:
-        raise InputError(
-            "lens cannot be rectified to a pinhole camera of its own size", where=f"camera {camera.name}", got=problem,
-            expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
-            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera",
-        )  # fmt: skip
+        raise InputError("lens cannot be rectified to a pinhole camera of its own size", where=f"camera {camera.name}",
+            got=problem, expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
+            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera")  # fmt: skip
     while high - low > 1e-4:
         middle = (low + high) / 2
         low, high = (middle, high) if _border_problem(at(middle), camera, lens) else (low, middle)
@@ -284,10 +278,8 @@ class _Table:
             place = lens(xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5
             outside = (place < -0.51) | (place > np.array([camera.width, camera.height]) - 0.49)
             if not np.isfinite(place).all() or outside.any():
-                raise InputError(
-                    "rectified camera looks beyond the recorded image", where=f"camera {camera.name}",
-                    got=f"row {rows.start} on", remedy="choose a narrower pinhole camera",
-                )  # fmt: skip
+                raise InputError("rectified camera looks beyond the recorded image", where=f"camera {camera.name}",
+                    got=f"row {rows.start} on", remedy="choose a narrower pinhole camera")  # fmt: skip
             place = place.clip(0, np.array([camera.width, camera.height]) - 1.0)
             whole = np.minimum(place.astype(np.int64), [max(camera.width - 2, 0), max(camera.height - 2, 0)])
             part = np.minimum(np.round((place - whole) * 256), 255).astype(np.uint8)

@@ -65,24 +65,17 @@ def whole_frames(
     missing = {name: sorted(everything - found) for name, found in numbers.items() if everything - found}
     words = "; ".join(f"{name} lacks {some_numbers(lacks)}" for name, lacks in missing.items())
     if missing and not options.skip_missing:
-        raise InputError(
-            "images and sweeps do not pair up",
-            where=where,
-            expected="every camera and LiDAR for every frame",
-            got=words,
-            remedy="copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        raise InputError("images and sweeps do not pair up", where=where,
+            expected="every camera and LiDAR for every frame", got=words,
+            remedy="copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
     if missing:
         log.warn(f"{title}: left out incomplete frames: {words}")
     for lacks in missing.values():
         everything -= set(lacks)
     if not everything:
-        raise InputError(
-            "no frames to import",
-            where=where,
+        raise InputError("no frames to import", where=where,
             expected="numbered images" + (f" in {options.frames[0]}:{options.frames[1]}" if options.frames else ""),
-            got=", ".join(f"{name}: {some_numbers(sorted(found))}" for name, found in numbers.items()) or "nothing",
-        )
+            got=", ".join(f"{name}: {some_numbers(sorted(found))}" for name, found in numbers.items()) or "nothing")  # fmt: skip
     return sorted(everything)
 
 
@@ -147,9 +140,8 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     if not options.cameras:
         chosen = [name for name in available if name in usual]
         if not chosen:
-            raise InputError(
-                "the log has no camera that can be imported", where=where, expected=", ".join(usual), got=words
-            )
+            raise InputError("the log has no camera that can be imported", where=where, expected=", ".join(usual),
+                got=words)  # fmt: skip
         return chosen
     unknown = [name for name in options.cameras if name not in available and name not in by_scene_name]
     if unknown:
@@ -190,12 +182,8 @@ def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
 def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
     """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its sweeps."""
     if options.untwist == "yes":
-        raise UsageError(
-            f"sweeps of {dataset} are already compensated for the vehicle's motion",
-            where=where,
-            got="--untwist yes",
-            remedy="leave --untwist out",
-        )
+        raise UsageError(f"sweeps of {dataset} are already compensated for the vehicle's motion", where=where,
+            got="--untwist yes", remedy="leave --untwist out")  # fmt: skip
     refuse_options(options, dataset, "poses", "boxes")
 
 
@@ -203,7 +191,6 @@ def path_inside(root: Path, name: Any, where: str) -> Path:
     """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
     problem = ref_problem(name)
     if problem is not None:
-        raise InputError(
-            f"file name {problem}", where=where, got=repr(name)[:120], expected="a relative path inside the log"
-        )
+        raise InputError(f"file name {problem}", where=where, got=repr(name)[:120],
+            expected="a relative path inside the log")  # fmt: skip
     return root / name
