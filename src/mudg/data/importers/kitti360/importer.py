@@ -26,7 +26,7 @@ looks along the lens' axis and is 90 degrees wide and high, with the lens' own r
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -40,6 +40,7 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track
+from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.common import deskew, pose_near, rigid_pose, seconds, world_from_first
@@ -49,16 +50,7 @@ from mudg.data.importers.kitti import poses as kitti_poses
 from mudg.data.importers.kitti.scans import SENSOR, read_scan
 from mudg.data.importers.kitti360.boxes import LABEL_OF, Kitti360Box, read_boxes
 from mudg.data.importers.kitti360.calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
-from mudg.data.importers.layout import (
-    LogFiles,
-    chosen_cameras,
-    first_file,
-    folder_contents,
-    numbered_files,
-    some_numbers,
-    the_only,
-    whole_frames,
-)
+from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -123,17 +115,19 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     folders = _find(source, options)
     calibration = read_calibration(folders.root / "calibration")
-    images = {name: numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
+    images = {name: layout.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
     available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
-    chosen = chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
-    scans = numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
+    chosen = layout.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
+    scans = layout.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
     streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
     notes: list[str] = []
     clock = _clock(folders, streams, notes)
-    ego = _read_motion(folders, calibration, clock, options, notes)
+    poses = _find_poses(folders, options)
+    notes.append(f"poses from {poses.name}")
+    ego = _read_motion(poses, calibration, clock)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
-    frames = whole_frames(placed, options, str(folders.root), "kitti360")
-    _say_left_out(streams, placed, options, notes)
+    frames = layout.whole_frames(placed, options, str(folders.root), "kitti360")
+    notes += _without_pose(streams.values(), placed.values(), options)
     start_s = float(clock[frames[0]])
     world_from_source = world_from_first(pose_near(ego, clock[frames[0]]))
     scene_s = seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
@@ -181,12 +175,12 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
         return _Folders(source.absolute().parent.parent, source.absolute().name)
     raw = source / "data_2d_raw"
     if not raw.is_dir():
-        raise InputError("no KITTI-360 recording found", where=str(source), got=folder_contents(source),
+        raise InputError("no KITTI-360 recording found", where=str(source), got=layout.folder_contents(source),
             expected="data_2d_raw, data_poses and calibration in it")  # fmt: skip
     drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
     wanted = options.sequence
     matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
-    return _Folders(source, the_only(matching, drives, options, raw, "drive"))
+    return _Folders(source, layout.the_only(matching, drives, options, raw, "drive"))
 
 
 def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
@@ -198,18 +192,13 @@ def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
     return LogFiles(tuple(part for part in parts if part.exists()))
 
 
-def _say_left_out(
-    streams: Mapping[str, Mapping[int, Path]],
-    placed: Mapping[str, Sequence[int]],
-    options: ImportOptions,
-    notes: list[str],
-) -> None:
-    everything = {n for found in streams.values() for n in found}
-    if options.frames is not None:
-        everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
-    lost = sorted(everything - {n for found in placed.values() for n in found})
-    if lost:
-        notes.append(f"frames without a pose or time stamp were left out: {some_numbers(lost)}")
+def _without_pose(
+    streams: Iterable[Iterable[int]], placed: Iterable[Iterable[int]], options: ImportOptions
+) -> list[str]:
+    """A note about the frames within ``options.frames`` that some stream has and none could place."""
+    first, end = options.frames or (0, 2**63)
+    lost = {n for found in streams for n in found if first <= n < end}.difference(*placed)
+    return [f"frames without a pose or time stamp were left out: {layout.some_numbers(sorted(lost))}"] if lost else []
 
 
 # --- time and motion ------------------------------------------------------------------------------------------------
@@ -247,20 +236,17 @@ def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.floa
     return times
 
 
-def _read_motion(
-    folders: _Folders,
-    calibration: Kitti360Calibration,
-    clock: NDArray[np.float64],
-    options: ImportOptions,
-    notes: list[str],
-) -> EgoPath:
-    """The vehicle at the frames that have a pose, in the data set's world and clock."""
+def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
     here = folders.root / "data_poses" / folders.drive
-    path = first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
+    path = layout.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
     if path is None:
         raise InputError("no vehicle poses found", where=str(options.poses or here),
             expected="poses.txt or cam0_to_world.txt", remedy="download the data set's vehicle poses")  # fmt: skip
-    notes.append(f"poses from {path.name}")
+    return path
+
+
+def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np.float64]) -> EgoPath:
+    """The vehicle at the frames that have a pose, in the data set's world and clock."""
     numbers, poses, before = [], [], -1
     for index, line in enumerate(kitti_poses.read_lines(path)):
         where = f"{path}: line {index + 1}"
@@ -280,7 +266,7 @@ def _read_motion(
     times = clock[numbers]
     if (np.diff(times) <= 0).any():
         frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
-        raise InputError("timestamps do not increase", where=f"{folders.root}: {folders.drive}, frame {frame}")
+        raise InputError("timestamps do not increase", where=f"{path}: frame {frame}")
     return EgoPath(times, np.stack(poses) @ IMU_FROM_EGO)
 
 
@@ -321,7 +307,7 @@ class _SickLines:
     def find(
         cls, folders: _Folders, calibration: Kitti360Calibration, ego: EgoPath, start_s: float, notes: list[str]
     ) -> _SickLines | None:
-        files = numbered_files(folders.raw("sick_points") / "data", (".bin",))
+        files = layout.numbered_files(folders.raw("sick_points") / "data", (".bin",))
         stamps = folders.raw("sick_points") / "timestamps.txt"
         if not files:
             return None
@@ -400,7 +386,7 @@ def _read_tracks(
     notes: list[str],
 ) -> list[Track]:
     """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn in."""
-    path = options.boxes or first_file(*folders.boxes())
+    path = options.boxes or layout.first_file(*folders.boxes())
     if path is None:
         notes.append("no boxes found: everything counts as static")
         return []

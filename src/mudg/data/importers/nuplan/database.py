@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base.errors import InputError
+from mudg.data.importers.columns import require_columns
 from mudg.data.importers.common import pose_from_quaternion
+from mudg.data.importers.layout import path_inside
 from mudg.data.importers.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
 
 Matrix = NDArray[np.float64]
@@ -57,10 +59,10 @@ class NuplanCamera:
 
 @dataclass(frozen=True, slots=True)
 class NuplanCloud:
-    """One point cloud: its token, file below the sensor blobs, time (us), and world-from-lidar f64[4, 4] in the log's world."""
+    """One point cloud: its token, file, time (us), and world-from-lidar f64[4, 4] in the log's world."""
 
     token: bytes
-    file: str
+    file: Path
     time_us: int
     world_from_lidar: Matrix
 
@@ -91,11 +93,8 @@ class NuplanLog:
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
                 raise InputError(f"database has no table {table!r}", where=str(self.path), expected=", ".join(SCHEMA),
                     got=", ".join(sorted(tables)) or "no tables", remedy="is it a nuPlan log (v1.1)?")  # fmt: skip
-            there = {str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")}
-            missing = [column for column in columns if column not in there]
-            if missing:
-                raise InputError(f"table {table!r} lacks columns", where=str(self.path), expected=", ".join(columns),
-                    got=f"no {', '.join(missing)}", remedy="is it a nuPlan log of version 1.1?")  # fmt: skip
+            there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
+            require_columns(columns, there, f"{self.path}: {table}")
 
     def name(self) -> str:
         """The log's name, e.g. ``2021.05.12.22.00.38_veh-35_01008_01518``."""
@@ -112,11 +111,8 @@ class NuplanLog:
         ):
             where = f"{self.path}: camera {channel}"
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
-            if (
-                abs(matrix[0, 1]) > 1e-6
-                or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
-                or min(matrix[0, 0], matrix[1, 1]) <= 0
-            ):
+            skewed = abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
+            if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
                 raise InputError("intrinsics are not of a pinhole camera", where=f"{where}.intrinsic",
                     got=str(matrix.tolist()), expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")  # fmt: skip
             found[bytes(token)] = NuplanCamera(
@@ -148,8 +144,8 @@ class NuplanLog:
             )
         )
 
-    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix]) -> NuplanCloud:
-        """One point cloud with its pose."""
+    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix], blobs: Path) -> NuplanCloud:
+        """One point cloud with its pose; its file lies below ``blobs``."""
         for lidar, file, time_us, *pose in self.rows(
             "SELECT p.lidar_token, p.filename, p.timestamp, e.x, e.y, e.z, e.qw, e.qx, e.qy, e.qz "
             "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token = ?",
@@ -158,12 +154,9 @@ class NuplanLog:
             where = f"{self.path}: lidar_pc {token.hex()}"
             if bytes(lidar) not in ego_from_lidar:
                 raise InputError("point cloud is of a LiDAR that is not there", where=where, got=bytes(lidar).hex())
-            world_from_ego = self._ego(pose, where)
+            world_from_lidar = self._ego(pose, where) @ ego_from_lidar[bytes(lidar)]
             return NuplanCloud(
-                token,
-                _blob_name(file, where),
-                self._time(time_us, "lidar_pc"),
-                world_from_ego @ ego_from_lidar[bytes(lidar)],
+                token, path_inside(blobs, file, where), self._time(time_us, "lidar_pc"), world_from_lidar
             )
         raise InputError("point cloud has no vehicle pose", where=f"{self.path}: lidar_pc {token.hex()}.ego_pose_token",
             expected="a token of ego_pose")  # fmt: skip
@@ -180,13 +173,14 @@ class NuplanLog:
                 poses.append(self._ego(pose, f"{self.path}: ego_pose at {time_us}"))
         return np.array(times, np.int64), np.array(poses).reshape(-1, 4, 4)
 
-    def images(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, int]]:
-        """Camera token, file below the sensor blobs, and time (us), in order of time."""
+    def images(self, first_us: int, last_us: int, blobs: Path) -> Iterator[tuple[bytes, Path, int]]:
+        """Camera token, file below ``blobs``, and time (us), in order of time."""
         for camera, file, time_us in self.rows(
             "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
             (first_us, last_us),
         ):
-            yield bytes(camera), _blob_name(file, f"{self.path}: image at {time_us}"), self._time(time_us, "image")
+            path = path_inside(blobs, file, f"{self.path}: image at {time_us}")
+            yield bytes(camera), path, self._time(time_us, "image")
 
     def boxes(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, str, tuple[float, ...]]]:
         """Cloud, track, class, and x y z yaw length width height (metres, radians, the log's world) of all boxes of a span.
@@ -244,15 +238,6 @@ def _finite(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise InputError("value is not a finite number", where=where, got=repr(value)[:40])
     return float(value)
-
-
-def _blob_name(value: Any, where: str) -> str:
-    """A relative path of plain components; anything that leads elsewhere is refused."""
-    parts = value.split("/") if isinstance(value, str) else []
-    if not parts or any(part in ("", ".", "..") or "\\" in part or ":" in part or "\0" in part for part in parts):
-        raise InputError("file name leads out of the sensor blobs", where=where, got=repr(value)[:80],
-            expected="a relative path, e.g. LOG/CAM_F0/0123456789abcdef.jpg")  # fmt: skip
-    return str(value)
 
 
 @contextmanager

@@ -154,7 +154,6 @@ class _NuplanPlan:
         name: the scene's id.
         cameras: channel -> camera, the chosen ones.
         clouds: in order of time.
-        files: cloud token -> file.
         moments: images of one moment, in order of time.
         ego_us, world_from_ego: the vehicle over the whole span, in the log's world.
         notes: for the scene's source.
@@ -163,7 +162,6 @@ class _NuplanPlan:
     name: str
     cameras: Mapping[str, NuplanCamera]
     clouds: Sequence[NuplanCloud]
-    files: Mapping[bytes, Path]
     moments: Sequence[Sequence[_Shot]]
     ego_us: NDArray[np.int64]
     world_from_ego: Matrix
@@ -184,12 +182,11 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
     notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
     lidars = opened.lidars()
-    clouds = [opened.cloud(token, lidars) for token, _ in chosen]
-    files = {cloud.token: blobs / cloud.file for cloud in clouds}
-    lacking = [path for path in files.values() if not path.is_file()]
+    clouds = [opened.cloud(token, lidars, blobs) for token, _ in chosen]
+    lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
     if lacking:
         _refuse_missing("point cloud", lacking, len(clouds), options)
-        clouds = [cloud for cloud in clouds if files[cloud.token].is_file()]
+        clouds = [cloud for cloud in clouds if cloud.file.is_file()]
         notes.append(f"{len(lacking)} clouds whose files are missing were left out")
     by_token = opened.cameras()
     folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
@@ -198,14 +195,14 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     cameras = {camera.channel: camera for camera in by_token.values()}
     span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
     shots = [
-        _Shot(by_token[token].channel, blobs / file, time_us)
-        for token, file, time_us in opened.images(*span)
+        _Shot(by_token[token].channel, file, time_us)
+        for token, file, time_us in opened.images(*span, blobs)
         if token in by_token and by_token[token].channel in names
     ]
     moments, moment_notes = _moments(shots, names, options, where)
     ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
     return _NuplanPlan(
-        f"{name}_{scene}" if scene else name, {channel: cameras[channel] for channel in names}, clouds, files, moments,
+        f"{name}_{scene}" if scene else name, {channel: cameras[channel] for channel in names}, clouds, moments,
         ego_us, poses, (*notes, *moment_notes),
     )  # fmt: skip
 
@@ -288,7 +285,7 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> Iterable[SceneImage | SceneSweep]:
         index, what = item
         if isinstance(what, NuplanCloud):
-            time_s, path = (what.time_us - start_us) / 1e6, plan.files[what.token]
+            time_s, path = (what.time_us - start_us) / 1e6, what.file
             yield SceneSweep(
                 SENSOR, index, time_s, world_from_source @ what.world_from_lidar, _read_points(path), str(path)
             )
