@@ -342,18 +342,28 @@ def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
     return {name: rows[:, index].copy() for index, name in enumerate(("x", "y", "z", "intensity"))}
 
 
-def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
-    """numpy archive: ``xyz`` [N, 3] and any number of arrays [N]."""
-    columns: dict[str, NDArray] = {}
+def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
+    """All arrays of a numpy archive by name.
+
+    Raises:
+        InputError: damaged, cut off, or not plain numbers of the declared size.
+    """
+    arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for entry in archive.infolist():
                 with archive.open(entry) as handle:
-                    columns[entry.filename.removesuffix(".npy")] = read_npy(
-                        handle, entry.file_size, f"{where}: {entry.filename}"
-                    )
+                    member = f"{where}: {entry.filename}"
+                    arrays[entry.filename.removesuffix(".npy")] = read_npy(handle, entry.file_size, member)
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as error:
-        raise InputError("not a readable NPZ file", where=where, got=str(error)[:120]) from error
+        raise InputError("not a readable NPZ file, or cut off", where=where, got=str(error)[:120],
+            remedy="copy the file again") from error  # fmt: skip
+    return arrays
+
+
+def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
+    """numpy archive: ``xyz`` [N, 3] and any number of arrays [N]."""
+    columns = npz_arrays(content, where)
     xyz = columns.pop("xyz", None)
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
         raise InputError("NPZ cloud has no coordinates", where=where, expected="an array xyz [N, 3] of numbers",

@@ -15,7 +15,7 @@ from mudg.base.errors import InputError, ResourceError
 Columns = Mapping[str, NDArray[Any]]
 
 
-def require_columns(names: Iterable[str], there: Iterable[str], where: Path) -> None:
+def require_columns(names: Iterable[str], there: Iterable[str], where: object) -> None:
     """Refuse a table that lacks one of ``names``."""
     there, names = list(there), list(names)
     if not set(names) <= set(there):
