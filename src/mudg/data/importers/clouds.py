@@ -316,7 +316,7 @@ def read_float_rows(path: Path, columns: int, what: str = "scan") -> NDArray[np.
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns].
 
     Args:
-        what: word for one file's content, for messages.
+        what: what one file holds, for messages.
 
     Raises:
         InputError: missing, cut off, or values that are not finite.
