@@ -143,7 +143,7 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     "label columns": ("number of columns", "label_02.txt: line 3", lambda r: label(r, lambda w: w[:-3])),
     "label text": ("not a number", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "left"])),
     "label NaN": ("not finite", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "nan"])),
-    "flat box": ("not positive", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:10], "0", *w[11:]])),
+    "flat box": ("makes no sense", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:10], "0", *w[11:]])),
     "two boxes of one track": (
         "two boxes",
         "label_02.txt",

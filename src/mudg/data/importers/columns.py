@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from mudg.base.errors import InputError, ResourceError
 Columns = Mapping[str, NDArray[Any]]
 
 
-def require_columns(names: Iterable[str], there: Iterable[str], where: Path) -> None:
+def require_columns(names: Iterable[str], there: Iterable[str], where: object) -> None:
     """Refuse a table that lacks one of ``names``."""
     there, names = list(there), list(names)
     if not set(names) <= set(there):
@@ -52,12 +51,12 @@ def record_fields(what: str, where: object, expected: str) -> Iterator[None]:
 
 
 @contextmanager
-def arrow_files(path: Path) -> Iterator[ModuleType]:
-    """Code that reads an Arrow file (Feather, Parquet), with the pyarrow package.
+def arrow_files(path: Path) -> Iterator[None]:
+    """Code that reads a Feather or Parquet file with pyarrow.
 
     Raises:
         ResourceError: pyarrow is not installed.
-        InputError: what it raises about a file that is damaged or cut off.
+        InputError: the file is damaged or cut off.
     """
     try:
         import pyarrow
@@ -65,7 +64,7 @@ def arrow_files(path: Path) -> Iterator[ModuleType]:
         raise ResourceError("Feather and Parquet files need pyarrow, which is not installed", where=str(path),
             remedy="pip install 'mudg[data]'") from error  # fmt: skip
     try:
-        yield pyarrow
+        yield
     except (pyarrow.ArrowException, OSError, MemoryError, StopIteration) as error:
         raise InputError("table cannot be read, or is cut off", where=str(path), remedy="copy the file again",
             got=str(error)[:200] or "it ends early") from error  # fmt: skip

@@ -17,8 +17,9 @@ any number of workers.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
@@ -84,7 +85,7 @@ def for_each(
         title: of the progress bar.
         total: number of items; None = ``len(items)``, or unknown for a generator.
         workers: threads; 1 = no threads, 0 = as many as there are processors to use.
-        name: words for an item, put before the place of an error.
+        name: what an item is called, put before the place of an error.
 
     Returns:
         Number of items.
@@ -105,39 +106,25 @@ def for_each(
                 bar.advance()
             return done
         with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
-            pending: dict[Future[None], int] = {}
-            failed: dict[int, BaseException] = {}
-            source = iter(items)
-            index = 0
+            pending: deque[Future[None]] = deque()
+
+            def finish_first() -> None:
+                pending.popleft().result()
+                bar.advance()
+
             try:
-                while not failed:
-                    while len(pending) < 2 * workers:
-                        try:
-                            item = next(source)
-                        except StopIteration:
-                            break
-                        pending[pool.submit(_named, work, item, name)] = index
-                        index += 1
-                    if not pending:
+                for item in items:
+                    pending.append(pool.submit(_named, work, item, name))
+                    done += 1
+                    if any(future.done() and future.exception() for future in pending):
                         break
-                    finished, _ = wait(pending, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        at = pending.pop(future)
-                        error = future.exception()
-                        if error is not None:
-                            failed[at] = error
-                        else:
-                            done += 1
-                            bar.advance()
+                    if len(pending) == 2 * workers:
+                        finish_first()
+                while pending:
+                    finish_first()
             finally:
                 for future in pending:
                     future.cancel()
-            wait(pending)
-            for future, at in pending.items():
-                if not future.cancelled() and future.exception() is not None:
-                    failed[at] = future.exception()  # type: ignore[assignment]
-            if failed:
-                raise failed[min(failed)]
     return done
 
 
@@ -145,11 +132,11 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
     try:
         work(item)
     except MudgError as error:
-        words = name(item)
-        if words in error.where:
+        called = name(item)
+        if called in error.where:
             raise
         raise type(error)(
-            error.what, where=f"{words}: {error.where}" if error.where else words,
+            error.what, where=f"{called}: {error.where}" if error.where else called,
             expected=error.expected, got=error.got, remedy=error.remedy,
         ) from error  # fmt: skip
 
@@ -175,20 +162,16 @@ def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, wh
     steps = np.diff(since_start)
     if (steps <= 0).any():
         at = int(np.flatnonzero(steps <= 0)[0])
-        raise InputError(
-            "timestamps do not increase", where=f"{where}: record {at + 1}",
+        raise InputError("timestamps do not increase", where=f"{where}: record {at + 1}",
             expected=f"later than {numbers[at]} {unit}", got=str(numbers[at + 1]),
-            remedy="sort the records by time, and remove doubled ones",
-        )  # fmt: skip
+            remedy="sort the records by time, and remove doubled ones")  # fmt: skip
     low, high = PLAUSIBLE_PERIOD_S
     if len(steps) and not low <= (period := float(np.median(steps))) <= high:
         raw = period * UNITS_PER_SECOND[unit]
         fitting = [u for u, scale in UNITS_PER_SECOND.items() if low <= raw / scale <= high]
-        raise InputError(
-            "timestamps are in another unit than expected", where=where,
+        raise InputError("timestamps are in another unit than expected", where=where,
             expected=f"{unit}; records {low:g} to {high:g} s apart", got=f"records {period:.3g} s apart",
-            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording",
-        )  # fmt: skip
+            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording")  # fmt: skip
     return since_start
 
 
@@ -197,21 +180,12 @@ def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> Non
     unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
     outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
     if outside.any():
-        raise InputError(
-            "time stamp is in another unit",
-            where=where,
-            expected=f"{unit} since 1970",
-            got=f"{int(stamps[outside][0])}",
-            remedy=f"convert the stamps to {unit}",
-        )
+        raise InputError("time stamp is in another unit", where=where, expected=f"{unit} since 1970",
+            got=f"{int(stamps[outside][0])}", remedy=f"convert the stamps to {unit}")  # fmt: skip
     if len(stamps) and int(stamps.max()) - int(stamps.min()) > _MAX_LOG_S * per_second:
-        raise InputError(
-            "time stamps of one log span more than hours",
-            where=where,
-            got=f"{int(stamps.min())} to {int(stamps.max())}",
-            expected=f"{unit}, all of one recording",
-            remedy="are records of another log, or of another unit, mixed in?",
-        )
+        raise InputError("time stamps of one log span more than hours", where=where,
+            got=f"{int(stamps.min())} to {int(stamps.max())}", expected=f"{unit}, all of one recording",
+            remedy="are records of another log, or of another unit, mixed in?")  # fmt: skip
 
 
 def nearest_index(sorted_times_s: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -236,10 +210,8 @@ def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
     if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
         got = numbers[3].tolist()
         transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
-        raise InputError(
-            "pose does not end in the row 0 0 0 1", where=where, got=str(got),
-            remedy="it looks transposed: write it row by row" if transposed else "write it row by row",
-        )  # fmt: skip
+        raise InputError("pose does not end in the row 0 0 0 1", where=where, got=str(got),
+            remedy="it looks transposed: write it row by row" if transposed else "write it row by row")  # fmt: skip
     return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
 
 
@@ -248,20 +220,16 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
     u, stretch, vt = np.linalg.svd(matrix)
     handed = float(np.linalg.det(u @ vt))
     if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
-        raise InputError(
-            "pose is scaled", where=where, expected="a rotation (scale 1)", got=f"scale {stretch[1]:.6g}",
-            remedy="divide the rotation part by its scale; are the translations in metres?",
-        )  # fmt: skip
+        raise InputError("pose is scaled", where=where, expected="a rotation (scale 1)", got=f"scale {stretch[1]:.6g}",
+            remedy="divide the rotation part by its scale; are the translations in metres?")  # fmt: skip
     if np.abs(stretch - 1).max() > POSE_TOLERANCE:
-        raise InputError(
-            "pose is not a rigid motion", where=where, expected="an orthonormal rotation part",
-            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}", remedy="is it row-major, without shear or scale?",
-        )  # fmt: skip
+        raise InputError("pose is not a rigid motion", where=where, expected="an orthonormal rotation part",
+            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}",
+            remedy="is it row-major, without shear or scale?")  # fmt: skip
     if handed < 0:
-        raise InputError(
-            "pose is left-handed", where=where, expected="determinant +1", got="a reflection (determinant -1)",
-            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras",
-        )  # fmt: skip
+        raise InputError("pose is left-handed", where=where, expected="determinant +1",
+            got="a reflection (determinant -1)",
+            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras")  # fmt: skip
     return u @ vt
 
 
@@ -273,22 +241,18 @@ def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matri
     """
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
-        raise InputError(
-            "pose is not a quaternion and a translation", where=where, expected="4 and 3 finite numbers",
-            got=f"{q.tolist()} and {t.tolist()}",
-        )  # fmt: skip
+        raise InputError("pose is not a quaternion and a translation", where=where, expected="4 and 3 finite numbers",
+            got=f"{q.tolist()} and {t.tolist()}")  # fmt: skip
     length = float(np.linalg.norm(q))
     if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise InputError(
-            "quaternion does not have length 1",
-            where=where,
-            expected="w, x, y, z of a rotation",
-            got=f"length {length:.6g}",
-        )
+        raise InputError("quaternion does not have length 1", where=where, expected="w, x, y, z of a rotation",
+            got=f"length {length:.6g}")  # fmt: skip
     return from_rotation_translation(matrix_from_quaternion(q), t)
 
 
-def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path") -> Matrix:
+def pose_near(
+    ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path"
+) -> Matrix:
     """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
 
     Raises:
@@ -300,13 +264,8 @@ def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATI
     first = time_s < ego.times_s[0]
     beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
     if beyond > max_beyond_s:
-        raise InputError(
-            "vehicle poses do not cover the images and scans",
-            where=where,
-            got=f"{beyond:.2f} s outside",
-            expected="poses from the first to the last frame",
-            remedy="is the pose file cut off, or of another log?",
-        )
+        raise InputError("vehicle poses do not cover the images and scans", where=where, got=f"{beyond:.2f} s outside",
+            expected="poses from the first to the last frame", remedy="is the pose file cut off, or of another log?")  # fmt: skip
     if len(ego.times_s) == 1:
         return ego.world_from_ego[0]
     near, far = (0, 1) if first else (-1, -2)
@@ -336,13 +295,9 @@ def check_motion(ego: EgoPath, where: str) -> None:
     """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are wrong then."""
     upright = float(np.median(ego.world_from_ego[:, 2, 2]))
     if upright < _LEAST_UPRIGHT:
-        raise InputError(
-            "the vehicle does not stand upright",
-            where=where,
-            expected="vehicle and map with z up",
+        raise InputError("the vehicle does not stand upright", where=where, expected="vehicle and map with z up",
             got=f"its z axis rises by {upright:.2f} per metre",
-            remedy="check the order of quaternions (w, x, y, z) and the axes",
-        )
+            remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
     if len(ego.times_s) < 2:
         return
     # over a twentieth of a second at least: pose noise over less is no speed
@@ -353,25 +308,19 @@ def check_motion(ego: EgoPath, where: str) -> None:
     speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
     at = int(speed.argmax())
     if speed[at] > MAX_SPEED_M_S:
-        raise InputError(
-            "the vehicle moves impossibly fast",
-            where=where,
+        raise InputError("the vehicle moves impossibly fast", where=where,
             got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
             expected=f"under {MAX_SPEED_M_S:.0f} m/s",
-            remedy="check the units of times and translations, and that all poses are of one log",
-        )
+            remedy="check the units of times and translations, and that all poses are of one log")  # fmt: skip
     drives = speed > _DRIVES_M_S
     if drives.any():
         forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
         along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
         if along < _LEAST_ALONG:
-            raise InputError(
-                "the vehicle does not drive where it looks",
-                where=where,
+            raise InputError("the vehicle does not drive where it looks", where=where,
                 expected="vehicle axes x forward, y left, z up",
                 got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
-                remedy="check the order of quaternions (w, x, y, z) and the axes",
-            )
+                remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
 
 
 def deskew(

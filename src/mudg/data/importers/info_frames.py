@@ -19,6 +19,7 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Track
 from mudg.data.importers.box_tracks import box_size, check_sides
+from mudg.data.importers.columns import record_fields
 
 Size = tuple[float, float, float]
 
@@ -33,11 +34,8 @@ def info_record(path: Path, expected: str) -> Iterator[dict[str, Any]]:
         path: the file.
         expected: what the record must hold, for the message.
     """
-    try:
+    with record_fields("frame record is malformed or incomplete", path, expected):
         yield json.loads(store.read_bytes(path))
-    except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
-        raise InputError("frame record is malformed or incomplete", where=str(path), got=repr(error),
-                         expected=expected) from error  # fmt: skip
 
 
 def info_tracks(
@@ -64,7 +62,7 @@ def info_tracks(
             continue
         if number not in names:
             raise InputError("box has a class that does not exist", where=here, got=str(number),
-                             expected=", ".join(f"{n} ({name})" for n, name in names.items())[:200])  # fmt: skip
+                expected=", ".join(f"{n} ({name})" for n, name in names.items())[:200])  # fmt: skip
         values = [float(value) for value in item["bbox_3d"]]
         if not np.isfinite(values).all():
             raise InputError("box is not finite", where=here, got=str(item["bbox_3d"]))

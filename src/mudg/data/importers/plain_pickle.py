@@ -141,9 +141,8 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
         InputError: cut off, malformed, too large, or it names something that is not in ``makers``.
     """
     if len(content) > MAX_BYTES:
-        raise InputError(
-            "pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes", got=f"{len(content)} bytes"
-        )
+        raise InputError("pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes",
+            got=f"{len(content)} bytes")  # fmt: skip
     machine = _Machine(where, makers)
     try:
         for count, (opcode, argument, _place) in enumerate(pickletools.genops(content)):
@@ -162,12 +161,8 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
         RecursionError,
         struct.error,
     ) as error:
-        raise InputError(
-            "pickle is malformed or cut off",
-            where=where,
-            got=f"{type(error).__name__}: {error}"[:200],
-            remedy="copy the file again",
-        ) from error
+        raise InputError("pickle is malformed or cut off", where=where, got=f"{type(error).__name__}: {error}"[:200],
+            remedy="copy the file again") from error  # fmt: skip
     raise InputError("pickle is cut off", where=where, expected="an end mark", remedy="copy the file again")
 
 
@@ -226,12 +221,8 @@ class _Machine:
         elif opcode == "DUP":
             stack.append(stack[-1])
         else:
-            raise InputError(
-                "pickle uses an operation that plain data does not need",
-                where=self._where,
-                got=opcode,
-                remedy="the file is not what the data set ships; do not open it with Python's pickle",
-            )
+            raise InputError("pickle uses an operation that plain data does not need", where=self._where, got=opcode,
+                remedy="the file is not what the data set ships; do not open it with Python's pickle")  # fmt: skip
 
     def _since_mark(self) -> list[Any]:
         for index in range(len(self._stack) - 1, -1, -1):
@@ -248,13 +239,9 @@ class _Machine:
             name, module = self._stack.pop(), self._stack.pop()
         text = f"{module}.{name}"
         if text not in self._makers:
-            raise InputError(
-                f"pickle asks for {text!r}, which is not plain data",
-                where=self._where,
-                expected="numbers, texts, lists and arrays",
-                got=text[:120],
-                remedy="nothing was run. If the file comes from the data set itself, convert it to a plain format",
-            )
+            raise InputError(f"pickle asks for {text!r}, which is not plain data", where=self._where,
+                expected="numbers, texts, lists and arrays", got=text[:120],
+                remedy="nothing was run. If the file comes from the data set itself, convert it to a plain format")  # fmt: skip
         self._stack.append(Name(text))
 
     def _remember(self, opcode: str, argument: Any) -> None:

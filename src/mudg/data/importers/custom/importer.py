@@ -83,6 +83,8 @@ def _id_of(item: Numbered) -> str:
 
 def _moments(images: Sequence[LogItem]) -> dict[LogItem, int]:
     """Image -> number of the image of the first camera that is nearest in time."""
+    if not images:
+        return {}
     clock = np.array([image.time_s for image in images if image.sensor == images[0].sensor])
     numbers = nearest_index(clock, np.array([image.time_s for image in images]))
     return dict(zip(images, numbers.tolist(), strict=True))
@@ -301,7 +303,7 @@ def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple
             where = f"{record.kind} {record.file.path}"
             complain(InputError(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=remedy))
     groups: dict[int, list[str]] = {}
-    for record, moment in _moments(list(frames)).items() if frames else ():
+    for record, moment in _moments(list(frames)).items():
         groups.setdefault(moment, []).append(frames[record].id)
     split = holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
     cameras = {name: camera.camera for name, camera in content.cameras.items()}

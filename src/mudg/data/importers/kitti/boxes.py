@@ -14,7 +14,7 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix
 from mudg.base.types import Track
-from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.box_tracks import BoxTracks, box_size
 from mudg.data.importers.kitti.poses import read_lines
 from mudg.data.importers.kitti.scans import azimuth_delay_s
 
@@ -64,7 +64,7 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
         frame: frame number for an object label file (15 columns and optionally a score); None for a tracking file.
 
     Raises:
-        InputError: another number of columns, values that are no finite numbers, or a size that is not positive.
+        InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
     """
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
@@ -73,8 +73,8 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
         columns, where = line.split(), f"{path}: line {index + 1}"
         if len(columns) - skip not in (15, 16):
             raise InputError("label line has the wrong number of columns", where=where, got=str(len(columns)),
-                             expected=f"{15 + skip} (or {16 + skip} with a score)",
-                             remedy="is this a tracking or an object label file?")  # fmt: skip
+                expected=f"{15 + skip} (or {16 + skip} with a score)",
+                remedy="is this a tracking or an object label file?")  # fmt: skip
         if columns[skip] == "DontCare":
             continue
         try:
@@ -84,14 +84,10 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
             raise InputError("label value is not a number", where=where, got=str(error)) from error
         if not np.isfinite(values).all():
             raise InputError("label value is not finite", where=where, got=line.strip()[:100])
-        height, width, length = values[7:10]
-        if min(height, width, length) <= 0:
-            raise InputError("box size is not positive", where=where, expected="height, width, length in metres",
-                             got=str(values[7:10]))  # fmt: skip
-        pose = velo_from_rect0 @ rect0_from_box(values[10:13], height, values[13])
-        left, top, right, bottom = values[3:7]
-        size_m, box2d_px = (length, width, height), (left, top, right, bottom)
-        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose, box2d_px))
+        left, top, right, bottom, height, width, length, x, y, z, turn = values[3:14]
+        size_m = box_size(length, width, height, where)
+        pose = velo_from_rect0 @ rect0_from_box((x, y, z), height, turn)
+        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose, (left, top, right, bottom)))
     return boxes
 
 
@@ -102,7 +98,7 @@ def read_tracklets(path: Path) -> list[KittiBox]:
         raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
     if b"<!ENTITY" in content:
         raise InputError("tracklet file declares XML entities, which no KITTI file does", where=str(path),
-                         remedy="use the file from the data set")  # fmt: skip
+            remedy="use the file from the data set")  # fmt: skip
     try:
         root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
     except ElementTree.ParseError as error:
@@ -110,17 +106,13 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     boxes = []
     for track, item in enumerate(root.findall("./tracklets/item")):
         where = f"{path}: tracklet {track}"
-        height, width, length = (_xml_number(item, key, where) for key in ("h", "w", "l"))
-        if min(height, width, length) <= 0:
-            raise InputError("box size is not positive", where=where, got=f"h={height} w={width} l={length}")
+        size_m = box_size(*(_xml_number(item, key, where) for key in ("l", "w", "h")), where)
         first = int(_xml_number(item, "first_frame", where))
         label = (item.findtext("objectType") or "").strip().lower()
         for step, pose in enumerate(item.findall("./poses/item")):
             here = f"{where} pose {step}"
             tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
-            boxes.append(
-                KittiBox(first + step, track, label, (length, width, height), yaw_matrix(rz, (tx, ty, tz + height / 2)))
-            )
+            boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + size_m[2] / 2))))
     return boxes
 
 
@@ -171,7 +163,7 @@ def build_tracks(
             delay_s = delays_s[name, time_s] = float(azimuth_delay_s(float(np.arctan2(y, x))))
             pose = velo_at(time_s + delay_s)
         record = f"{where}: track {name}, frame {box.frame}"
-        collected.add(name, collected.word(box.label), time_s, box.size_m, pose @ box.sensor_from_box, where=record)
+        collected.add(name, collected.label_of(box.label), time_s, box.size_m, pose @ box.sensor_from_box, where=record)
     found, notes = collected.tracks()
     if velo_at is not None:
         found = [_at_scan_times(track, delays_s) for track in found]

@@ -56,7 +56,7 @@ class KittiCalibration:
     def _projection(self, number: int) -> Matrix:
         if number not in self.projections:
             raise InputError(f"calibration does not tell camera {number}", where=self.source,
-                             got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices")  # fmt: skip
+                got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices")  # fmt: skip
         return self.projections[number]
 
 
@@ -74,11 +74,11 @@ def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: 
     """
     if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
         raise InputError("projection matrix is not of a rectified pinhole camera", where=where,
-                         expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))  # fmt: skip
+            expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))  # fmt: skip
     fx, fy, cx, cy = (float(projection[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if fx <= 0 or fy <= 0:
         raise InputError("focal length is not positive", where=where, expected="pixels, about 700 for KITTI",
-                         got=f"fx={fx:g}, fy={fy:g}", remedy="check the calibration file")  # fmt: skip
+            got=f"fx={fx:g}, fy={fy:g}", remedy="check the calibration file")  # fmt: skip
     return Camera(name, *size, fx, fy, cx + PIXEL_CENTRE_PX, cy + PIXEL_CENTRE_PX)
 
 
@@ -98,7 +98,7 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
             continue
         if not np.isfinite(numbers).all():
             raise InputError("calibration holds a value that is not finite", where=f"{path}: {match[1]}",
-                             got=match[2][:80])  # fmt: skip
+                got=match[2][:80])  # fmt: skip
         table[match[1]] = numbers
     return table
 
@@ -114,12 +114,10 @@ def table_entry(
     key = next((key for key in keys if key in table), None)
     if key is None:
         raise InputError(f"calibration lacks {keys[0]}", where=str(where), expected=" or ".join(keys),
-                         got=", ".join(table) or "no entries",
-                         remedy="use the calibration file that belongs to this recording")  # fmt: skip
+            got=", ".join(table) or "no entries", remedy="use the calibration file that belongs to this recording")  # fmt: skip
     if table[key].size != np.prod(shape):
         raise InputError("calibration entry has the wrong number of values", where=f"{where}: {key}",
-                         expected=f"{np.prod(shape)} numbers", got=f"{table[key].size}",
-                         remedy="is the file cut off?")  # fmt: skip
+            expected=f"{np.prod(shape)} numbers", got=f"{table[key].size}", remedy="is the file cut off?")  # fmt: skip
     return table[key].reshape(shape)
 
 

@@ -34,6 +34,7 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Source, Track
+from mudg.data.importers import layout
 from mudg.data.importers.common import pose_near, seconds
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_size
@@ -43,15 +44,7 @@ from mudg.data.importers.kitti import poses as kitti_poses
 from mudg.data.importers.kitti.calib import KittiCalibration, read_calibration_day, read_calibration_text
 from mudg.data.importers.kitti.info import import_info_frame
 from mudg.data.importers.kitti.scans import SENSOR, read_scan, untwist_scan
-from mudg.data.importers.layout import (
-    LogFiles,
-    chosen_cameras,
-    first_file,
-    folder_contents,
-    numbered_files,
-    some_numbers,
-    whole_frames,
-)
+from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -199,17 +192,17 @@ def find_files(source: Path, options: ImportOptions) -> KittiFiles:
     for folder in CAMERA_NAMES:
         short = folder.replace("_0", "_")
         for candidate in (source / folder / "data", source / folder / sequence, source / short / sequence):
-            found = numbered_files(candidate, (".png", ".jpg", ".jpeg"))
+            found = layout.numbered_files(candidate, (".png", ".jpg", ".jpeg"))
             if found:
                 images[folder] = found
                 break
     if not images:
         _refuse_without_images(source, options)
     usual = "image_02" if "image_02" in images else next(iter(images))
-    chosen = chosen_cameras({folder: CAMERA_NAMES[folder] for folder in images}, options, str(source), (usual,))
+    chosen = layout.chosen_cameras({folder: CAMERA_NAMES[folder] for folder in images}, options, str(source), (usual,))
     scans: dict[int, Path] = {}
     for candidate in (source / "velodyne_points" / "data", source / "velodyne" / sequence):
-        scans = scans or numbered_files(candidate, (".bin",))
+        scans = scans or layout.numbered_files(candidate, (".bin",))
     wanted = {CAMERA_NAMES[folder]: images[folder] for folder in chosen}
     return KittiFiles(wanted, {CAMERA_NAMES[folder]: int(folder[-1]) for folder in chosen}, scans, source, single)
 
@@ -219,11 +212,10 @@ def _refuse_without_images(source: Path, options: ImportOptions) -> None:
     sequences = sorted(path.name for path in folders if path.name != "data")
     if sequences:
         raise UsageError("the folder holds several sequences", where=str(source),
-                         expected="--sequence with one of " + ", ".join(sequences[:12]),
-                         got=options.sequence or "none chosen")  # fmt: skip
-    raise InputError("no KITTI images found", where=str(source), got=folder_contents(source),
-                     expected="image_02/data, image_02 or image_2 with numbered PNG files",
-                     remedy="give the folder of one drive, sequence or training set")  # fmt: skip
+            expected="--sequence with one of " + ", ".join(sequences[:12]), got=options.sequence or "none chosen")  # fmt: skip
+    raise InputError("no KITTI images found", where=str(source), got=layout.folder_contents(source),
+        expected="image_02/data, image_02 or image_2 with numbered PNG files",
+        remedy="give the folder of one drive, sequence or training set")  # fmt: skip
 
 
 def _choose_frames(files: KittiFiles, options: ImportOptions) -> list[int]:
@@ -231,7 +223,7 @@ def _choose_frames(files: KittiFiles, options: ImportOptions) -> list[int]:
     if files.single:
         return [_single_frame(files, options)]
     streams = {**files.images, **({SENSOR: files.scans} if files.scans else {})}
-    frames = whole_frames(streams, options, str(files.folder), "kitti")
+    frames = layout.complete_frames(streams, options, str(files.folder), "kitti")
     if not files.scans:
         log.warn("kitti: no scans found: the scene has images only, and there is nothing to fuse")
     return frames
@@ -245,8 +237,8 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
         numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
     if len(numbers) != 1:
         raise UsageError("an object-benchmark folder holds unrelated frames; a scene is one of them",
-                         where=str(files.folder), expected="--sequence with one frame number, e.g. 000008",
-                         got=f"{len(numbers)} frames: {some_numbers(numbers)}")  # fmt: skip
+            where=str(files.folder), expected="--sequence with one frame number, e.g. 000008",
+            got=f"{len(numbers)} frames: {layout.number_ranges(numbers)}")  # fmt: skip
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(files.folder / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
@@ -254,7 +246,7 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
 
 def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportOptions) -> KittiCalibration:
     folder = files.folder
-    path = first_file(
+    path = layout.first_file(
         folder / "calib.txt",
         *([folder / "calib" / f"{frames[0]:06d}.txt"] if files.single else []),
         *([folder / "calib" / f"{options.sequence}.txt"] if options.sequence else []),
@@ -267,8 +259,8 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
             log.info(f"kitti: calibration from {day}/calib_*.txt")
             return read_calibration_day(day)
     raise InputError("no calibration found", where=str(folder),
-                     expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
-                     remedy="download the day's calibration archive and unpack it beside the drive")  # fmt: skip
+        expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
+        remedy="download the day's calibration archive and unpack it beside the drive")  # fmt: skip
 
 
 # --- time and motion ------------------------------------------------------------------------------------------------
@@ -279,7 +271,7 @@ def _find_clock(files: KittiFiles, frames: Sequence[int], notes: list[str]) -> _
     common = files.folder / "times.txt"
     image_folders = {name: next(path.parent for path in found.values()) for name, found in files.images.items()}
     image_files = {
-        name: first_file(folder.parent / "timestamps.txt", folder / "timestamps.txt", common)
+        name: layout.first_file(folder.parent / "timestamps.txt", folder / "timestamps.txt", common)
         for name, folder in image_folders.items()
     }
     if files.single or None in image_files.values():
@@ -288,7 +280,7 @@ def _find_clock(files: KittiFiles, frames: Sequence[int], notes: list[str]) -> _
         assumed = {n: (n - frames[0]) * FRAME_PERIOD_S for n in frames}
         return _Clock(dict.fromkeys(files.images, assumed), assumed, 0.0, False)
     image_s = {name: _times_of(path, frames) for name, path in image_files.items() if path is not None}
-    scan_file = first_file(files.folder / "velodyne_points" / "timestamps.txt", common) if files.scans else None
+    scan_file = layout.first_file(files.folder / "velodyne_points" / "timestamps.txt", common) if files.scans else None
     scan_s = _times_of(scan_file, frames) if scan_file is not None else next(iter(image_s.values()))
     for stream, times in (*image_s.items(), (SENSOR, scan_s)):
         seconds([times[n] for n in frames], "s", f"{files.folder}: {stream}")
@@ -301,8 +293,8 @@ def _times_of(path: Path, frames: Sequence[int]) -> dict[int, float]:
     times = kitti_poses.read_timestamps(path)
     if len(times) <= max(frames):
         raise InputError("timestamps do not cover the frames", where=str(path),
-                         expected=f"at least {max(frames) + 1} lines (line k = frame k)", got=f"{len(times)} lines",
-                         remedy="is the file cut off?")  # fmt: skip
+            expected=f"at least {max(frames) + 1} lines (line k = frame k)", got=f"{len(times)} lines",
+            remedy="is the file cut off?")  # fmt: skip
     return {n: times[n] for n in frames}
 
 
@@ -319,8 +311,7 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
     else:
         if calibration.velo_from_imu is None:
             raise InputError("calibration does not tell where the IMU is", where=calibration.source,
-                             expected="calib_imu_to_velo.txt or Tr_imu_to_velo",
-                             remedy="add it, or give a pose file with --poses")  # fmt: skip
+                expected="calib_imu_to_velo.txt or Tr_imu_to_velo", remedy="add it, or give a pose file with --poses")  # fmt: skip
         log.info(f"kitti: poses from GPS/IMU packets in {packets}")
         notes.append("poses from GPS/IMU packets")
         ego = _ego_from_packets(packets, frames, recording.clock)
@@ -338,20 +329,20 @@ def _poses_from_file(recording: _Recording, options: ImportOptions, notes: list[
     frames, folder = recording.frames, recording.files.folder
     names = ("poses_velo.txt", "poses.txt", "poses_cam0.txt")
     found = [parent / name for parent in (folder, folder / "derived") for name in names]
-    path = options.poses or first_file(*found, *_odometry_poses(folder))
+    path = options.poses or layout.first_file(*found, *_odometry_poses(folder))
     if path is None and len(frames) == 1:
         return np.eye(4)[None]
     if path is None:
         raise InputError("no vehicle poses found", where=str(folder),
-                         expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
-                         remedy="without poses the frames of a moving vehicle cannot be put into one world")  # fmt: skip
+            expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
+            remedy="without poses the frames of a moving vehicle cannot be put into one world")  # fmt: skip
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
     poses, sensor = kitti_poses.read_pose_file(path, frames)
     missing = [n for n in frames if n not in poses]
     if missing:
-        raise InputError("pose file lacks frames", where=str(path), got=f"no pose for frames {some_numbers(missing)}",
-                         remedy="choose frames with --frames FIRST:END, or give another file with --poses")  # fmt: skip
+        raise InputError("pose file lacks frames", where=str(path), got=f"no pose for frames {layout.number_ranges(missing)}",
+            remedy="choose frames with --frames FIRST:END, or give another file with --poses")  # fmt: skip
     stacked = np.stack([poses[n] for n in frames])
     if sensor == "cam0":
         rect0_from_velo = recording.calibration.rect0_from_velo
@@ -366,7 +357,7 @@ def _find_packets(files: KittiFiles, options: ImportOptions) -> Path | None:
     folder = files.folder / "oxts" / "data"
     if folder.is_dir():
         return folder
-    return first_file(files.folder / "oxts" / f"{options.sequence}.txt") if options.sequence else None
+    return layout.first_file(files.folder / "oxts" / f"{options.sequence}.txt") if options.sequence else None
 
 
 def _odometry_poses(source: Path) -> tuple[Path, ...]:
@@ -400,7 +391,7 @@ def _find_tracks(
     if options.boxes is not None and not options.boxes.is_file():
         raise InputError("box file does not exist", where=str(options.boxes))
     object_label = here / "label_2" / f"{frames[0]:06d}.txt"
-    found = options.boxes or first_file(
+    found = options.boxes or layout.first_file(
         here / "tracklet_labels.xml",
         here / "label_02.txt",
         *([here / "label_02" / f"{options.sequence}.txt"] if options.sequence else []),

@@ -41,10 +41,10 @@ def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDA
         raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
     if len(numbers) not in counts:
         raise InputError(f"{what}: wrong number of values", where=where, expected=" or ".join(str(c) for c in counts),
-                         got=str(len(numbers)), remedy="is the file cut off, or of another format?")  # fmt: skip
+            got=str(len(numbers)), remedy="is the file cut off, or of another format?")  # fmt: skip
     if not np.isfinite(numbers).all():
         raise InputError(f"{what}: a value is not finite", where=where, got=line.strip()[:80],
-                         expected="finite numbers")  # fmt: skip
+            expected="finite numbers")  # fmt: skip
     return numbers
 
 
@@ -76,7 +76,7 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     else:
         expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
         raise InputError("pose file does not cover the frames", where=str(path), got=f"{len(rows)} lines",
-                         expected=expected)  # fmt: skip
+            expected=expected)  # fmt: skip
     sensor = "velo" if widths == {13} else "cam0"
     return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
 
@@ -99,8 +99,8 @@ def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.floa
     missing = [n for n in frames if n not in lines]
     if missing:
         raise InputError("GPS/IMU packets are missing", where=str(path),
-                         got=f"no packet for frames {', '.join(str(n) for n in missing[:8])} ({len(missing)} in all)",
-                         remedy="copy them, or choose frames with --frames FIRST:END")  # fmt: skip
+            got=f"no packet for frames {', '.join(str(n) for n in missing[:8])} ({len(missing)} in all)",
+            remedy="copy them, or choose frames with --frames FIRST:END")  # fmt: skip
     return {n: line_numbers(line, (_OXTS_VALUES,), wheres[n], "GPS/IMU packet") for n, line in lines.items()}
 
 

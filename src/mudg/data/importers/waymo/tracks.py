@@ -72,11 +72,8 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
         seen: set[str] = set()
         for box, late in zip(frame.boxes, frame.late_s, strict=True):
             if not box.id or box.id in seen:
-                raise InputError(
-                    "frame has two boxes of one object" if box.id else "box has no id",
-                    where=frame.where,
-                    got=repr(box.id),
-                )
+                raise InputError("frame has two boxes of one object" if box.id else "box has no id", where=frame.where,
+                    got=repr(box.id))  # fmt: skip
             seen.add(box.id)
             pose = frame.world_from_vehicle @ yaw_matrix(box.heading, box.centre)
             members.setdefault(box.id, []).append((frame.time_s, float(late), pose, box))
@@ -86,9 +83,8 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
     for box_id, found in members.items():
         labels = sorted({box.label for *_, box in found})
         if len(labels) > 1:
-            raise InputError(
-                "the class of an object changes", where=f"{frames[0].where}: object {box_id}", got=", ".join(labels)
-            )
+            raise InputError("the class of an object changes", where=f"{frames[0].where}: object {box_id}",
+                got=", ".join(labels))  # fmt: skip
         times, late = np.array([item[0] for item in found]), np.array([item[1] for item in found])
         poses = np.stack([item[2] for item in found])
         velocity = _velocity(times + late, poses[:, :3, 3])
