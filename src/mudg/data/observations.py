@@ -21,42 +21,10 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, ObservationKind, View
+from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 1
-
-
-def camera_record(camera: Camera) -> dict[str, Any]:
-    """A camera as JSON values."""
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
-        "readout_s": camera.readout_s,
-    }
-
-
-def camera_from_record(record: Any, where: str) -> Camera:
-    """Inverse of ``camera_record``; InputError names ``where`` and the field."""
-    try:
-        return Camera(
-            name=str(record["name"]),
-            width=int(record["width"]),
-            height=int(record["height"]),
-            fx=float(record["fx"]),
-            fy=float(record["fy"]),
-            cx=float(record["cx"]),
-            cy=float(record["cy"]),
-            distortion=tuple(float(x) for x in record.get("distortion", ())),
-            readout_s=float(record.get("readout_s", 0.0)),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError("a camera record is incomplete or malformed", where=where, got=repr(error)) from error
 
 
 class ObservationWriter:
@@ -104,7 +72,7 @@ class ObservationWriter:
     def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
         self._records.append(
             {
-                "camera": camera_record(view.camera),
+                "camera": {"name": view.camera.name, **camera_to_json(view.camera)},
                 "world_from_cam": view.world_from_cam.tolist(),
                 "time_s": view.time_s,
                 "depth": has_depth,
@@ -212,7 +180,7 @@ def read_observations(path: Path) -> ObservationSet:
         records = content["observations"]
         views = tuple(
             View(
-                camera_from_record(r["camera"], f"{index}: observations[{i}].camera"),
+                _camera(r["camera"], f"{index}: observations[{i}].camera"),
                 np.asarray(r["world_from_cam"], np.float64),
                 float(r["time_s"]),
             )
@@ -229,6 +197,10 @@ def read_observations(path: Path) -> ObservationSet:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
+
+
+def _camera(record: Any, where: str) -> Camera:
+    return parse_camera(str(record["name"]), {key: value for key, value in record.items() if key != "name"}, where)
 
 
 def list_observation_sets(path: Path) -> dict[str, Path]:
