@@ -162,9 +162,8 @@ class ObservationSet:
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
-                raise InputError(
-                    "an observation file does not fit its view", where=f"{path}: {name}", expected=str(shape), got=got
-                )
+                raise InputError("an observation file does not fit its view", where=f"{path}: {name}",
+                    expected=str(shape), got=got)  # fmt: skip
         return Observation(
             view=view,
             rgb=torch.from_numpy(self.rgb_u8(index).copy()).permute(2, 0, 1).float() / 255,
@@ -183,12 +182,8 @@ def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
         with Image.open(io.BytesIO(content)) as image:
             if image.size != (camera.width, camera.height):
-                raise InputError(
-                    "an image has another size than its camera",
-                    where=str(path),
-                    expected=f"{camera.width}x{camera.height}",
-                    got=f"{image.size[0]}x{image.size[1]}",
-                )
+                raise InputError("an image has another size than its camera", where=str(path),
+                    expected=f"{camera.width}x{camera.height}", got=f"{image.size[0]}x{image.size[1]}")  # fmt: skip
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
@@ -206,9 +201,8 @@ def read_observations(path: Path) -> ObservationSet:
     content = store.read_json(index)
     try:
         if content["schema"] != _SCHEMA:
-            raise InputError(
-                "unknown schema version", where=str(index), expected=str(_SCHEMA), got=str(content["schema"])
-            )
+            raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
+                got=str(content["schema"]))  # fmt: skip
         records = content["observations"]
         views = tuple(
             View(
