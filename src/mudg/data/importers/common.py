@@ -17,8 +17,9 @@ any number of workers.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
@@ -105,39 +106,25 @@ def for_each(
                 bar.advance()
             return done
         with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
-            pending: dict[Future[None], int] = {}
-            failed: dict[int, BaseException] = {}
-            source = iter(items)
-            index = 0
+            pending: deque[Future[None]] = deque()
+
+            def finish_first() -> None:
+                pending.popleft().result()
+                bar.advance()
+
             try:
-                while not failed:
-                    while len(pending) < 2 * workers:
-                        try:
-                            item = next(source)
-                        except StopIteration:
-                            break
-                        pending[pool.submit(_named, work, item, name)] = index
-                        index += 1
-                    if not pending:
+                for item in items:
+                    pending.append(pool.submit(_named, work, item, name))
+                    done += 1
+                    if any(future.done() and future.exception() for future in pending):
                         break
-                    finished, _ = wait(pending, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        at = pending.pop(future)
-                        error = future.exception()
-                        if error is not None:
-                            failed[at] = error
-                        else:
-                            done += 1
-                            bar.advance()
+                    if len(pending) == 2 * workers:
+                        finish_first()
+                while pending:
+                    finish_first()
             finally:
                 for future in pending:
                     future.cancel()
-            wait(pending)
-            for future, at in pending.items():
-                if not future.cancelled() and future.exception() is not None:
-                    failed[at] = future.exception()  # type: ignore[assignment]
-            if failed:
-                raise failed[min(failed)]
     return done
 
 
