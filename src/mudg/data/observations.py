@@ -8,7 +8,7 @@ data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -26,35 +26,14 @@ _INDEX = "observations.json"
 _SCHEMA = 1
 
 
-def camera_record(camera: Camera) -> dict[str, Any]:
-    """A camera as JSON values."""
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
-        "readout_s": camera.readout_s,
-    }
-
-
-def camera_from_record(record: Any, where: str) -> Camera:
-    """Inverse of ``camera_record``; InputError names ``where`` and the field."""
+def _camera(record: Any, where: str) -> Camera:
+    """A camera from the JSON values of its fields."""
     try:
-        return Camera(
-            name=str(record["name"]),
-            width=int(record["width"]),
-            height=int(record["height"]),
-            fx=float(record["fx"]),
-            fy=float(record["fy"]),
-            cx=float(record["cx"]),
-            cy=float(record["cy"]),
-            distortion=tuple(float(x) for x in record.get("distortion", ())),
-            readout_s=float(record.get("readout_s", 0.0)),
-        )
+        sizes = {key: int(record[key]) for key in ("width", "height")}
+        intrinsics = {key: float(record[key]) for key in ("fx", "fy", "cx", "cy")}
+        distortion = tuple(float(x) for x in record.get("distortion", ()))
+        readout_s = float(record.get("readout_s", 0.0))
+        return Camera(str(record["name"]), **sizes, **intrinsics, distortion=distortion, readout_s=readout_s)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a camera record is incomplete or malformed", where=where, got=repr(error)) from error
 
@@ -67,10 +46,7 @@ class ObservationWriter:
     """
 
     def __init__(self, out: Path, trajectory: str, source: str, kind: ObservationKind = "virtual") -> None:
-        self._out = Path(out)
-        self._trajectory = trajectory
-        self._source = source
-        self._kind = kind
+        self._out, self._trajectory, self._source, self._kind = Path(out), trajectory, source, kind
         self._records: list[dict[str, Any]] = []
         self.done = 0
         while (self._out / "data" / f"{self.done:06d}.safetensors").is_file():
@@ -102,30 +78,17 @@ class ObservationWriter:
         self._record(observation.view, observation.depth is not None, observation.semantics is not None)
 
     def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
-        self._records.append(
-            {
-                "camera": camera_record(view.camera),
-                "world_from_cam": view.world_from_cam.tolist(),
-                "time_s": view.time_s,
-                "depth": has_depth,
-                "semantics": has_semantics,
-            }
-        )
+        self._records.append({
+            "camera": asdict(view.camera), "world_from_cam": view.world_from_cam.tolist(), "time_s": view.time_s,
+            "depth": has_depth, "semantics": has_semantics,
+        })  # fmt: skip
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None:
-            store.write_json(
-                self._out / _INDEX,
-                {
-                    "schema": _SCHEMA,
-                    "trajectory": self._trajectory,
-                    "source": self._source,
-                    "kind": self._kind,
-                    "observations": self._records,
-                },
-            )
+            head = {"schema": _SCHEMA, "trajectory": self._trajectory, "source": self._source, "kind": self._kind}
+            store.write_json(self._out / _INDEX, {**head, "observations": self._records})
 
 
 def _numpy(tensor: torch.Tensor, dtype: type[np.generic]) -> NDArray[Any]:
@@ -204,23 +167,13 @@ def read_observations(path: Path) -> ObservationSet:
             raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
                 got=str(content["schema"]))  # fmt: skip
         records = content["observations"]
-        views = tuple(
-            View(
-                camera_from_record(r["camera"], f"{index}: observations[{i}].camera"),
-                np.asarray(r["world_from_cam"], np.float64),
-                float(r["time_s"]),
-            )
-            for i, r in enumerate(records)
-        )
-        return ObservationSet(
-            Path(path),
-            str(content["trajectory"]),
-            str(content["source"]),
-            "recorded" if content["kind"] == "recorded" else "virtual",
-            views,
-            tuple(bool(r["depth"]) for r in records),
-            tuple(bool(r["semantics"]) for r in records),
-        )
+        cameras = [_camera(r["camera"], f"{index}: observations[{i}].camera") for i, r in enumerate(records)]
+        poses = [np.asarray(r["world_from_cam"], np.float64) for r in records]
+        views = tuple(View(c, p, float(r["time_s"])) for c, p, r in zip(cameras, poses, records, strict=True))
+        has_depth, has_semantics = (tuple(bool(r[key]) for r in records) for key in ("depth", "semantics"))
+        kind: ObservationKind = "recorded" if content["kind"] == "recorded" else "virtual"
+        trajectory, source = str(content["trajectory"]), str(content["source"])
+        return ObservationSet(Path(path), trajectory, source, kind, views, has_depth, has_semantics)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
 
