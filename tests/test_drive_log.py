@@ -185,8 +185,8 @@ def test_clip_keeps_one_key_beyond_each_end() -> None:
 
 def test_unknown_categories_keep_their_last_word() -> None:
     boxes = BoxTracks("table", {"vehicle.car": "car"})
-    assert boxes.word("vehicle.hover Craft") == "hover_craft"
-    assert boxes.word("vehicle.car") == "car"
+    assert boxes.label_of("vehicle.hover Craft") == "hover_craft"
+    assert boxes.label_of("vehicle.car") == "car"
     assert boxes.tracks()[1] == ["classes that are not known here keep their names: 'vehicle.hover Craft' (1 boxes)"]
 
 
@@ -210,7 +210,7 @@ def test_boxes_come_to_the_sweeps_times(delays: list[float]) -> None:
     track, sweeps = drawn(10.0, delays)
     times = BoxTimes([track])
     for number, sweep in reversed(list(enumerate(sweeps))):
-        times.see(0.1 * number, np.eye(4), sweep)
+        times.observe(0.1 * number, np.eye(4), sweep)
     (moved,) = times.at_sweep_times()
     assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
     assert np.abs(track.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() > 0.5
@@ -220,7 +220,7 @@ def test_boxes_without_returns_take_the_delay_of_their_neighbours_and_standing_o
     track, sweeps = drawn(10.0, [0.08] * 6)
     standing, _ = drawn(0.5, [0.08] * 6)
     times = BoxTimes([track, standing])
-    times.see(0.2, np.eye(4), sweeps[2])
+    times.observe(0.2, np.eye(4), sweeps[2])
     moved, kept = times.at_sweep_times()
     assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
     assert kept is standing

@@ -259,7 +259,7 @@ def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
     named = [path for path in (options.poses, options.boxes) if path is not None and path.exists()]
     total = hashlib.sha256()
     base = source if source.is_dir() else source.parent
-    for path in (*files.whole, *named):
+    for path in (*files.files, *named):
         for name in _walk(path):
             state = name.stat() if name.exists() else name.lstat()  # a link may lead nowhere
             place = Path(os.path.relpath(name, base)).as_posix()

@@ -73,7 +73,7 @@ LABELS: Final[Mapping[str, str]] = {
     "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign", "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
     "MESSAGE_BOARD_TRAILER": "message_board_trailer", "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
 }  # fmt: skip
-"""The data set's categories in the product's words."""
+"""The data set's categories -> labels."""
 
 
 def looks_like_argoverse2(source: Path) -> bool:
@@ -270,7 +270,7 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     }
     tracks = BoxTracks(where, LABELS)
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
-        label = tracks.word(str(columns["category"][row]))
+        label = tracks.label_of(str(columns["category"][row]))
         length, width, height = sizes[row].tolist()
         time_s = (int(stamp) - zero_ns) / NANOSECONDS
         track = str(columns["track_uuid"][row])

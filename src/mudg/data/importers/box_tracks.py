@@ -1,4 +1,4 @@
-"""Boxes of many frames -> tracks: words for classes, sizes that make sense, keys in time order, splits where a box is not seen."""
+"""Boxes of many frames -> tracks: labels, plausible sizes, keys in time order, splits where a box is not seen."""
 
 from __future__ import annotations
 
@@ -49,23 +49,23 @@ class BoxTracks:
 
     Args:
         where: the file or folder the boxes come from, for messages.
-        words: the data set's class -> the product's word (``car``, ``pedestrian``, ...). Other classes keep the last part (after
+        labels: the data set's class -> the label here (``car``, ``pedestrian``, ...). Other classes keep the last part (after
             a dot) of their name in lower case, and are named once in the notes.
         max_gap_s: an object that is not seen for longer than this is split.
     """
 
-    def __init__(self, where: str, words: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
-        self._where, self._words, self._max_gap_s = where, words, max_gap_s
+    def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
+        self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
         self._members: dict[str, _Member] = {}
         self._unknown: dict[str, int] = {}
 
     def __len__(self) -> int:
         return len(self._members)
 
-    def word(self, category: str) -> str:
-        """The product's word for a class of the data set; what is not known is counted."""
-        if category in self._words:
-            return self._words[category]
+    def label_of(self, category: str) -> str:
+        """The label of a class of the data set; classes that are not known are counted."""
+        if category in self._labels:
+            return self._labels[category]
         self._unknown[category] = self._unknown.get(category, 0) + 1
         return category.rsplit(".", 1)[-1].strip().lower().replace(" ", "_") or "unknown"
 
@@ -84,7 +84,7 @@ class BoxTracks:
 
         Args:
             track: the object's id, the same in all frames.
-            label: the product's word for it (``word``). The track takes its commonest one.
+            label: its label (``label_of``). The track takes its commonest one.
             time_s: when, seconds of the scene's clock.
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
@@ -122,7 +122,7 @@ class BoxTracks:
                 raise InputError("an object has two boxes at one moment", where=f"{self._where}: object {name}",
                     got=f"time {at:.3f} s of the log", remedy="are two logs mixed?")  # fmt: skip
             size = np.median(rows[:, 2:5], axis=0)
-            label = max(member.labels, key=lambda word: member.labels[word])
+            label = max(member.labels, key=lambda name: member.labels[name])
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
             poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
             if member.standing:
@@ -146,11 +146,11 @@ class BoxTracks:
         if split:
             notes.append(f"{split} tracks are not seen for more than {self._max_gap_s:g} s and were split there")
         if self._unknown:
-            notes.append(unknown_words(self._unknown))
+            notes.append(unknown_classes(self._unknown))
         return notes
 
 
-def unknown_words(counts: Mapping[str, int]) -> str:
+def unknown_classes(counts: Mapping[str, int]) -> str:
     """A note about classes of boxes that the format does not document, by their number of boxes."""
     some = ", ".join(f"{label!r} ({count} boxes)" for label, count in sorted(counts.items())[:8])
     return f"classes that are not known here keep their names: {some}"

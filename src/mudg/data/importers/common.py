@@ -85,7 +85,7 @@ def for_each(
         title: of the progress bar.
         total: number of items; None = ``len(items)``, or unknown for a generator.
         workers: threads; 1 = no threads, 0 = as many as there are processors to use.
-        name: words for an item, put before the place of an error.
+        name: what an item is called, put before the place of an error.
 
     Returns:
         Number of items.
@@ -132,11 +132,11 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
     try:
         work(item)
     except MudgError as error:
-        words = name(item)
-        if words in error.where:
+        called = name(item)
+        if called in error.where:
             raise
         raise type(error)(
-            error.what, where=f"{words}: {error.where}" if error.where else words,
+            error.what, where=f"{called}: {error.where}" if error.where else called,
             expected=error.expected, got=error.got, remedy=error.remedy,
         ) from error  # fmt: skip
 

@@ -273,7 +273,7 @@ def _read_tracks(
                     expected=", ".join(str(number) for number in names))  # fmt: skip
             box = item["box"]
             size = box["length"], box["width"], box["height"]
-            label = tracks.word(names[item["class_id"]])
+            label = tracks.label_of(names[item["class_id"]])
             pose = datum.map_from_sensor @ _pose(box["pose"], where)
             tracks.add(str(item["instance_id"]), label, time_s, size, pose, where=where)
     return tracks.tracks()

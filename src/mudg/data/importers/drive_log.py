@@ -86,7 +86,7 @@ class SceneContent(Generic[Item]):
         fits: by the cameras' scene names, in the order of the scene.
         items: what is converted one by one: frames, images, sweeps; may be a generator (``total`` says how many then).
         convert: an item to its images and sweeps; called from several threads if ``workers`` > 1.
-        item_name: words for an item, put before the place of an error.
+        item_name: what an item is called, put before the place of an error.
         ego: the vehicle's path in the scene's world and clock.
         tracks: called after the last item: tracks in the world and clock of the scene, and notes about them.
     """
@@ -239,7 +239,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
         points = record.read()
         if options.untwist == "no":
             points = SweepPoints(points.xyz, points.intensity, np.zeros_like(points.dt_s))
-        seen.see(record.time_s, record.map_from_lidar, points)
+        seen.observe(record.time_s, record.map_from_lidar, points)
         pose = world_from_map @ record.map_from_lidar
         yield SceneSweep(record.sensor, numbers[record], time_s, pose, points, where)
 

@@ -85,26 +85,26 @@ class ImageFit:
     Args:
         camera: the scene's camera: pinhole, rectified, of the scene's size.
         recorded: the camera as recorded: its size is that of the files.
-        words: what is done, for ``Source.notes``; empty if images are kept as they are.
+        note: what is done, for ``Source.notes``; empty if images are kept as they are.
         table: where each pixel of the rectified image (recorded size) comes from; None if images are rectified already.
     """
 
     camera: Camera
     recorded: Camera
-    words: str
+    note: str
     table: _Table | None
 
     @property
     def keeps_bytes(self) -> bool:
         """Whether images are taken as they are."""
-        return not self.words
+        return not self.note
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
         """One recorded image as ``SceneWriter.add_frame`` wants it.
 
         Args:
             image: u8[H, W, 3], or path or bytes of a PNG or JPEG.
-            where: words for the image, for errors.
+            where: names the image, for errors.
 
         Returns:
             ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95 for a
@@ -166,24 +166,24 @@ def fit_images(
     Raises:
         InputError: the lens cannot be rectified like this. UsageError: ``resolution`` is larger than the images.
     """
-    words = []
+    changes = []
     table = None
     out = camera
     if lens is not None:
         out = target or covering_camera(camera, lens)
         table = _Table.of(out, camera, lens)
-        words.append(f"rectified, focal length times {out.fx / camera.fx:.3f}")
+        changes.append(f"rectified, focal length times {out.fx / camera.fx:.3f}")
     size = resized(out.width, out.height, options.resolution, f"camera {camera.name}")
     if size != (out.width, out.height):
-        words.append(f"resized from {out.width}x{out.height} to {size[0]}x{size[1]}")
+        changes.append(f"resized from {out.width}x{out.height} to {size[0]}x{size[1]}")
         out = out.resized(*size)
-    note = f"camera {camera.name}: images {'; '.join(words)}" if words else ""
+    note = f"camera {camera.name}: images {'; '.join(changes)}" if changes else ""
     return ImageFit(out, camera, note, table)
 
 
 def image_notes(fits: Mapping[str, ImageFit]) -> list[str]:
     """What is done to the images of the cameras, for ``Source.notes``; nothing where they are kept as they are."""
-    return [fit.words for fit in fits.values() if fit.words]
+    return [fit.note for fit in fits.values() if fit.note]
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -28,6 +28,10 @@ MAX_OPCODES: Final = 20_000_000
 _MAX_DIMENSIONS: Final = 4
 _DTYPE: Final = re.compile(r"b1|[iu][1248]|f[248]|O8?|[US]\d{1,4}")
 _MARK: Final = object()
+_MALFORMED: Final = (
+    ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, struct.error,
+)  # fmt: skip
+"""What a malformed pickle makes the disassembler or an opcode raise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +82,7 @@ class Array:
 def _filled(shape: Any, dtype: Any, order: str, content: Any) -> NDArray[Any]:
     if not isinstance(dtype, Dtype):
         raise ValueError("array without a type")
-    sizes = [_whole(side) for side in shape]
+    sizes = [_integer(side) for side in shape]
     if len(sizes) > _MAX_DIMENSIONS or min(sizes, default=0) < 0:
         raise ValueError(f"array of shape {tuple(sizes)}")
     count = math.prod(sizes)
@@ -95,7 +99,7 @@ def _filled(shape: Any, dtype: Any, order: str, content: Any) -> NDArray[Any]:
     return flat.reshape(sizes, order="F" if order == "F" else "C")
 
 
-def _whole(value: Any) -> int:
+def _integer(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError(f"{value!r} is no whole number")
     return value
@@ -151,16 +155,7 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
             if opcode.name == "STOP":
                 return machine.result()
             machine.step(opcode.name, argument)
-    except (
-        ValueError,
-        IndexError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-        struct.error,
-    ) as error:
+    except _MALFORMED as error:
         raise InputError("pickle is malformed or cut off", where=where, got=f"{type(error).__name__}: {error}"[:200],
             remedy="copy the file again") from error  # fmt: skip
     raise InputError("pickle is cut off", where=where, expected="an end mark", remedy="copy the file again")

@@ -50,7 +50,7 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     content = _chosen(read_log(source), options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
     images, sweeps = _numbered(content.images), _numbered(content.sweeps)
-    notes = (*content.source.notes, *(fit.words for fit in fits.values() if fit.words))
+    notes = (*content.source.notes, *(fit.note for fit in fits.values() if fit.note))
     for note in notes:
         log.info(f"custom: {note}")
 

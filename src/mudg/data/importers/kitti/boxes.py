@@ -163,7 +163,7 @@ def build_tracks(
             delay_s = delays_s[name, time_s] = float(azimuth_delay_s(float(np.arctan2(y, x))))
             pose = velo_at(time_s + delay_s)
         record = f"{where}: track {name}, frame {box.frame}"
-        collected.add(name, collected.word(box.label), time_s, box.size_m, pose @ box.sensor_from_box, where=record)
+        collected.add(name, collected.label_of(box.label), time_s, box.size_m, pose @ box.sensor_from_box, where=record)
     found, notes = collected.tracks()
     if velo_at is not None:
         found = [_at_scan_times(track, delays_s) for track in found]

@@ -223,7 +223,7 @@ def _choose_frames(files: KittiFiles, options: ImportOptions) -> list[int]:
     if files.single:
         return [_single_frame(files, options)]
     streams = {**files.images, **({SENSOR: files.scans} if files.scans else {})}
-    frames = layout.whole_frames(streams, options, str(files.folder), "kitti")
+    frames = layout.complete_frames(streams, options, str(files.folder), "kitti")
     if not files.scans:
         log.warn("kitti: no scans found: the scene has images only, and there is nothing to fuse")
     return frames
@@ -238,7 +238,7 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
     if len(numbers) != 1:
         raise UsageError("an object-benchmark folder holds unrelated frames; a scene is one of them",
             where=str(files.folder), expected="--sequence with one frame number, e.g. 000008",
-            got=f"{len(numbers)} frames: {layout.some_numbers(numbers)}")  # fmt: skip
+            got=f"{len(numbers)} frames: {layout.number_ranges(numbers)}")  # fmt: skip
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(files.folder / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
@@ -341,7 +341,7 @@ def _poses_from_file(recording: _Recording, options: ImportOptions, notes: list[
     poses, sensor = kitti_poses.read_pose_file(path, frames)
     missing = [n for n in frames if n not in poses]
     if missing:
-        raise InputError("pose file lacks frames", where=str(path), got=f"no pose for frames {layout.some_numbers(missing)}",
+        raise InputError("pose file lacks frames", where=str(path), got=f"no pose for frames {layout.number_ranges(missing)}",
             remedy="choose frames with --frames FIRST:END, or give another file with --poses")  # fmt: skip
     stacked = np.stack([poses[n] for n in frames])
     if sensor == "cam0":

@@ -126,7 +126,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes.append(f"poses from {poses.name}")
     ego = _read_motion(poses, calibration, clock)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
-    frames = layout.whole_frames(placed, options, str(folders.root), "kitti360")
+    frames = layout.complete_frames(placed, options, str(folders.root), "kitti360")
     notes += _without_pose(streams.values(), placed.values(), options)
     start_s = float(clock[frames[0]])
     world_from_source = world_from_first(pose_near(ego, clock[frames[0]]))
@@ -198,7 +198,7 @@ def _without_pose(
     """A note about the frames within ``options.frames`` that some stream has and none could place."""
     first, end = options.frames or (0, 2**63)
     lost = {n for found in streams for n in found if first <= n < end}.difference(*placed)
-    return [f"frames without a pose or time stamp were left out: {layout.some_numbers(sorted(lost))}"] if lost else []
+    return [f"frames without a pose or time stamp were left out: {layout.number_ranges(sorted(lost))}"] if lost else []
 
 
 # --- time and motion ------------------------------------------------------------------------------------------------
@@ -400,7 +400,7 @@ def _read_tracks(
 
     def add(name: str, box: Kitti360Box, frame: int) -> None:
         pose, still = world_from_source @ box.world_from_box, box.frame < 0
-        tracks.add(name, tracks.word(box.label), time_of[frame], box.size_m, pose, standing=still)
+        tracks.add(name, tracks.label_of(box.label), time_of[frame], box.size_m, pose, standing=still)
 
     for box in read_boxes(path, left_out):
         if box.frame < 0:

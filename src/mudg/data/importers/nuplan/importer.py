@@ -317,7 +317,7 @@ def _read_tracks(
     for token, track, label, (x, y, z, yaw, length, width, height) in opened.boxes(*span):
         if token in time_of:
             pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
-            tracks.add(track, tracks.word(label), time_of[token], (length, width, height), pose)
+            tracks.add(track, tracks.label_of(label), time_of[token], (length, width, height), pose)
     return tracks.tracks()
 
 

@@ -72,7 +72,7 @@ LABELS: Final[Mapping[str, str]] = {
     "vehicle.emergency.police": "car", "vehicle.motorcycle": "motorcycle", "vehicle.trailer": "trailer",
     "vehicle.truck": "truck",
 }  # fmt: skip
-"""The release's categories in the product's words."""
+"""The release's categories -> labels."""
 _RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
 _WITH_RIDER: Final = "cycle.with_rider"
 
@@ -221,7 +221,7 @@ def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
     while at:
         if at in stamps:
             raise InputError("the chain of key frames runs in a circle", where=samples.where, got=f"back at {at!r}")
-        stamps[at] = tables.whole(samples.record(at, samples.where), "timestamp", samples.where)
+        stamps[at] = tables.integer(samples.record(at, samples.where), "timestamp", samples.where)
         at = tables.text(samples.rows[at], "next", samples.where)
     values = np.array(list(stamps.values()), np.int64)
     common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
@@ -235,7 +235,7 @@ def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
 
 def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: str) -> None:
     """Stamps of images and sweeps are microseconds near their scene."""
-    stamps = np.array([tables.whole(row, "timestamp", where) for row in rows], np.int64)
+    stamps = np.array([tables.integer(row, "timestamp", where) for row in rows], np.int64)
     common.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
@@ -278,7 +278,7 @@ class _RowReader:
     def camera(self, row: tables.Row, name: str) -> Camera:
         calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
         where = f"{self.calibrations.where}: record {calibration['token']!r}"
-        size = tables.whole(row, "width", self.where), tables.whole(row, "height", self.where)
+        size = tables.integer(row, "width", self.where), tables.integer(row, "height", self.where)
         return camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), where)
 
 
@@ -317,7 +317,7 @@ def _read_tracks(release: _Release, samples: Mapping[str, int], zero_us: int) ->
     for row in annotations.rows.values():
         instance = instances.get(row, "instance_token", annotations.where)
         category = categories.get(instance, "category_token", instances.where)
-        label = tracks.word(tables.text(category, "name", categories.where))
+        label = tracks.label_of(tables.text(category, "name", categories.where))
         if attributes is not None and label in _RIDDEN and _is_ridden(row, attributes):
             label = _RIDDEN[label]
         width, length, height = tables.numbers(row, "size", 3, annotations.where)  # in this order in the tables

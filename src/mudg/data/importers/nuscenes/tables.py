@@ -155,7 +155,7 @@ def text(row: Row, key: str, where: str) -> str:
     return value
 
 
-def whole(row: Row, key: str, where: str) -> int:
+def integer(row: Row, key: str, where: str) -> int:
     """An integer field."""
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):

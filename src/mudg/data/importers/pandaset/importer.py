@@ -42,11 +42,11 @@ from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_
 from mudg.data.importers.layout import (
     LogFiles,
     chosen_cameras,
+    complete_frames,
     folder_contents,
     numbered_files,
     refuse_options,
     the_only,
-    whole_frames,
 )
 from mudg.data.importers.options import ImportOptions
 from mudg.data.importers.pandaset.pandas_frame import read_frame
@@ -74,7 +74,7 @@ LABELS: Final = {
     "Road Barriers": "barrier", "Cones": "traffic_cone", "Signs": "sign", "Construction Signs": "sign",
     "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
 }  # fmt: skip
-"""The data set's classes -> words of the product; pickup trucks count as cars, as in Cityscapes."""
+"""The data set's classes -> labels; pickup trucks count as cars, as in Cityscapes."""
 FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
 """Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
 MAX_POINT_DELAY_S: Final = 0.25
@@ -136,7 +136,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     chosen = chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
     images = {name: numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
     clouds = numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
-    frames = whole_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
+    frames = complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
     motion = _Motion.read(folder, frames, chosen)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
     cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
@@ -434,6 +434,6 @@ def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> lis
             kept.setdefault(name, box)
         for name, box in kept.items():
             tracks.add(
-                name, tracks.word(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s
+                name, tracks.label_of(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s
             )
     return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []

@@ -301,7 +301,7 @@ def _plan(
     for name in cameras:
         camera, lens = sensors.recorded_camera(waymo.cameras[name], first.shots[name])
         fits[name] = fit_images(camera, options, lens)
-        notes += [fits[name].words] if fits[name].words else []
+        notes += [fits[name].note] if fits[name].note else []
     rolling = sorted({waymo.cameras[name].direction for name, fit in fits.items() if fit.camera.readout_s > 0})
     if rolling:
         ways = ", ".join(sensors.DIRECTIONS[d] if 0 <= d < len(sensors.DIRECTIONS) else f"code {d}" for d in rolling)
@@ -343,7 +343,7 @@ def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> sensors.Tur
 
 
 def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan) -> tuple[Moment, str]:
-    """For which moment the boxes of this log hold, by the points in the boxes of its fast objects; and words for the notes."""
+    """For which moment the boxes of this log hold, by the points in the boxes of its fast objects; and a note."""
     boxes = [plan.timed_boxes(frame, "pose") for frame in frames]
     fast = [
         {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= FAST_M_S} for speeds in velocities(boxes)
@@ -365,9 +365,9 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
     if not counts.any():
         return ("seen" if any(TOP in frame.lasers for frame in frames) else "pose"), ""
     moment = choose_moment(counts)
-    words = {"seen": "when the LiDAR passes them", "start": "at the timestamp", "pose": "at the frame's pose"}
-    tallies = ", ".join(f"{count} {words[name]}" for name, count in zip(MOMENTS, counts, strict=True))
-    return moment, f"boxes hold {words[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
+    texts = {"seen": "when the LiDAR passes them", "start": "at the timestamp", "pose": "at the frame's pose"}
+    tallies = ", ".join(f"{count} {texts[name]}" for name, count in zip(MOMENTS, counts, strict=True))
+    return moment, f"boxes hold {texts[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
@@ -400,7 +400,7 @@ def _points(plan: _Plan, frame: FrameRecord, name: str, scan: LaserScan) -> sens
 
 
 def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: Sequence[str], plan: _Plan) -> str:
-    """Compare our projections of the first frame's points with those recorded; words for the notes, empty if there are none."""
+    """Compare our projections of the first frame's points with those recorded; a note, empty if there are none."""
     frame = frames[0]
     if not frame.lasers:
         return ""
@@ -415,9 +415,9 @@ def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: 
     medians = {camera: float(np.median(np.concatenate(off))) for camera, off in errors.items()}
     if not medians:
         return ""
-    words = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
+    texts = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
     if max(medians.values()) > DOUBTFUL_PROJECTION_PX:
         log.warn(
-            f"waymo: points do not fall where the log says they do ({words}, median); are calibrations and poses of this log?"
+            f"waymo: points do not fall where the log says they do ({texts}, median); are calibrations and poses of this log?"
         )
-    return f"points fall where the log says they do, up to (median, first frame): {words}"
+    return f"points fall where the log says they do, up to (median, first frame): {texts}"
