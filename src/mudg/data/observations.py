@@ -8,7 +8,7 @@ data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -35,10 +35,7 @@ class ObservationWriter:
     """
 
     def __init__(self, out: Path, trajectory: str, source: str, kind: ObservationKind = "virtual") -> None:
-        self._out = Path(out)
-        self._trajectory = trajectory
-        self._source = source
-        self._kind = kind
+        self._out, self._trajectory, self._source, self._kind = Path(out), trajectory, source, kind
         self._records: list[dict[str, Any]] = []
         self.done = 0
         while (self._out / "data" / f"{self.done:06d}.safetensors").is_file():
@@ -84,16 +81,8 @@ class ObservationWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None:
-            store.write_json(
-                self._out / _INDEX,
-                {
-                    "schema": _SCHEMA,
-                    "trajectory": self._trajectory,
-                    "source": self._source,
-                    "kind": self._kind,
-                    "observations": self._records,
-                },
-            )
+            head = {"schema": _SCHEMA, "trajectory": self._trajectory, "source": self._source, "kind": self._kind}
+            store.write_json(self._out / _INDEX, {**head, "observations": self._records})
 
 
 def _numpy(tensor: torch.Tensor, dtype: type[np.generic]) -> NDArray[Any]:
@@ -130,9 +119,8 @@ class ObservationSet:
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
-                raise InputError(
-                    "an observation file does not fit its view", where=f"{path}: {name}", expected=str(shape), got=got
-                )
+                raise InputError("an observation file does not fit its view", where=f"{path}: {name}",
+                    expected=str(shape), got=got)  # fmt: skip
         return Observation(
             view=view,
             rgb=torch.from_numpy(self.rgb_u8(index).copy()).permute(2, 0, 1).float() / 255,
@@ -151,12 +139,8 @@ def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
         with Image.open(io.BytesIO(content)) as image:
             if image.size != (camera.width, camera.height):
-                raise InputError(
-                    "an image has another size than its camera",
-                    where=str(path),
-                    expected=f"{camera.width}x{camera.height}",
-                    got=f"{image.size[0]}x{image.size[1]}",
-                )
+                raise InputError("an image has another size than its camera", where=str(path),
+                    expected=f"{camera.width}x{camera.height}", got=f"{image.size[0]}x{image.size[1]}")  # fmt: skip
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
@@ -174,9 +158,8 @@ def read_observations(path: Path) -> ObservationSet:
     content = store.read_json(index)
     try:
         if content["schema"] != _SCHEMA:
-            raise InputError(
-                "unknown schema version", where=str(index), expected=str(_SCHEMA), got=str(content["schema"])
-            )
+            raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
+                got=str(content["schema"]))  # fmt: skip
         records = content["observations"]
         views = tuple(
             View(
