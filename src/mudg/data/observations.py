@@ -24,6 +24,8 @@ from mudg.base.types import Camera, Observation, ObservationKind, View
 
 _INDEX = "observations.json"
 _SCHEMA = 1
+OBSERVATION_FILES = (_INDEX, "rgb/*.png", "data/*.safetensors")
+"""Patterns of the names in a folder of observations."""
 
 
 def camera_record(camera: Camera) -> dict[str, Any]:

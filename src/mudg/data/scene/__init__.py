@@ -22,9 +22,10 @@ from mudg.data.scene.read import (
     read_scene,
     read_trusted_classes,
 )
-from mudg.data.scene.write import SceneWriter, write_zip
+from mudg.data.scene.write import SCENE_FILES, SceneWriter, write_zip
 
 __all__ = [
+    "SCENE_FILES",
     "Finding",
     "SceneWriter",
     "check_scene",

@@ -23,12 +23,15 @@ from PIL import Image
 from mudg.base import store
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.geometry import rigid_problem
+from mudg.base.processes import process_alive
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
 from mudg.data.scene import schema
 from mudg.data.scene.files import open_files
 from mudg.data.scene.read import MASK_LABELS, all_refs, check_image, checked_points, label_ref, read_scene
 
 _MAX_PENDING_WRITES: Final = 8
+SCENE_FILES: Final = ("scene.json", "tracks.json", "images/*/*", "lidar/*/*.safetensors", "labels/*/*/*")
+"""Patterns of the names in a scene directory."""
 
 
 class SceneWriter:
@@ -304,7 +307,7 @@ def _partial_folder(root: Path) -> Path:
     for stale in parent.iterdir() if parent.is_dir() else ():
         if stale.name.startswith(prefix) and stale.name.endswith(".part") and stale.is_dir():
             pid = stale.name.removeprefix(prefix).split("-")[0]
-            if pid.isdigit() and not store.process_alive(int(pid)):
+            if pid.isdigit() and not process_alive(int(pid)):
                 shutil.rmtree(stale, ignore_errors=True)
     return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
 
