@@ -419,10 +419,11 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 OVERLAPS = [
     ("data/scene", "data/scene", "is also"), ("data/scene/", "link", "is also"), ("link", "data/scene", "is also"),
-    ("data/../data/scene", "data/scene", "is also"), ("other/up/scene", "data/scene", "is also"), ("data", "data/scene", "holds"),
-    (".", "link", "holds"), ("data/scene/new", "data/scene", "lies in"), ("link/a/b/c", "data/scene", "lies in"),
-    ("other/../link/new", "data/scene", "lies in"), ("other/up/scene/new", "link", "lies in"),
-    ("data/scene", "data/scene/weights", "holds"), ("data/scene/weights", "data/scene/weights", "is also"), ("data/scene", "weights_link", "holds"),
+    ("data/../data/scene", "data/scene", "is also"), ("other/up/scene", "data/scene", "is also"),
+    ("data", "data/scene", "holds"), (".", "link", "holds"), ("data/scene/new", "data/scene", "lies in"),
+    ("link/a/b/c", "data/scene", "lies in"), ("other/../link/new", "data/scene", "lies in"),
+    ("other/up/scene/new", "link", "lies in"), ("data/scene", "data/scene/weights", "holds"),
+    ("data/scene/weights", "data/scene/weights", "is also"), ("data/scene", "weights_link", "holds"),
     ("link/images", "data", "lies in"),
 ]  # fmt: skip
 

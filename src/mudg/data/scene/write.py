@@ -24,6 +24,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.geometry import rigid_problem
 from mudg.base.processes import process_alive
+from mudg.base.replacement import all_names
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
 from mudg.data.scene import schema
 from mudg.data.scene.files import open_files
@@ -263,11 +264,13 @@ class SceneWriter:
                 return
             entries = sorted(self._partial.iterdir(), key=lambda entry: entry.name == "scene.json")
             for entry in entries:  # scene.json last: without it the folder is no scene
-                target = self.root / entry.name
-                if target.is_dir():
-                    shutil.rmtree(target)
-                entry.replace(target)
-            self._partial.rmdir()
+                if (self.root / entry.name).is_dir():  # file by file: what else lies there stays
+                    for name in all_names(entry):
+                        (self.root / entry.name / name).parent.mkdir(parents=True, exist_ok=True)
+                        (entry / name).replace(self.root / entry.name / name)
+                else:
+                    entry.replace(self.root / entry.name)
+            shutil.rmtree(self._partial)
         except OSError as error:
             raise ResourceError("scene cannot be moved into place", where=str(self.root), got=str(error)) from error
 
