@@ -312,7 +312,7 @@ def _start(task: Task, threads: int) -> _Child:
     return _Child(task, process, mine)
 
 
-def _watch(children: Sequence[_Child], bar: log.Task) -> _Child | None:
+def _watch(children: Sequence[_Child], bar: log.ProgressTask) -> _Child | None:
     """Show what the children say until all have ended or one has failed, which is returned."""
     running = list(children)
     while running:

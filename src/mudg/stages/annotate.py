@@ -28,7 +28,8 @@ from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Scene
 from mudg.data.scene import SCENE_FILES, SceneWriter, read_image, read_scene
 from mudg.models.labels.ground import driven_path
-from mudg.models.labels.labellers import LabelInput, Labels, labeller
+from mudg.models.labels.inputs import LabelInput, Labels
+from mudg.models.labels.labellers import labeller
 from mudg.report.annotate_page import write_page
 from mudg.stages import batch
 from mudg.stages.config import AnnotateConfig
