@@ -8,7 +8,7 @@ data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled
 from __future__ import annotations
 
 import io
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -25,6 +25,8 @@ from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 1
+OBSERVATION_FILES = (_INDEX, "rgb/*.png", "data/*.safetensors")
+"""Patterns of the names in a folder of observations."""
 
 
 class ObservationWriter:

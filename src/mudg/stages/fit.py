@@ -31,6 +31,7 @@ from torch import Tensor
 from mudg.base import checkpoint, log, palette, seeds, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import fused as kernels
 from mudg.core import losses, metrics
@@ -59,7 +60,10 @@ from mudg.stages.fitting.views import (
     training_frames,
 )
 
-VERSION = 1
+OUTPUT = VerbOutput(
+    "fit", 1,
+    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "preview/*.png", "steps/"),
+)  # fmt: skip
 PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
@@ -109,12 +113,15 @@ def run(
     if recipe.virtual and observations is None:
         raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and hand its folder on")
     virtual = observations if recipe.virtual else None
+    refuse_overlap(
+        out, {"scene": scene, "fused": fused, "observations": observations, "lpips-weights": config.lpips_weights}
+    )
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
     if virtual is not None:
         inputs["observations"] = store.digest(Path(virtual))
     if config.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
-    folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
+    folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     with _one_torch_thread():
@@ -191,7 +198,7 @@ def start_state(
 # ---- the loop ------------------------------------------------------------------------------------------------------
 
 
-def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
+def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``virtual_beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
