@@ -12,7 +12,7 @@ SHIFTED: Final = "shifted"
 """The mean over the lateral distances."""
 COLUMNS: Final[tuple[tuple[str, str, int], ...]] = (
     ("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("perceptual", "perceptual", 4), ("abs_rel", "AbsRel", 4), ("rmse_m", "RMSE m", 2),
-    ("delta1", "delta1", 4), ("miou", "mIoU", 3), ("flicker", "flicker", 3), ("psnr_movers", "PSNR of movers", 2),
+    ("delta1", "delta1", 4), ("miou", "mIoU", 3), ("flicker", "flicker", 3), ("psnr_movers", "PSNR of dynamic objects", 2),
 )  # fmt: skip
 """Metric, heading, digits."""
 
@@ -46,14 +46,14 @@ def _against(a: str, b: str, place: str, where: str, of: str) -> tuple[Compariso
 
 
 COMPARISONS: Final[tuple[Comparison, ...]] = (
-    *_against("mudg_s", "street_gaussians", SHIFTED, "beside the path", "psnr ssim perceptual abs_rel rmse_m delta1 miou"),
-    *_against("mudg_s", "street_gaussians", SHIFTED, "beside the path", "flicker psnr_movers"),
-    *_against("mudg_s", "mudg_r", SHIFTED, "beside the path", "psnr perceptual abs_rel miou flicker"),
+    *_against("mudg_s", "street_gaussians", SHIFTED, "off the recorded path", "psnr ssim perceptual abs_rel rmse_m delta1 miou"),
+    *_against("mudg_s", "street_gaussians", SHIFTED, "off the recorded path", "flicker psnr_movers"),
+    *_against("mudg_s", "mudg_r", SHIFTED, "off the recorded path", "psnr perceptual abs_rel miou flicker"),
     *_against("mudg_s", "street_gaussians", RECORDED, "recorded path", "psnr ssim perceptual abs_rel miou"),
     *_against("street_gaussians", "gs3d", RECORDED, "recorded path", "psnr psnr_movers"),
-    *_against("street_gaussians", "gs3d", SHIFTED, "beside the path", "psnr psnr_movers"),
-    *_against("mudg_s", "nearest_fill", SHIFTED, "beside the path", "psnr perceptual abs_rel miou"),
-    *_against("mudg_r", "nearest_fill", SHIFTED, "beside the path", "psnr perceptual abs_rel miou"),
+    *_against("street_gaussians", "gs3d", SHIFTED, "off the recorded path", "psnr psnr_movers"),
+    *_against("mudg_s", "nearest_fill", SHIFTED, "off the recorded path", "psnr perceptual abs_rel miou"),
+    *_against("mudg_r", "nearest_fill", SHIFTED, "off the recorded path", "psnr perceptual abs_rel miou"),
 )  # fmt: skip
 ABLATION_ROWS: Final = (
     ("street_gaussians", "none"), ("only_I", "+ I"), ("only_I_D", "+ I + D"), ("only_I_S", "+ I + S"), ("mudg_s", "+ I + D + S"),
@@ -71,7 +71,7 @@ def document(
 
     Args:
         logs: per log its facts, ``values[method][distance][metric]`` (a number, or why there is none) and seconds.
-        rows: name, title and fit of each method. distances_m: beside the path. settings: what was asked for.
+        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the bench.
     """
     places = [RECORDED, *(f"{d:g}" for d in sorted(distances_m))]
     full = [{**entry, "values": {m: _with_mean(of, places[1:]) for m, of in entry["values"].items()}} for entry in logs]
@@ -86,7 +86,7 @@ def document(
         "comparisons": [compare(full, c) for c in COMPARISONS if {c.a, c.b} <= names],
         "variants": [
             {"name": r["name"], "against_mudg_s": [
-                compare(full, c) for place, where in ((SHIFTED, "beside the path"), (RECORDED, "recorded path"))
+                compare(full, c) for place, where in ((SHIFTED, "off the recorded path"), (RECORDED, "recorded path"))
                 for c in _against(r["name"], "mudg_s", place, where, "psnr perceptual abs_rel miou")
             ]}
             for r in rows if "mudg_s" in names and r["fit"] is not None and r["name"] not in ("gs3d", "street_gaussians", "mudg_s")
@@ -95,7 +95,7 @@ def document(
 
 
 def _with_mean(of: Mapping[str, Mapping[str, Any]], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The values of one method and log with the mean over the distances beside the path."""
+    """The values of one method and log with the mean over the distances off the recorded path."""
     mean: dict[str, Any] = {}
     for metric, _, _ in COLUMNS:
         values = [of.get(place, {}).get(metric, "not produced") for place in shifted]
@@ -171,7 +171,7 @@ def markdown(doc: Mapping[str, Any]) -> str:
     settings = doc["settings"]
     width, height = settings["size_px"]
     lines = [
-        f"# Beside the recorded path: {logs_text(doc)} of the {settings['list']} list", "",
+        f"# Off the recorded path: {logs_text(doc)} of the {settings['list']} list", "",
         f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
         f"frame held out; {settings['iterations']} iterations per fit, seed {settings['seed']}. Means over both sides and all logs, +- the "
         "standard error over logs. Flicker: 1 = as calm as the truth. Perceptual: features of the shipped codec, not LPIPS.", "",
@@ -179,13 +179,13 @@ def markdown(doc: Mapping[str, Any]) -> str:
     ]  # fmt: skip
     for place in [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]:
         lines += [f"## {place_title(doc, place)}", "", *_method_table(doc, place), ""]
-    lines += ["## Compared", "", *_comparison_table(doc["comparisons"]), ""]
+    lines += ["## Comparisons", "", *_comparison_table(doc["comparisons"]), ""]
     if any(r["name"] == "only_I" for r in doc["methods"]):
         lines += ["## Which virtual term does what", "", *_ablation_table(doc), ""]
     for variant in doc["variants"]:
         lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
     lines += [
-        "## Each log, mean beside the path",
+        "## Each log, mean off the recorded path",
         "",
         *_log_table(doc),
         "",
@@ -225,7 +225,7 @@ def _facts(doc: Mapping[str, Any]) -> list[str]:
     return lines + ["| " + " | ".join(facts_of(entry)) + " |" for entry in doc["logs"]]
 
 
-FACTS: Final = ("log", "turn, degrees", "length, m", "moving vehicles in view", "their share of the picture", "city")
+FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city")
 
 
 def facts_of(entry: Mapping[str, Any]) -> list[str]:

@@ -26,7 +26,8 @@ from torch import Tensor, nn
 
 from mudg.base.errors import InputError
 from mudg.core.fused import box_mean
-from mudg.core.metrics import Pair, distance_to_units, unit_features
+from mudg.core.metrics import Pair
+from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.mdm.codec import PatchCodec
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
@@ -163,7 +164,7 @@ def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], wher
 
 
 class PerceptualDistance:
-    """``metrics.perceptual_distance`` of a pair's colours in the features of a network. Several threads may ask.
+    """``lpips_distance`` of a pair's colours in the features of a network. Several threads may ask.
 
     Truth is compared with one method after another: each thread keeps its features until another truth comes.
     """
@@ -180,4 +181,5 @@ class PerceptualDistance:
             if getattr(self._known, "picture", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb))
                 self._known.picture = pair.truth_rgb
-            return distance_to_units(self._features(pair.rgb), self._known.features, pair.mask, self._weights)
+            distance = lpips_distance(self._features(pair.rgb), self._known.features, pair.mask, self._weights, over_weight=True)
+            return float(distance)
