@@ -77,14 +77,18 @@ def _frames(sets: Mapping[str, ObservationSet], order: Sequence[str], frames: in
 def page(doc: Mapping[str, Any]) -> str:
     """The whole page from what ``bench.json`` holds."""
     settings = doc["settings"]
-    places = [tables.SHIFTED, tables.RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"]))]
+    *places, mean = tables.places_of(doc)
+    names = [row["name"] for row in doc["methods"]]
     return html.render(
         "shift.html.j2", title=f"Off the recorded path: {tables.logs_text(doc)}, {settings['list']} list", kicker="mudg bench shift",
         lead=f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {settings['iterations']} iterations "
         "per fit. Means over logs and both sides of the path.",
         comparisons=[[c["title"], *tables.compared_text(c), c["kind"], c["logs"]] for c in doc["comparisons"]],
         score_heads=["method", *(heading for _, heading, _ in tables.COLUMNS)],
-        places=[{"title": tables.place_title(doc, place), "rows": _score_rows(doc, place)} for place in places],
+        places=[
+            {"title": tables.place_title(doc, place), "rows": [[n, *tables.score_cells(doc, n, place, with_error=True)] for n in names]}
+            for place in (mean, *places)
+        ],
         log_heads=tables.FACTS, logs=[tables.facts_of(entry) for entry in doc["logs"]], **_video_values(doc),
     )  # fmt: skip
 
@@ -109,16 +113,3 @@ def _shift_of(name: str) -> float:
 
 def _place(name: str) -> str:
     return shift_title(_shift_of(name), name)
-
-
-def _score_rows(doc: Mapping[str, Any], place: str) -> list[list[str]]:
-    return [
-        [
-            row["name"],
-            *(
-                tables.number(doc["pooled"][row["name"]][place][m], digits, with_error=True)
-                for m, _, digits in tables.COLUMNS
-            ),
-        ]
-        for row in doc["methods"]
-    ]

@@ -16,7 +16,7 @@ MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus"
 def flicker(
     made: Tensor, truth: Tensor, depth: Tensor, ids: Tensor, world_from_cam: Tensor, intrinsics: Tensor
 ) -> float:
-    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as calm as the truth).
+    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as steady as the truth).
 
     Arguments as for `changes`. NaN for one frame or without such pixels.
     """

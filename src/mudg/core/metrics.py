@@ -1,7 +1,7 @@
 """Image, depth and semantic metrics, each as a small accumulator over a whole trajectory.
 
-A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums, and is asked
-for its ``value()`` once at the end. Metrics with the same source share one measurement.
+A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums, and its
+``value()`` is read once at the end. Metrics with the same source share one measurement.
 What a method did not produce stays None ("not produced"); what needs weights that are not there is listed in ``METRICS``
 with ``build=None`` ("not computed"). Nothing is ever reported as zero for want of data.
 """
@@ -297,7 +297,7 @@ class Flicker:
         self._true += true_change
 
     def value(self) -> float | None:
-        """1 = as calm as the truth; None without two neighbouring frames or without static surfaces."""
+        """1 = as steady as the truth; None without two neighbouring frames or without static surfaces."""
         return self._made / self._true if self._true > 0 else None
 
 

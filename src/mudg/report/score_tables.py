@@ -157,14 +157,18 @@ def plain(document: Mapping[str, Any]) -> str:
 
 def markdown(document: Mapping[str, Any]) -> str:
     """All trajectories and metrics as Markdown, with the rules."""
-    lines = [f"# Scores of {document['scene']['id']}", ""]
-    lines += [f"* {rule}" for rule in document["rules"]]
+    lines = [f"# Scores of {document['scene']['id']}", "", *(f"* {rule}" for rule in document["rules"])]
     names = [m["name"] for m in document["metrics"]]
     for trajectory in document["trajectories"]:
-        lines += ["", f"## {trajectory['name']}", "", "| method | views | " + " | ".join(names) + " |"]
-        lines.append("|---" * (len(names) + 2) + "|")
-        for row in document["results"]:
-            if row["trajectory"] == trajectory["name"]:
-                cells = " | ".join(number_text(n, row["values"].get(n)) for n in names)
-                lines.append(f"| {title_of(row['method'])} | {row['views']} | {cells} |")
+        rows = [
+            [title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in names)]
+            for r in document["results"] if r["trajectory"] == trajectory["name"]
+        ]  # fmt: skip
+        lines += ["", f"## {trajectory['name']}", "", *markdown_table(["method", "views", *names], rows)]
     return "\n".join(lines) + "\n"
+
+
+def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    first, *others = ("| " + " | ".join(cells) + " |" for cells in (heads, *rows))
+    return [first, "|---" * len(heads) + "|", *others]

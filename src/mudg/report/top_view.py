@@ -23,8 +23,6 @@ FRONT_COLOR: Final = (255, 80, 80)
 PATH_COLOR: Final = (60, 200, 255)
 _COURSE_COLOR: Final = (150, 110, 60)
 _MARGIN_M: Final = 8.0
-_OUTER_PERCENT: Final = 4
-"""Points farther out than this share of them do not widen the picture."""
 
 PEOPLE: Final = frozenset(
     ("pedestrian", "person", "person_sitting", "person (sitting)", "cyclist", "rider", "motorcyclist", "bicyclist", "stroller",
@@ -41,7 +39,7 @@ class TopView:
     Args:
         xyz: points f64[N, 3] in the world. rgb: their colours u8[N, 3]; higher points lie over lower ones.
         boxes: id of a track -> ``world_from_object`` of its box, or None for its course alone. caption: upper left.
-        dot_px: side of a point, pixels.
+        dot_px: side of a point, pixels. outer_percent: of the points on each side that need not fit into the picture.
     """
 
     xyz: Floats
@@ -49,6 +47,7 @@ class TopView:
     boxes: Mapping[str, Floats | None]
     caption: str
     dot_px: int = 1
+    outer_percent: float = 4.0
 
 
 def draw_top_view(scene: Scene, content: TopView, width: int, height: int) -> Image.Image:
@@ -57,7 +56,7 @@ def draw_top_view(scene: Scene, content: TopView, width: int, height: int) -> Im
     tracks = [track for track in scene.tracks if track.id in content.boxes]
     places = [content.xyz] if len(content.xyz) else [track.world_from_object[:, :3, 3] for track in tracks]
     around = np.concatenate([path[:, :2], *(xyz[:, :2] for xyz in places)])
-    low, high = np.percentile(around, _OUTER_PERCENT, axis=0), np.percentile(around, 100 - _OUTER_PERCENT, axis=0)
+    low, high = np.percentile(around, [content.outer_percent, 100 - content.outer_percent], axis=0)
     low, high = np.minimum(low, path[:, :2].min(0)) - _MARGIN_M, np.maximum(high, path[:, :2].max(0)) + _MARGIN_M
     scale = float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
     middle = (low + high) / 2

@@ -132,7 +132,8 @@ def top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Image.Ima
     xyz, rgb = _placed(scene, cloud)
     boxes = {track.id: _middle(track) for track in scene.tracks if report.verdicts[track.id].moving}
     caption = f"{scene.id}: {len(xyz)} points, {len(boxes)} dynamic objects"
-    return draw_top_view(scene, TopView(xyz, rgb, boxes, caption, dot_px=2 if len(xyz) < 400_000 else 1), *_TOP_VIEW_PX)
+    dot_px = 2 if len(xyz) < 400_000 else 1
+    return draw_top_view(scene, TopView(xyz, rgb, boxes, caption, dot_px, outer_percent=1.0), *_TOP_VIEW_PX)
 
 
 def _middle(track: Track) -> NDArray[np.float64]:
