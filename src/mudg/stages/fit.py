@@ -35,6 +35,7 @@ from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import fused as kernels
 from mudg.core import losses, metrics
+from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_scene
@@ -611,13 +612,11 @@ def render_view(model: SceneModel, view: View, raster: RasterConfig, sky_below_a
 
 def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
     """A picture: truth, render, depth, semantics of the middle recorded view."""
-    from mudg.data.exporters.video import depth_colors
-
     stored = state.views.recorded[len(state.views.recorded) // 2]
     seen = render_view(state.model, stored.view, raster)
-    panels = [stored.rgb, (seen.rgb * 255).round().byte().permute(1, 2, 0).numpy(), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
+    panels = [stored.rgb, to_bytes(seen.rgb), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
     if seen.semantics is not None:
-        panels.append(palette.encode(seen.semantics.numpy(), palette.DISPLAY_COLORS))
+        panels.append(class_colors(seen.semantics.numpy()))
     with store.atomic_path(path) as temporary:
         Image.fromarray(np.concatenate(panels, 1)).save(temporary)
 

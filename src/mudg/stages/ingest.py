@@ -46,7 +46,7 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
     kind = CITY if source == CITY else _kind(config, Path(source))
     if kind in IMPORTERS:
         files = files_of(kind, Path(source), import_options(config))
-        refuse_overlap(out, {f"file {n} of the log": path for n, path in enumerate((*files.whole, *files.entries))})
+        refuse_overlap(out, {f"file {n} of the log": path for n, path in enumerate((*files.files, *files.entries))})
     inputs = {} if kind == CITY else {"source": source_digest(Path(source), kind, config)}
     idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
     settings = {name: value for name, value in to_dict(config).items() if name not in idle}

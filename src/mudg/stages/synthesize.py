@@ -32,6 +32,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
 from mudg.core import trajectory
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.clips.condition import ConditionRules, Recorded, Source, Sparse, build_conditions
 from mudg.data.cloudfile import read_fused
@@ -45,7 +46,6 @@ from mudg.stages.config import SynthesizeConfig
 from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.learning import published_model
 from mudg.stages.learning.precision import choose_bf16
-from mudg.stages.learning.score import class_image, depth_image, rgb_image
 
 SOURCE = "mudg_r"
 FITS = "depth_fits.json"
@@ -456,9 +456,8 @@ def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
 
 def _sheet_row(condition: Condition, sample: Sample, i: int) -> np.ndarray:
     """Condition, colour, depth, classes and confidence of one frame side by side, u8[H,5W,3]."""
-    trust = (sample.confidence[i, 0].clamp(0, 1) * 255).byte().numpy()
     cells = [
-        rgb_image(condition.color[i]), rgb_image(sample.rgb[i]), depth_image(sample.depth[i]), class_image(sample.semantics[i]),  # type: ignore[index]
-        np.repeat(trust[..., None], 3, 2),
+        to_bytes(condition.color[i]), to_bytes(sample.rgb[i]), depth_colors(sample.depth[i, 0].numpy()),  # type: ignore[index]
+        class_colors(sample.semantics[i].numpy()), gray(sample.confidence[i, 0].numpy()),  # type: ignore[index]
     ]  # fmt: skip
     return np.concatenate(cells, 1)
