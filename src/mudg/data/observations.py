@@ -29,11 +29,11 @@ _SCHEMA = 1
 def _camera(record: Any, where: str) -> Camera:
     """A camera from the JSON values of its fields."""
     try:
-        sizes = {key: int(record[key]) for key in ("width", "height")}
-        intrinsics = {key: float(record[key]) for key in ("fx", "fy", "cx", "cy")}
+        fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
         distortion = tuple(float(x) for x in record.get("distortion", ()))
         readout_s = float(record.get("readout_s", 0.0))
-        return Camera(str(record["name"]), **sizes, **intrinsics, distortion=distortion, readout_s=readout_s)
+        width, height = int(record["width"]), int(record["height"])
+        return Camera(str(record["name"]), width, height, fx, fy, cx, cy, distortion, readout_s)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a camera record is incomplete or malformed", where=where, got=repr(error)) from error
 
