@@ -271,7 +271,7 @@ def test_scan_with_zero_points(drive: Path, tmp_path: Path) -> None:
     scene, cloud = through(drive, tmp_path)
     assert len(read_points(scene, scene.sweeps[3]).xyz) == 0
     assert len(cloud.static) > 0
-    assert any("no points" in f.words for f in check_scene(scene.root))
+    assert any("no points" in f.message for f in check_scene(scene.root))
 
 
 def test_one_camera_of_several_is_enough(tmp_path: Path) -> None:

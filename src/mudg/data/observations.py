@@ -8,7 +8,7 @@ data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled
 from __future__ import annotations
 
 import io
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,21 +21,12 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, ObservationKind, View
+from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 1
-
-
-def _camera(record: Any, where: str) -> Camera:
-    """A camera from the JSON values of its fields."""
-    try:
-        fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
-        distortion = tuple(float(x) for x in record.get("distortion", ()))
-        readout_s = float(record.get("readout_s", 0.0))
-        width, height = int(record["width"]), int(record["height"])
-        return Camera(str(record["name"]), width, height, fx, fy, cx, cy, distortion, readout_s)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError("a camera record is incomplete or malformed", where=where, got=repr(error)) from error
+OBSERVATION_FILES = (_INDEX, "rgb/*.png", "data/*.safetensors")
+"""Patterns of the names in a folder of observations."""
 
 
 class ObservationWriter:
@@ -78,10 +69,15 @@ class ObservationWriter:
         self._record(observation.view, observation.depth is not None, observation.semantics is not None)
 
     def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
-        self._records.append({
-            "camera": asdict(view.camera), "world_from_cam": view.world_from_cam.tolist(), "time_s": view.time_s,
-            "depth": has_depth, "semantics": has_semantics,
-        })  # fmt: skip
+        self._records.append(
+            {
+                "camera": {"name": view.camera.name, **camera_to_json(view.camera)},
+                "world_from_cam": view.world_from_cam.tolist(),
+                "time_s": view.time_s,
+                "depth": has_depth,
+                "semantics": has_semantics,
+            }
+        )
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -176,6 +172,10 @@ def read_observations(path: Path) -> ObservationSet:
         return ObservationSet(Path(path), trajectory, source, kind, views, has_depth, has_semantics)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
+
+
+def _camera(record: Any, where: str) -> Camera:
+    return parse_camera(str(record["name"]), {key: value for key, value in record.items() if key != "name"}, where)
 
 
 def list_observation_sets(path: Path) -> dict[str, Path]:

@@ -42,7 +42,7 @@ class Name:
 
 
 @dataclass(slots=True)
-class Record:
+class PickledObject:
     """An object of an allowed class as plain values: its class' name, arguments, state, and items if it is a list."""
 
     name: str
@@ -133,13 +133,13 @@ NUMPY_MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) -> Any:
-    """Plain values from a pickle: numbers, texts, bytes, lists, tuples, dicts, ``Array``, ``Record``.
+    """Plain values from a pickle: numbers, texts, bytes, lists, tuples, dicts, ``Array``, ``PickledObject``.
 
     Args:
         content: the pickle, protocol 0 to 5.
         where: for messages.
         makers: name in the file (``module.name``) -> function from plain values to a plain value; None = a class or name
-            that may only be mentioned: objects of it become a ``Record``.
+            that may only be mentioned: objects of it become a ``PickledObject``.
 
     Raises:
         InputError: cut off, malformed, too large, or it names something that is not in ``makers``.
@@ -163,7 +163,7 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
 
 def as_list(value: Any, where: str) -> list[Any]:
     """The items of a pickled list, tuple, array, or object of an allowed list class."""
-    if isinstance(value, Record):
+    if isinstance(value, PickledObject):
         return value.items
     if isinstance(value, Array) and value.value is not None:
         return value.value.tolist()
@@ -264,7 +264,7 @@ class _Machine:
             stack.append(self._since_mark())
         elif opcode in ("APPEND", "APPENDS"):
             items = [stack.pop()] if opcode == "APPEND" else self._since_mark()
-            target = stack[-1].items if isinstance(stack[-1], Record) else stack[-1]
+            target = stack[-1].items if isinstance(stack[-1], PickledObject) else stack[-1]
             if not isinstance(target, list):
                 raise TypeError("items for something that is no list")
             target.extend(items)
@@ -284,7 +284,7 @@ class _Machine:
         if opcode == "BUILD":
             state = stack.pop()
             target = stack[-1]
-            if isinstance(target, Record):
+            if isinstance(target, PickledObject):
                 target.state = state
             elif isinstance(target, Dtype | Array):
                 target.build(state)
@@ -296,14 +296,16 @@ class _Machine:
         arguments, kind = stack.pop(), stack.pop()
         if not isinstance(arguments, tuple):
             raise TypeError("arguments are no tuple")
-        if isinstance(kind, Record):  # a call of an object: kept as it stands, whoever knows its class may read it
-            stack.append(Record(kind.name, (kind, *arguments)))
+        if isinstance(
+            kind, PickledObject
+        ):  # a call of an object: kept as it stands, whoever knows its class may read it
+            stack.append(PickledObject(kind.name, (kind, *arguments)))
         elif not isinstance(kind, Name):
             raise TypeError(f"a call of a {type(kind).__name__}")
         else:
             maker = self._makers[kind.text]
             if maker is None or opcode != "REDUCE":
-                stack.append(Record(kind.text, arguments))
+                stack.append(PickledObject(kind.text, arguments))
             else:
                 stack.append(maker(*arguments))
 
