@@ -30,13 +30,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_missing_cameras, refuse_untwist
+from mudg.data.importers.layout import (
+    LogFiles,
+    chosen_cameras,
+    path_inside,
+    refuse_missing_cameras,
+    refuse_untwist,
+    the_only,
+)
 from mudg.data.importers.nuscenes import tables
 from mudg.data.importers.options import ImportOptions
 
@@ -127,37 +134,26 @@ def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
 # --- one scene ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Release:
-    """A table folder and the root that file names are relative to."""
+def _all_of(folder: Path, name: str) -> tables.TokenTable:
+    """A small table, complete."""
+    path = folder / f"{name}.json"
+    return tables.TokenTable(path, tables.iter_records(path))
 
-    folder: Path
 
-    @property
-    def root(self) -> Path:
-        return self.folder.parent
-
-    def path(self, name: str) -> Path:
-        return self.folder / f"{name}.json"
-
-    def all_of(self, name: str) -> tables.TokenTable:
-        """A small table, whole."""
-        return tables.TokenTable(self.path(name), tables.iter_records(self.path(name)))
-
-    def those(self, name: str, field: str, values: set[str]) -> tables.TokenTable:
-        """The records of a large table whose ``field`` is one of ``values``."""
-        return tables.TokenTable(self.path(name), tables.find_records(self.path(name), field, values))
+def _those(folder: Path, name: str, field: str, values: set[str]) -> tables.TokenTable:
+    """The records of a large table whose ``field`` is one of ``values``."""
+    path = folder / f"{name}.json"
+    return tables.TokenTable(path, tables.find_records(path, field, values))
 
 
 def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
     """What the tables tell about the chosen scene; no image or sweep is opened."""
     folder, scene = _choose_scene(releases, options)
-    release = _Release(folder)
     where = f"{folder}: {scene['name']}"
     log.info(f"nuscenes: {where}")
-    samples = _samples_in_order(release, scene)
-    data = release.those("sample_data", "sample_token", set(samples))
-    sensors, calibrations = release.all_of("sensor"), release.all_of("calibrated_sensor")
+    samples = _samples_in_order(folder, scene)
+    data = _those(folder, "sample_data", "sample_token", set(samples))
+    sensors, calibrations = _all_of(folder, "sensor"), _all_of(folder, "calibrated_sensor")
     channel_of: dict[str, str] = {}
     for row in data.rows.values():
         calibration = calibrations.get(row, "calibrated_sensor_token", data.where)
@@ -169,9 +165,9 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
-    ego_poses = release.those("ego_pose", "token", {tables.text(r, "ego_pose_token", data.where) for r in used})
+    ego_poses = _those(folder, "ego_pose", "token", {tables.text(r, "ego_pose_token", data.where) for r in used})
     zero_us = int(used[0]["timestamp"])
-    reader = _RowReader(release, data.where, calibrations, ego_poses, zero_us)
+    reader = _RowReader(folder.parent, data.where, calibrations, ego_poses, zero_us)
     scene_name_of = {raw: name for name, raw in chosen.items()}
     images, sweeps = [], []
     rows_of: dict[str, tables.Row] = {}
@@ -183,7 +179,7 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
             images.append(reader.image(row, scene_name_of[channel]))
             rows_of.setdefault(channel, row)
     cameras = {name: reader.camera(rows_of[raw], name) for name, raw in chosen.items() if raw in rows_of}
-    tracks, notes = _read_tracks(release, samples, zero_us)
+    tracks, notes = _read_tracks(folder, samples, zero_us)
     if not sweeps:
         notes.append("no LiDAR sweeps in the tables")
     ego = common.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
@@ -203,20 +199,16 @@ def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Pat
             names.append(f"{folder.name}/{name}" if len(releases) > 1 else name)
             if wanted in ("", name, row.get("token")):
                 found.append((folder, row))
-    if not found or (not wanted and len(found) > 1):
-        several = "the release holds several scenes" if found else "the release has no such scene"
-        listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
-        raise UsageError(several, where=", ".join(str(folder) for folder in releases),
-            expected=f"--sequence with one of {listed}" if names else "a release with scenes",
-            got=options.sequence or "none chosen")  # fmt: skip
-    return found[0]  # the same scene may lie in two releases: the smaller one is quicker
+    # the same scene may lie in two releases: the smaller one is quicker
+    return the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
 
 
-def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
+def _samples_in_order(folder: Path, scene: tables.Row) -> dict[str, int]:
     """Key frames of a scene: token -> time stamp in microseconds, in the order of the chain."""
-    token = tables.text(scene, "token", str(release.path("scene")))
-    samples = release.those("sample", "scene_token", {token})
-    at = tables.text(scene, "first_sample_token", str(release.path("scene")))
+    where = str(folder / "scene.json")
+    token = tables.text(scene, "token", where)
+    samples = _those(folder, "sample", "scene_token", {token})
+    at = tables.text(scene, "first_sample_token", where)
     stamps: dict[str, int] = {}
     while at:
         if at in stamps:
@@ -249,7 +241,7 @@ def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: 
 class _RowReader:
     """Records of ``sample_data`` to images and sweeps with their poses."""
 
-    release: _Release
+    root: Path
     where: str
     calibrations: tables.TokenTable
     ego_poses: tables.TokenTable
@@ -266,7 +258,7 @@ class _RowReader:
         return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
 
     def file(self, row: tables.Row) -> Path:
-        return path_inside(self.release.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+        return path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
 
     def image(self, row: tables.Row, camera: str) -> ImageRecord:
         return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))
@@ -304,15 +296,14 @@ def _pose(row: tables.Row, where: str) -> Matrix:
 # --- boxes ----------------------------------------------------------------------------------------------------------
 
 
-def _read_tracks(release: _Release, samples: Mapping[str, int], zero_us: int) -> tuple[list[Track], list[str]]:
+def _read_tracks(folder: Path, samples: Mapping[str, int], zero_us: int) -> tuple[list[Track], list[str]]:
     """Tracks of the whole scene in the map's frame, and notes; a release without annotations has none."""
-    path = release.path("sample_annotation")
-    if not path.is_file():
+    if not (folder / "sample_annotation.json").is_file():
         return [], ["no annotations in this release: everything counts as static"]
-    annotations = release.those("sample_annotation", "sample_token", set(samples))
-    instances = release.those("instance", "token", {str(r.get("instance_token")) for r in annotations.rows.values()})
-    categories = release.all_of("category")
-    attributes = release.all_of("attribute") if release.path("attribute").is_file() else None
+    annotations = _those(folder, "sample_annotation", "sample_token", set(samples))
+    instances = _those(folder, "instance", "token", {str(r.get("instance_token")) for r in annotations.rows.values()})
+    categories = _all_of(folder, "category")
+    attributes = _all_of(folder, "attribute") if (folder / "attribute.json").is_file() else None
     tracks = BoxTracks(annotations.where, LABELS, MAX_GAP_S)
     for row in annotations.rows.values():
         instance = instances.get(row, "instance_token", annotations.where)
