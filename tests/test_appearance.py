@@ -163,7 +163,7 @@ def begin(world, change=None, **options) -> tuple[fit.FitState, FitConfig]:
         method="street_gaussians", **{"iterations": 120, "initial_gaussians": 700, "densify": False, **options}
     )
     frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, None)
+    classes = fit_views.classes_of(scene, frames, {})
     recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
     recorded = tuple(map(change, recorded)) if change is not None else recorded
     return fit.start_state(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -246,7 +247,7 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
 def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
     scene = read_scene(world["scene"])
     frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, None)
+    classes = fit_views.classes_of(scene, frames, {})
     stored = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=False)
     start = fit_start.StartSettings(300, 0.15, 150.0, 0, True, True, False, 0)
     model = fit_start.start_model(scene, fused_cloud(FRAMES), stored, classes, start)
@@ -263,6 +264,18 @@ def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no finished folders"):
         fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "empty")
+
+
+def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
+    """The truth that `mudg score` keeps shows held-out frames: nothing may be fitted to it."""
+    sets = tmp_path / "sets"
+    shutil.copytree(world["virtual"], sets)
+    view = view_at(0.9, camera(width=30, height=20))
+    with ObservationWriter(sets / "front_recorded", "front_recorded", "truth", "recorded") as writer:
+        writer.add(replace(truth(view), kind="recorded"))
+    with pytest.raises(InputError, match=r"recorded views[\s\S]*front_recorded[\s\S]*mudg synthesize"):
+        fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=sets)
+    assert not (tmp_path / "fit").exists()
 
 
 def test_another_configuration_in_the_same_folder_is_refused(world, tmp_path):

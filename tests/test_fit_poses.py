@@ -32,7 +32,7 @@ def fitted(tmp_path_factory) -> fit.FitState:
         method="street_gaussians", iterations=60, initial_gaussians=1500, densify=False, semantic_every=999
     )
     frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, None)
+    classes = fit_views.classes_of(scene, frames, {})
     recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
     state = fit.start_state(
         config, fit.RECIPES[config.method], scene, fused_cloud(FRAMES), fit_views.ViewSet(recorded, ()), classes

@@ -200,7 +200,7 @@ def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
 def test_no_sky_at_all_and_nothing_but_sky(world, share):
     scene = read_scene(world["scene"])
     frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, None)
+    classes = fit_views.classes_of(scene, frames, {})
     views = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
     views = tuple(replace(view, sky=np.full(view.rgb.shape[:2], share > 0)) for view in views)
     config = settings("street_gaussians", iterations=4)

@@ -130,7 +130,7 @@ def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> 
     """Fit in memory; ``folder`` takes the log and the pictures."""
     recipe = fit.RECIPES[config.method]
     frames = training_frames(scene, config.cameras)
-    classes = classes_of(scene, frames, None) if config.semantics else ()
+    classes = classes_of(scene, frames, {}) if config.semantics else ()
     views = ViewSet(
         load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0), ()
     )

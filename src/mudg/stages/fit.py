@@ -36,6 +36,7 @@ from mudg.core import fused as kernels
 from mudg.core import losses, metrics
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
+from mudg.data.observations import ObservationSet
 from mudg.data.scene import read_scene
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
@@ -57,6 +58,7 @@ from mudg.stages.fitting.views import (
     load_virtual,
     offsets_from_path_m,
     training_frames,
+    virtual_sets,
 )
 
 VERSION = 1
@@ -103,15 +105,15 @@ def run(
 
     Raises:
         UsageError: a method with virtual views without ``observations``. NumericsError: a loss or gradient is not
-        finite. InputError: damaged inputs.
+        finite. InputError: damaged inputs, or recorded views among ``observations``.
     """
     recipe = RECIPES[config.method]
     if recipe.virtual and observations is None:
         raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and hand its folder on")
-    virtual = observations if recipe.virtual else None
+    virtual = virtual_sets(Path(observations)) if recipe.virtual and observations is not None else {}
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
-    if virtual is not None:
-        inputs["observations"] = store.digest(Path(virtual))
+    if virtual:
+        inputs["observations"] = store.digest(Path(observations))  # type: ignore[arg-type]
     if config.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
     folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
@@ -147,7 +149,9 @@ class FitState:
         return {"gaussians": len(self.model.table), "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def _prepare(config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Path, virtual: Path | None, out: Path) -> FitState:
+def _prepare(
+    config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Path, virtual: Mapping[str, ObservationSet], out: Path
+) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
     scene = read_scene(scene_path)
     frames = training_frames(scene, config.cameras)
@@ -155,7 +159,7 @@ def _prepare(config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Pa
     recorded = load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0)
     fused = read_fused(fused_path)
     shown: tuple[StoredView, ...] = ()
-    if virtual is not None:
+    if virtual:
         measured = fused_lidar(fused, scene.tracks) if config.virtual_lidar_weight else None
         shown = load_virtual(virtual, classes, measured)
     views = ViewSet(recorded, shown, offsets_from_path_m(recorded, shown))

@@ -7,7 +7,7 @@ gets is a function of (run seed, step) alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Sweep, Track, View
 from mudg.data import scene as scenefile
 from mudg.data.clips.condition import ConditionRules, project_sparse
-from mudg.data.observations import list_observation_sets, read_observations
+from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 
 MAX_LIDAR_M = 100.0
 NEAREST_SWEEP_S = 0.1
@@ -153,8 +153,8 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
     return frames
 
 
-def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Path | None) -> tuple[int, ...]:
-    """Train ids that occur in the labels of the frames (a sample of them) and in virtual views; sky always included.
+def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, ObservationSet]) -> tuple[int, ...]:
+    """Train ids that occur in the labels of the frames and in virtual views (a sample of both); sky always included.
 
     Empty when nothing is labelled.
     """
@@ -162,12 +162,10 @@ def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Path | None) -> t
     labelled = [frame for frame in frames if "semantics" in frame.labels]
     for frame in labelled[:: max(1, len(labelled) // 24)]:
         found |= set(np.unique(scenefile.read_label(scene, frame, "semantics")).tolist())
-    if virtual is not None:
-        for path in list_observation_sets(virtual).values():
-            observations = read_observations(path)
-            for index in range(0, len(observations), 6):
-                semantics = observations[index].semantics
-                found |= set() if semantics is None else set(torch.unique(semantics).tolist())
+    for observations in virtual.values():
+        for index in range(0, len(observations), 6):
+            semantics = observations[index].semantics
+            found |= set() if semantics is None else set(torch.unique(semantics).tolist())
     found -= {UNLABELLED}
     return tuple(sorted(found | {ID["sky"]})) if found else ()
 
@@ -207,20 +205,29 @@ def load_recorded(
     return tuple(stored)
 
 
-def load_virtual(
-    path: Path, classes: Sequence[int], measured: Callable[[View], LidarPixels] | None = None
-) -> tuple[StoredView, ...]:
-    """All observations below ``path``, with the sparse depth that ``measured`` gives for a view.
+def virtual_sets(path: Path) -> dict[str, ObservationSet]:
+    """The sets of virtual observations below ``path``, by name; only their indices are read.
 
     Raises:
-        InputError: no observation folder there, or a recorded one among them.
+        InputError: there is none, or one of them holds recorded views.
     """
-    sets = list_observation_sets(path)
+    sets = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
     if not sets:
         raise InputError("no finished folders of observations here", where=str(path), remedy="run `mudg synthesize` first")
+    for found in sets.values():
+        if found.kind == "recorded":
+            raise InputError("recorded views among the virtual ones: held-out truth must not be learnt from", where=str(found.path),
+                             expected="views of kind virtual", got=f"kind recorded, source {found.source}",
+                             remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
+    return sets
+
+
+def load_virtual(
+    sets: Mapping[str, ObservationSet], classes: Sequence[int], measured: Callable[[View], LidarPixels] | None = None
+) -> tuple[StoredView, ...]:
+    """All observations of these sets, with the sparse depth that ``measured`` gives for a view."""
     stored = []
-    for name, folder in sets.items():
-        observations = read_observations(folder)
+    for name, observations in sets.items():
         for index in range(len(observations)):
             seen = observations[index]
             lidar = None if measured is None else measured(seen.view)
