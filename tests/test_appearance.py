@@ -12,12 +12,12 @@ from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError
-from mudg.core.fused import adam_columns
+from mudg.core.native_ops import adam_columns
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import torch_adam_columns
 from mudg.data.scene import read_scene
 from mudg.models.scene.appearance import Appearance, owner, rigid_motion
-from mudg.models.scene.nodes import compose
+from mudg.models.scene.model import compose
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting import views as fit_views

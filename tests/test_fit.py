@@ -8,7 +8,6 @@ import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +24,8 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_scene
-from mudg.models.scene.nodes import RigidNode, SceneModel
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting import start as fit_start
@@ -313,7 +313,7 @@ class Named:
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def sample(self, unseen=None) -> str:
+    def sample(self) -> str:
         return self.name
 
 
@@ -334,28 +334,6 @@ def test_virtual_views_beside_recorded_ones_take_nothing_from_them():
     assert [step[0] for step in beside] == [views.choose(7, step, 0.0)[0] for step in range(200)]
     assert [step[-1] for step in beside] == [step[-1] for step in alone]
     assert {len(step) for step in beside} == {1, 2}
-
-
-def test_virtual_views_join_from_near_to_far():
-    views = fit_views.ViewSet(tuple(map(Named, "ab")), tuple(map(Named, "wxyz")), (2.0, 2.01, 3.0, 4.0))
-    draws = lambda reach: {views.choose(3, step, 1.0, reach_m=reach)[0] for step in range(80)}  # noqa: E731
-    assert draws(2.0) == {"w", "x"}
-    assert draws(3.2) == {"w", "x", "y"}
-    assert draws(float("inf")) == set("wxyz")
-    config = settings("mudg_s", iterations=100, virtual_start=0.2, virtual_grow=0.4)
-    reach = [fit._virtual_reach_m(views, config, step) for step in (1, 20, 40, 60, 90)]
-    assert reach == pytest.approx([2.0, 2.0, 3.0, 4.0, 4.0])
-    assert fit._virtual_reach_m(views, settings("mudg_s"), 1) == float("inf")
-
-
-def test_offsets_are_distances_from_the_same_cameras_path():
-    named = lambda x, y, name: SimpleNamespace(  # noqa: E731
-        view=SimpleNamespace(center_world=np.array([x, y, 1.0]), camera=SimpleNamespace(name=name))
-    )
-    recorded = [named(x, 0.0, "front") for x in range(4)] + [named(0.0, 7.0, "left")]
-    virtual = [named(2.0, 3.0, "front"), named(0.0, 8.0, "left"), named(1.0, 2.0, "other")]
-    assert fit_views.offsets_from_path_m(recorded, virtual) == pytest.approx((3.0, 1.0, 2.0))
-    assert fit_views.offsets_from_path_m(recorded, ()) == ()
 
 
 def test_fused_points_give_depth_beside_the_path(world):

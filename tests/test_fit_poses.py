@@ -12,7 +12,7 @@ from mudg.base.config import to_dict
 from mudg.bench.poses import pose_errors
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.scene import read_scene
-from mudg.models.scene.nodes import compose
+from mudg.models.scene.model import compose
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting import poses as fit_poses

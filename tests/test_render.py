@@ -102,7 +102,7 @@ def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     row, column = int(uv[0, 1]), int(uv[0, 0])
     assert with_car.semantics[row, column] == ID["car"]
     assert seen.semantics[row, column] != ID["car"]
-    with pytest.raises(UsageError, match="no moving object 'tram'"):
+    with pytest.raises(UsageError, match="no dynamic object 'tram'"):
         render.run(RenderConfig(remove_tracks=("tram",)), world["scene"], world["model"], tmp_path / "other")
 
 

@@ -35,7 +35,8 @@ from mudg.core.fusion import fuse_sweeps
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.city import CityConfig, write_city
 from mudg.data.scene import read_image, read_label, read_scene
-from mudg.models.scene.nodes import RigidNode, SceneModel
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, FitConfig, FuseConfig
 from mudg.stages.fitting.views import ViewSet, classes_of, load_recorded, training_frames

@@ -82,7 +82,7 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
 
-    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.fused.photometric`` computes the same value and
+    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes the same value and
     gradient in one native pass.
     """
     if weight is not None:
@@ -171,7 +171,7 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
 def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
 
-    ``core.fused.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
+    ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
     """
     if lift is not None:
         logits = logits.index_add(0, torch.tensor([lift[0]], device=logits.device), lift[1].detach()[None].to(logits.dtype))

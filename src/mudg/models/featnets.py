@@ -25,8 +25,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mudg.base.errors import InputError
-from mudg.core.fused import box_mean
 from mudg.core.metrics import Pair, distance_to_units, unit_features
+from mudg.core.native_ops import box_mean
 from mudg.models.mdm.codec import PatchCodec
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))

@@ -28,12 +28,11 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from mudg.base import checkpoint, log, palette, seeds, store
+from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
-from mudg.core import fused as kernels
-from mudg.core import losses, metrics
+from mudg.core import losses, metrics, native_ops
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet
@@ -41,7 +40,8 @@ from mudg.data.scene import read_scene
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
 from mudg.models.scene.mcmc import McmcSettings, drift, relocate_and_grow
-from mudg.models.scene.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky, sky_lift
+from mudg.models.scene.model import SceneModel, compose, composite_semantics, composite_sky, sky_lift
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
@@ -56,12 +56,11 @@ from mudg.stages.fitting.views import (
     fused_lidar,
     load_recorded,
     load_virtual,
-    offsets_from_path_m,
     training_frames,
     virtual_sets,
 )
 
-VERSION = 1
+VERSION = 2
 PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
@@ -140,8 +139,6 @@ class FitState:
     step: int
     seconds: float = 0.0
     last: Mapping[str, float] | None = None
-    unseen: Tensor | None = None
-    """u8[V, H, W] of the virtual views: 1 where no recorded view saw what they show; None before they join."""
     appearance: Appearance = field(default_factory=lambda: Appearance({}))
 
     def summary(self) -> dict[str, Any]:
@@ -162,16 +159,15 @@ def _prepare(
     if virtual:
         measured = fused_lidar(fused, scene.tracks) if config.virtual_lidar_weight else None
         shown = load_virtual(virtual, classes, measured)
-    views = ViewSet(recorded, shown, offsets_from_path_m(recorded, shown))
+    views = ViewSet(recorded, shown)
     schedule = densify_schedule(config)
     found = checkpoint.latest(out / "steps")
     if found is not None:
         model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
         log.info(f"continuing at step {found.step} of {config.iterations}")
         stats = DensifyStats.from_state(found.tensors("stats"))
-        unseen = found.tensors("unseen").get("maps") if found.state["virtual"] else None
         appearance = Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
-        return FitState(model, views, stats, schedule, found.step, float(found.state["seconds"]), found.state["last"], unseen, appearance)
+        return FitState(model, views, stats, schedule, found.step, float(found.state["seconds"]), found.state["last"], appearance)
     return start_state(config, recipe, scene, fused, views, classes)
 
 
@@ -181,7 +177,7 @@ def start_state(
     """The state that a fit starts from: a model built from the fused cloud, nothing corrected yet."""
     start = StartSettings(
         config.initial_gaussians, config.voxel_m, config.far_m, config.sh_degree, recipe.objects, recipe.sky,
-        config.learn_poses, config.seed, config.deformable, config.color_terms, config.mirror_start, config.outlier_deviations,
+        config.learn_poses, config.seed, config.deformable, config.mirror_start,
     )  # fmt: skip
     model = start_model(scene, cloud, views.recorded, classes, start)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
@@ -207,18 +203,14 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
-            if step > virtual_from and state.unseen is None and state.views.virtual:
-                state.unseen = admit_virtual_views(state, config, raster)
+            if step - 1 <= virtual_from < step and state.views.virtual and config.virtual_gaussians:
+                start_unseen_gaussians(state, config, raster)
             probability = config.virtual_probability if virtual_from < step <= virtual_to else 0.0
-            reach_m = _virtual_reach_m(state.views, config, step)
-            samples = state.views.choose(config.seed, step, probability, state.unseen, reach_m, config.virtual_beside)
+            samples = state.views.choose(config.seed, step, probability, config.virtual_beside)
             learnt = [_learn_from(state, sample, config, raster, perception, step, index) for index, sample in enumerate(samples)]
             (render, terms), sample = learnt[0], samples[0]
-            visible = render.trace.visible
-            for other, _ in learnt[1:]:
-                visible = visible | other.trace.visible
-            adam_step(state.model, step, config, visible)
-            state.appearance.adam_step(step, appearance_rates(step, config.iterations), kernels.adam_columns)
+            adam_step(state.model, step, config.iterations)
+            state.appearance.adam_step(step, appearance_rates(step, config.iterations), native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.longest_to_middle)
                 settle_nodes(state.model, config, step)
@@ -258,7 +250,7 @@ def _learn_from(
     wanted = recorded or config.virtual_densify
     growing = wanted and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
     with_classes = not recorded or step % config.semantic_every == 0
-    gaussians = compose(state.model, observation.view.time_s, None, with_classes, recorded and shows_mirrored(config, step))
+    gaussians = compose(state.model, observation.view.time_s, with_classes)
     pose = state.appearance.world_from_cam(observation.view, sample.name) if recorded else None
     render = rasterize(gaussians, observation.view, raster, absgrad=growing, world_from_cam=pose)
     terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception, state.appearance)
@@ -273,33 +265,14 @@ def _learn_from(
     return render, terms
 
 
-def _virtual_reach_m(views: ViewSet, config: FitConfig, step: int) -> float:
-    """How far from the recorded path virtual views may be at a step, metres: grows from the nearest one to all of them."""
-    if not views.virtual or not config.virtual_grow:
-        return math.inf
-    nearest, farthest = min(views.offsets_m), max(views.offsets_m)
-    along = (step / config.iterations - config.virtual_start) / config.virtual_grow
-    return nearest + (farthest - nearest) * min(max(along, 0.0), 1.0)
-
-
-def admit_virtual_views(state: FitState, config: FitConfig, raster: RasterConfig) -> Tensor:
-    """Before virtual views join: work out what only they see, and start Gaussians there (see ``fit_trust``).
-
-    Returns:
-        Maps u8[V, H, W], 1 where no recorded view saw what a virtual view shows; padded to the largest view.
-    """
+def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
+    """When virtual views join: start Gaussians at the surfaces that only they show (see ``fitting/trust.py``)."""
     maps = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
-    if config.virtual_gaussians:
-        columns, labels = unseen_rows(state.model, state.views.virtual, maps, config.virtual_gaussians, config.seed)
-        state.model.table.append(columns, labels)
-        state.model.sort_rows()
-        state.stats = DensifyStats.zeros(len(state.model.table))
-    height, width = (max(size) for size in zip(*(found.shape for found in maps)))
-    stacked = torch.zeros(len(maps), height, width, dtype=torch.uint8)
-    for index, found in enumerate(maps):
-        stacked[index, : found.shape[0], : found.shape[1]] = torch.from_numpy(found)
+    columns, labels = unseen_rows(state.model, state.views.virtual, maps, config.virtual_gaussians, config.seed)
+    state.model.table.append(columns, labels)
+    state.model.sort_rows()
+    state.stats = DensifyStats.zeros(len(state.model.table))
     log.info(f"virtual views: {float(np.mean([found.mean() for found in maps])):.0%} of their pixels show what no recorded view saw")
-    return stacked
 
 
 def recorded_terms(
@@ -314,14 +287,14 @@ def recorded_terms(
     rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
     rgb = rgb if appearance is None else appearance.colored(rgb, sample.name, seen.kind)
     rgb = losses.outside_mask_copied(rgb, seen.rgb, None if seen.mask.all() else seen.mask)
-    terms = {"color": kernels.photometric(rgb, seen.rgb, config.ssim_weight)}
+    terms = {"color": native_ops.photometric(rgb, seen.rgb, config.ssim_weight)}
     if sample.lidar is not None and len(sample.lidar.pixel) and config.lidar_weight:
         terms["lidar"] = config.lidar_weight * losses.sparse_depth(render.depth, sample.lidar.pixel, sample.lidar.depth_m)
     if sample.sky is not None and config.sky_weight and model.sky is not None:
         terms["sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), labels)
     if render.extra is not None and seen.semantics is not None and config.semantic_weight:
         total = max(float(labels.sum()), 1e-12) / config.semantic_weight
-        terms["semantics"] = kernels.class_loss(render.extra, seen.semantics, labels[0], total, sky_lift(model, render.alpha))
+        terms["semantics"] = native_ops.class_loss(render.extra, seen.semantics, labels[0], total, sky_lift(model, render.alpha))
     return terms
 
 
@@ -331,12 +304,12 @@ def virtual_terms(
     """Weighted loss terms of a virtual view, every pixel weighted by the observation's confidence."""
     seen = sample.observation
     sure = seen.confidence if config.virtual_confidence_power == 1 else seen.confidence**config.virtual_confidence_power
-    weight = sure * seen.mask * torch.where(sample.unseen, 1.0, config.virtual_seen_weight)
+    weight = sure * seen.mask
     rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
     rgb = rgb if appearance is None else appearance.colored(rgb, sample.name, seen.kind)
     terms: dict[str, Tensor] = {}
     if config.virtual_color_weight:
-        terms["virtual_color"] = config.virtual_color_weight * kernels.photometric(rgb, seen.rgb, config.virtual_ssim_weight, weight[0])
+        terms["virtual_color"] = config.virtual_color_weight * native_ops.photometric(rgb, seen.rgb, config.virtual_ssim_weight, weight[0])
     if config.virtual_perceptual_weight:
         terms["virtual_perceptual"] = config.virtual_perceptual_weight * perception(rgb, seen.rgb, weight)
     if seen.depth is not None and config.virtual_depth_weight:
@@ -350,7 +323,7 @@ def virtual_terms(
         terms["virtual_sky"] = config.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, sample.sky), weight)
     if render.extra is not None and seen.semantics is not None and config.virtual_semantic_weight:
         total, lift = weight[0].numel() / config.virtual_semantic_weight, sky_lift(model, render.alpha)
-        terms["virtual_semantics"] = kernels.class_loss(render.extra, seen.semantics, weight[0], total, lift)
+        terms["virtual_semantics"] = native_ops.class_loss(render.extra, seen.semantics, weight[0], total, lift)
     return terms
 
 
@@ -387,12 +360,6 @@ def correction_terms(
 def _settled(schedule: DensifySettings | McmcSettings | None, step: int) -> bool:
     """Whether the number of Gaussians does not change any more after a step."""
     return schedule is None or step > schedule.stop
-
-
-def shows_mirrored(config: FitConfig, step: int) -> bool:
-    """Whether symmetric objects are shown mirrored at a step."""
-    probability = config.mirror_probability
-    return probability > 0 and float(seeds.numpy_rng(config.seed, step, "mirrored").random()) < probability
 
 
 def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
@@ -458,7 +425,6 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "semantics": 1e-2 * boost,
         "panorama": 1e-2 * gentle,
         "deform": 1e-3 * boost * gentle,
-        "sh_time": 2.5e-3 * boost * gentle,
     }
 
 
@@ -485,17 +451,11 @@ def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None
     )
 
 
-def adam_step(model: SceneModel, step: int, config: FitConfig, visible: Tensor) -> None:
-    """One Adam step on every table of the model, then gradients are dropped.
-
-    Args:
-        visible: bool[N], the Gaussians this step's view shows; with ``config.selective_adam`` the others rest.
-    """
-    rates = learning_rates(step, config.iterations)
-    model.table.adam_step(step, rates, kernels.adam_columns, visible if config.selective_adam else None)
-    for table in model.node_tables().values():
-        table.adam_step(step, rates, kernels.adam_columns)
+def adam_step(model: SceneModel, step: int, iterations: int) -> None:
+    """One Adam step on every table of the model, then gradients are dropped."""
+    rates = learning_rates(step, iterations)
     for table in (model.table, *model.node_tables().values()):
+        table.adam_step(step, rates, native_ops.adam_columns)
         table.clear_gradients()
 
 
@@ -524,12 +484,9 @@ def save_checkpoint(state: FitState, folder: Path) -> None:
     """All that changes: model with moments, statistics, step."""
     values, groups = state.model.state()
     groups = {**groups, "stats": state.stats.state()}
-    if state.unseen is not None:
-        groups["unseen"] = {"maps": state.unseen}
     names, groups["appearance"] = state.appearance.state()
     groups["appearance"] = groups["appearance"] or {"none": torch.zeros(1)}
-    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "virtual": state.unseen is not None,
-             "appearance": names}  # fmt: skip
+    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "appearance": names}
     checkpoint.save(folder, state.step, groups, facts)
 
 

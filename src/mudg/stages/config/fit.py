@@ -45,8 +45,6 @@ class FitConfig:
     """Static points are thinned to one per cube of this size (finer close to the drive)."""
     far_m: float = Field(default=150.0, gt=1)
     """Distance of what is neither sky nor within LiDAR reach."""
-    selective_adam: bool = False
-    """Update only the Gaussians that a step's view shows."""
     learn_poses: bool = False
     """Correct the boxes of moving objects while fitting (offset and yaw per key)."""
     densify: Annotated[Literal["gradient", "mcmc", "none"], BeforeValidator(_densify_by_name)] = "gradient"
@@ -62,12 +60,8 @@ class FitConfig:
     """learn_poses: rounds of corrections, spread evenly up to 85 % of the iterations (0 = only take the noise out of the tracks)."""
     deformable: bool = True
     """Let people and cyclists change their shape within their boxes."""
-    color_terms: int = Field(default=0, ge=0, le=8)
-    """Sines and cosines by which the colour of moving objects may vary over time (published: 4; 0 = constant)."""
     mirror_start: bool = True
     """Start vehicles with their points mirrored to the side that nothing measured."""
-    mirror_probability: float = Field(default=0.0, ge=0, le=1)
-    """How often vehicles are shown mirrored while fitting, so that one side teaches the other."""
     exposure: Literal["none", "camera", "image"] = "none"
     """Learn an affine colour map per camera, or per recorded image; not used in renders."""
     exposure_weight: float = Field(default=0.01, ge=0)
@@ -76,8 +70,6 @@ class FitConfig:
     """Correct the pose of every recorded image while fitting; not used in renders."""
     virtual_appearance: bool = False
     """mudg_s: learn an affine colour map per set of virtual views, so that their colours do not reach the recorded path."""
-    outlier_deviations: float = Field(default=0.0, ge=0)
-    """Leave out starting points that lie lonelier than usual by so many standard deviations (0 = keep all)."""
     object_weight: float = Field(default=0.0, ge=0)
     """Moving objects decide, inside their boxes, between there and not there, and leave no haze outside (published: 0.1)."""
     ssim_weight: float = Field(default=0.2, ge=0, le=1)
@@ -97,11 +89,6 @@ class FitConfig:
     virtual_stop: float = Field(default=0.9, ge=0, le=1)
     """mudg_s: share of the iterations after which only recorded views are taken again, which gives the recorded path back what
     it lost."""
-    virtual_grow: float = Field(default=0.0, ge=0, le=1)
-    """mudg_s: share of the iterations over which virtual views farther and farther from the recorded path join (0 = all at once)."""
-    virtual_seen_weight: float = Field(default=1.0, ge=0, le=1)
-    """mudg_s: weight of virtual pixels whose surface a recorded view saw, beside 1 for those that none saw. Lower it for a
-    diffusion model that is worse than the scene fitted without it."""
     virtual_confidence_power: float = Field(default=1.0, ge=0)
     """mudg_s: every term of a virtual view is weighted by the observation's confidence to this power (0 = all pixels alike)."""
     virtual_gaussians: int = Field(default=8000, ge=0)

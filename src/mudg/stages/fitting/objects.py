@@ -13,7 +13,8 @@ from torch import Tensor
 
 from mudg.base import geometry
 from mudg.base.types import Gaussians, View
-from mudg.models.scene.nodes import RigidNode, SceneModel
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
 
 BOX_GROWTH = 1.05
 NEAREST_CORNER_M = 0.3

@@ -27,10 +27,12 @@ from torch import Tensor
 
 from mudg.base import geometry
 from mudg.base.types import Gaussians
+from mudg.core.quaternions import left_product_matrix
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.models.scene import motion
 from mudg.models.scene.appearance import Appearance
-from mudg.models.scene.nodes import RigidNode, SceneModel, compose, composite_sky, left_product_matrix
+from mudg.models.scene.model import SceneModel, compose, composite_sky
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages.fitting.objects import outline_mask
 from mudg.stages.fitting.views import StoredView
 

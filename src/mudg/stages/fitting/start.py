@@ -21,17 +21,10 @@ from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
 from mudg.core.table import Table
-from mudg.models.scene.nodes import (
-    RigidNode,
-    SceneModel,
-    SkyNode,
-    StaticNode,
-    box_grid,
-    columns_from_points,
-    neighbour_scale,
-    object_node,
-    voxel_filter,
-)  # fmt: skip
+from mudg.models.scene.initial import box_grid, columns_from_points, neighbour_scale, voxel_filter
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode, StaticNode, object_node
+from mudg.models.scene.sky import SkyNode
 from mudg.stages.fitting.views import StoredView
 
 UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation"))
@@ -56,9 +49,7 @@ class StartSettings:
     learn_poses: bool
     seed: int
     deformable: bool = False
-    color_terms: int = 0
     mirror: bool = False
-    outlier_deviations: float = 0.0
 
 
 def start_model(
@@ -83,9 +74,7 @@ def start_model(
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
     sky = _painted_sky(views) if settings.with_sky else None
     log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} objects")
-    moving = len(owner) - len(blocks[0]["means"])
-    partial = {"sh_time": torch.zeros(moving, settings.color_terms, 3)} if settings.color_terms and moving else {}
-    return SceneModel(Table(columns, {"node": owner}, partial), tuple(nodes), sky, classes, settings.sh_degree)
+    return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, settings.sh_degree)
 
 
 def _static_columns(
@@ -93,8 +82,6 @@ def _static_columns(
 ) -> Mapping[str, torch.Tensor]:
     centers = np.stack([view.view.center_world for view in views]).astype(np.float32)
     rows = _thinned(cloud.xyz, centers, settings)
-    if settings.outlier_deviations:
-        rows = rows[~_lonely(cloud.xyz[rows], centers, settings.outlier_deviations)]
     xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
     semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
     scale = neighbour_scale(xyz)
@@ -115,24 +102,6 @@ def _thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], settings: S
             return rows
         size = size * np.clip((len(rows) / settings.initial_gaussians) ** 0.5, 1.08, 2.0)
     return rows[np.sort(seeds.numpy_rng(settings.seed, 0, "thin").permutation(len(rows))[: settings.initial_gaussians])]
-
-
-def _lonely(xyz: NDArray[np.float32], centers: NDArray[np.float32], deviations: float, neighbours: int = 6) -> NDArray[np.bool_]:
-    """Bool[N]: points whose neighbours are unusually far for their distance from the drive.
-
-    The mean distance to the nearest neighbours grows with the range and has a long tail, so its logarithm is compared with the
-    mean and spread (median and quartiles, which outliers do not move) of points in the same band of range.
-    """
-    if len(xyz) <= neighbours:
-        return np.zeros(len(xyz), bool)
-    apart = np.log(cKDTree(xyz).query(xyz, k=neighbours + 1, workers=1)[0][:, 1:].mean(1) + 1e-6)
-    band = np.round(2 * np.log2(1 + cKDTree(centers).query(xyz, k=1, workers=1)[0])).astype(int)
-    lonely = np.zeros(len(xyz), bool)
-    for one in np.unique(band):
-        mine = band == one
-        low, middle, high = np.percentile(apart[mine], (25, 50, 75))
-        lonely[mine] = apart[mine] > middle + deviations * max((high - low) / 1.349, 1e-3)
-    return lonely
 
 
 def mirrored_points(xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

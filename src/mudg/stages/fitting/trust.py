@@ -21,7 +21,9 @@ from mudg.base import geometry, log, seeds
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.models.scene.nodes import RigidNode, SceneModel, columns_from_points, compose, voxel_filter
+from mudg.models.scene.initial import columns_from_points, voxel_filter
+from mudg.models.scene.model import SceneModel, compose
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages.fitting.views import StoredView
 
 WITNESSES = 36

@@ -6,7 +6,6 @@ gets is a function of (run seed, step) alone.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,8 +29,6 @@ NEAREST_SWEEP_S = 0.1
 OCCLUSION_CELL_PX = (8, 3)
 """Columns and rows of the neighbourhood in which a nearer point hides a farther one (rows: about one beam apart)."""
 OCCLUSION_MARGIN = 0.15
-NEXT_TO_M = 0.05
-"""Distances from the recorded path that differ by less are the same distance."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +48,12 @@ class Sample:
         observation: semantics hold *channel numbers* of the model's classes here (255 = unlabelled).
         sky: bool[1, H, W] or None if unknown.
         lidar: or None.
-        unseen: bool[1, H, W] of a virtual view: no recorded view saw what it shows here.
     """
 
     name: str
     observation: Observation
     sky: Tensor | None
     lidar: LidarPixels | None
-    unseen: Tensor
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,8 @@ class StoredView:
     depth: NDArray[np.float32] | None = None
     confidence: NDArray[np.uint8] | None = None
 
-    def sample(self, unseen: Tensor | None = None) -> Sample:
-        """The view as tensors; ``unseen`` u8, at least [H, W] (None: all of it)."""
+    def sample(self) -> Sample:
+        """The view as tensors."""
         height, width = self.rgb.shape[:2]
         everywhere = torch.ones(1, height, width)
         observation = Observation(
@@ -93,38 +88,27 @@ class StoredView:
             source=self.source,
         )
         sky = None if self.sky is None else torch.from_numpy(self.sky)[None]
-        unseen = everywhere.bool() if unseen is None else unseen[None, :height, :width].bool()
-        return Sample(self.name, observation, sky, self.lidar, unseen)
+        return Sample(self.name, observation, sky, self.lidar)
 
 
 @dataclass(frozen=True)
 class ViewSet:
-    """All views of a fit. ``virtual`` may be empty; ``offsets_m``: how far each of them is from the recorded path."""
+    """All views of a fit. ``virtual`` may be empty."""
 
     recorded: tuple[StoredView, ...]
     virtual: tuple[StoredView, ...]
-    offsets_m: tuple[float, ...] = ()
 
-    def choose(
-        self, run_seed: int, step: int, virtual_probability: float, unseen: Tensor | None = None, reach_m: float = math.inf,
-        beside: bool = False,
-    ) -> tuple[Sample, ...]:  # fmt: skip
+    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[Sample, ...]:
         """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
 
         Recorded views come in a fresh random order per round, so that every one is seen equally often.
 
         Args:
-            unseen: u8[V, H, W], what only the virtual views see (see ``fit_trust``).
-            reach_m: virtual views farther than this from the recorded path are not taken yet.
             beside: the virtual view comes after the recorded one, not in its place.
         """
         generator = seeds.numpy_rng(run_seed, step, "view")
         if self.virtual and generator.random() < virtual_probability:
-            within = range(len(self.virtual))
-            if math.isfinite(reach_m):
-                within = [i for i, offset in enumerate(self.offsets_m) if offset <= reach_m + NEXT_TO_M]
-            index = within[int(generator.integers(len(within)))]
-            drawn = self.virtual[index].sample(None if unseen is None else unseen[index])
+            drawn = self.virtual[int(generator.integers(len(self.virtual)))].sample()
             return (self._recorded_of(run_seed, step), drawn) if beside else (drawn,)
         return (self._recorded_of(run_seed, step),)
 
@@ -233,20 +217,6 @@ def load_virtual(
             lidar = None if measured is None else measured(seen.view)
             stored.append(replace(stored_observation(f"{name}/{index:06d}", seen, classes), lidar=lidar))
     return tuple(stored)
-
-
-def offsets_from_path_m(recorded: Sequence[StoredView], virtual: Sequence[StoredView]) -> tuple[float, ...]:
-    """Distance of each virtual view from the nearest recorded one of the same camera (of any, if it recorded nothing)."""
-    if not virtual:
-        return ()
-    every = np.stack([view.view.center_world for view in recorded])
-    names = [view.view.camera.name for view in recorded]
-    found = []
-    for view in virtual:
-        own = [name == view.view.camera.name for name in names]
-        centres = every[own] if any(own) else every
-        found.append(float(np.linalg.norm(centres - view.view.center_world, axis=1).min()))
-    return tuple(found)
 
 
 def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
