@@ -29,7 +29,7 @@ from mudg.core.raster import cpu as raster_cpu
 from mudg.data.city.config import CityConfig
 from mudg.models.scene.densify import DensifyStats
 from mudg.stages import fit, fuse, ingest
-from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
+from mudg.stages.config import DensifyConfig, FitConfig, FuseConfig, IngestConfig
 from mudg.stages.fitting.views import ViewSet
 
 FORWARD = ("project", "sort", "bin", "blend")
@@ -119,7 +119,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     config = FitConfig(
         method="street_gaussians",
         iterations=options.iterations,
-        densify=options.densify,
+        densify=DensifyConfig(kind=options.densify),
         checkpoint_every=1_000_000,
         preview_every=1_000_000,
     )
@@ -146,7 +146,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         fit.run(config, scene, fused, Path(folder) / "fit")
     clock.seconds["rest"] += taken["seconds"] - sum(clock.seconds.values())
     return {
-        **taken, "iterations": config.iterations, "densify": config.densify, "frames": options.frames, "cameras": options.cameras,
+        **taken, "iterations": config.iterations, "densify": config.densify.kind, "frames": options.frames, "cameras": options.cameras,
         "size": options.size, "threads": options.threads, "clock": "processor" if options.threads == 1 else "wall",
         "isa": native.isa(), "it_per_s": taken["steps"] / taken["seconds"],
         "ms": {part: 1e3 * value / taken["steps"] for part, value in clock.seconds.items()},

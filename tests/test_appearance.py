@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
@@ -20,7 +21,6 @@ from mudg.models.scene.appearance import Appearance, owner, rigid_motion
 from mudg.models.scene.model import compose
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
-from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.objects import boxes_in_view, convex_outline, objects_only
 
 SIZE = (60, 40)
@@ -159,16 +159,13 @@ def world(tmp_path_factory):
 
 def begin(world, change=None, **options) -> tuple[fit.FitState, FitConfig]:
     scene, cloud = world
-    config = FitConfig(
-        method="street_gaussians", **{"iterations": 120, "initial_gaussians": 700, "densify": False, **options}
+    config = fit_config(
+        method="street_gaussians", **{"iterations": 120, "start__gaussians": 700, "densify__kind": "none", **options}
     )
-    frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, {})
-    recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
-    recorded = tuple(map(change, recorded)) if change is not None else recorded
-    return fit.start_state(
-        config, fit.RECIPES[config.method], scene, cloud, fit_views.ViewSet(recorded, ()), classes
-    ), config
+    views, classes = fit.recorded_views(config, scene)
+    if change is not None:
+        views = replace(views, recorded=tuple(map(change, views.recorded)))
+    return fit.start_state(config, scene, cloud, views, classes), config
 
 
 def optimised(state, config, tmp_path):
@@ -190,7 +187,7 @@ def darker_left(stored):
 @pytest.mark.slow
 def test_different_exposures_are_recovered(world, tmp_path):
     """The ratio of both cameras' maps comes near the injected one, and the fit explains the pictures better."""
-    state, config = begin(world, darker_left, exposure="camera", iterations=240)
+    state, config = begin(world, darker_left, appearance__exposure="camera", iterations=240)
     optimised(state, config, tmp_path / "learnt")
     grey = torch.full((3, 1, 1), 0.5)
     front, left = (
@@ -216,7 +213,7 @@ def test_boxes_of_objects_in_a_view(world):
 
 
 def test_output_shows_no_correction(world):
-    state, _ = begin(world, exposure="image", learn_cameras=True)
+    state, _ = begin(world, appearance__exposure="image", appearance__cameras=True)
     view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
     before = fit.render_view(state.model, view, RasterConfig()).rgb
     with torch.no_grad():

@@ -9,7 +9,7 @@ from test_score_metrics import lpips_state
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.core import losses, metrics
-from mudg.stages.config import FitConfig
+from mudg.stages.config import VirtualConfig
 from mudg.stages.fitting.perception import perception_of
 
 
@@ -35,7 +35,7 @@ def test_gradient_of_the_loss():
 def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
     path = tmp_path / "lpips.safetensors"
     store.write_safetensors(path, {key: value.numpy() for key, value in lpips_state().items()})
-    perception = perception_of(FitConfig(virtual_perception=name, lpips_weights=str(path)))
+    perception = perception_of(VirtualConfig(perception=name, lpips_weights=str(path)))
     truth = random(1, 3, 48, 64).float()
     everywhere = torch.ones(1, 48, 64)
     assert perception(truth, truth, everywhere).item() == pytest.approx(0, abs=1e-6)
@@ -50,7 +50,7 @@ def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
 
 def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
     with pytest.raises(UsageError, match="file of its weights"):
-        perception_of(FitConfig(virtual_perception="lpips"))
+        perception_of(VirtualConfig(perception="lpips"))
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
     with pytest.raises(InputError, match="incomplete"):
-        perception_of(FitConfig(virtual_perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))
+        perception_of(VirtualConfig(perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry, store
@@ -14,9 +15,7 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import compose
 from mudg.stages import fit
-from mudg.stages.config import FitConfig
 from mudg.stages.fitting import poses as fit_poses
-from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.objects import outline_mask
 
 SIZE, FRAMES = (96, 64), 6
@@ -28,15 +27,10 @@ def fitted(tmp_path_factory) -> fit.FitState:
     """A toy street fitted with exact boxes."""
     root = tmp_path_factory.mktemp("world")
     scene = read_scene(write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1]).root)
-    config = FitConfig(
-        method="street_gaussians", iterations=60, initial_gaussians=1500, densify=False, semantic_every=999
+    config = fit_config(
+        method="street_gaussians", iterations=60, start__gaussians=1500, densify__kind="none", loss__semantic_every=999
     )
-    frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, {})
-    recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
-    state = fit.start_state(
-        config, fit.RECIPES[config.method], scene, fused_cloud(FRAMES), fit_views.ViewSet(recorded, ()), classes
-    )
+    state = fit.start_state(config, scene, fused_cloud(FRAMES), *fit.recorded_views(config, scene))
     fit.optimise(state, config, store.RunDir.open(root / "fit", "fit", to_dict(config), {}, 1, False))
     return state
 
@@ -118,7 +112,7 @@ def test_poses_that_are_not_learnt_stay(fitted):
 
 
 def test_rounds_are_spread_over_the_run():
-    config = FitConfig(method="street_gaussians", iterations=200, learn_poses=True, pose_rounds=4, pose_start=0.25)
+    config = fit_config(method="street_gaussians", iterations=200, poses__learn=True, poses__rounds=4, poses__start=0.25)
     assert [step for step in range(1, 201) if fit.pose_round_due(config, step)] == [50, 90, 130, 170]
-    off = FitConfig(method="street_gaussians", iterations=200, pose_rounds=4)
+    off = fit_config(method="street_gaussians", iterations=200, poses__rounds=4)
     assert not any(fit.pose_round_due(off, step) for step in range(1, 201))

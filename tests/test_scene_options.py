@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base.errors import InputError, NumericsError
@@ -29,8 +30,8 @@ from mudg.stages.ingest import add_frame_copy, add_rest
 
 SIZE, FRAMES = (60, 40), 6
 EVERYTHING = {
-    "learn_poses": True, "deformable": True, "mirror_start": True, "exposure": "image", "learn_cameras": True,
-    "virtual_appearance": True, "object_weight": 0.1, "pose_start": 0.3,
+    "poses__learn": True, "poses__start": 0.3, "objects__deformable": True, "objects__mirror_start": True,
+    "appearance__exposure": "image", "appearance__cameras": True, "appearance__virtual": True, "loss__object_weight": 0.1,
 }  # fmt: skip
 
 
@@ -70,9 +71,9 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:
-    small = {"iterations": 30, "initial_gaussians": 700, "max_gaussians": 1200, "checkpoint_every": 1000, "preview_every": 1000,
-             "virtual_probability": 0.4}  # fmt: skip
-    return FitConfig(method=method, **{**small, **EVERYTHING, **changes})
+    small = {"iterations": 30, "start__gaussians": 700, "densify__max_gaussians": 1200, "checkpoint_every": 1000, "preview_every": 1000,
+             "virtual__probability": 0.4}  # fmt: skip
+    return fit_config(method=method, **{**small, **EVERYTHING, **changes})
 
 
 def fitted_bytes(folder: Path) -> dict[str, bytes]:
@@ -134,11 +135,11 @@ def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(worl
     for own in (False, True):
         config = settings(
             iterations=150,
-            exposure="none",
-            learn_cameras=False,
-            learn_poses=False,
-            virtual_appearance=own,
-            virtual_beside=False,  # where the recorded path gives steps away, it suffers most
+            appearance__exposure="none",
+            appearance__cameras=False,
+            poses__learn=False,
+            appearance__virtual=own,
+            virtual__beside=False,  # where the recorded path gives steps away, it suffers most
         )
         folder = fit.run(config, world["scene"], world["fuse"], tmp_path / str(own), observations=tmp_path / "dark")
         view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
@@ -182,28 +183,25 @@ def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_no_sky_at_all_and_nothing_but_sky(world, share):
     scene = read_scene(world["scene"])
-    frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, {})
-    views = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
-    views = tuple(replace(view, sky=np.full(view.rgb.shape[:2], share > 0)) for view in views)
     config = settings("street_gaussians", iterations=4)
-    cloud = fused_cloud(FRAMES)
-    state = fit.start_state(config, fit.RECIPES[config.method], scene, cloud, fit_views.ViewSet(views, ()), classes)
+    views, classes = fit.recorded_views(config, scene)
+    recorded = tuple(replace(view, sky=np.full(view.rgb.shape[:2], share > 0)) for view in views.recorded)
+    state = fit.start_state(config, scene, fused_cloud(FRAMES), replace(views, recorded=recorded), classes)
     assert torch.isfinite(state.model.sky.table["panorama"]).all()
-    seen = fit.render_view(state.model, views[0].view, RasterConfig())
+    seen = fit.render_view(state.model, recorded[0].view, RasterConfig())
     assert torch.isfinite(seen.rgb).all()
 
 
 def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
-    sample = fit_views.StoredView.sample
+    sample = fit_views.StoredView.as_tensors
 
     def poisoned(self):
         made = sample(self)
         if made.name == "front/000002":
-            made.observation.rgb[0, 3, 4] = float("nan")
+            made.rgb[0, 3, 4] = float("nan")
         return made
 
-    monkeypatch.setattr(fit_views.StoredView, "sample", poisoned)
+    monkeypatch.setattr(fit_views.StoredView, "as_tensors", poisoned)
     with pytest.raises(NumericsError, match=r"view front/000002, step \d"):
         fit.run(settings("street_gaussians"), world["scene"], world["fuse"], tmp_path / "fit")
 

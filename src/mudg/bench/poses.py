@@ -38,8 +38,15 @@ from mudg.data.scene import read_image, read_label, read_scene
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
-from mudg.stages.config import BenchConfig, FitConfig, FuseConfig
-from mudg.stages.fitting.views import ViewSet, classes_of, load_recorded, training_frames
+from mudg.stages.config import (
+    BenchConfig,
+    DensifyConfig,
+    FitConfig,
+    FuseConfig,
+    PoseConfig,
+    RecordedLossConfig,
+    StartConfig,
+)
 from mudg.stages.fuse import rules_of, scene_sweeps
 
 LISTS: dict[str, tuple[int, ...]] = {
@@ -96,9 +103,9 @@ def _rows_of_case(config: BenchConfig, scene: Scene, city: int, kind: str, out: 
 def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
     """A small, quick fit with poses "fixed", "learnt", or only "smoothed"."""
     return FitConfig(
-        method="street_gaussians", iterations=config.pose_iterations, learn_poses=poses != "fixed",
-        pose_rounds=0 if poses == "smoothed" else FitConfig().pose_rounds, initial_gaussians=8000, densify=False,
-        semantic_every=1000, preview_every=10**6, checkpoint_every=10**6, seed=config.seed,
+        method="street_gaussians", iterations=config.pose_iterations, seed=config.seed, preview_every=10**6, checkpoint_every=10**6,
+        start=StartConfig(gaussians=8000), densify=DensifyConfig(kind="none"), loss=RecordedLossConfig(semantic_every=1000),
+        poses=PoseConfig(learn=poses != "fixed", rounds=0 if poses == "smoothed" else PoseConfig().rounds),
     )  # fmt: skip
 
 
@@ -129,13 +136,7 @@ def disturbed(tracks: tuple[Track, ...], kind: str, seed: int) -> tuple[Track, .
 
 def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> fit.FitState:
     """Fit in memory; ``folder`` takes the log and the pictures."""
-    recipe = fit.RECIPES[config.method]
-    frames = training_frames(scene, config.cameras)
-    classes = classes_of(scene, frames, {}) if config.semantics else ()
-    views = ViewSet(
-        load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0), ()
-    )
-    state = fit.start_state(config, recipe, scene, cloud, views, classes)
+    state = fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene))
     run = store.RunDir.open(folder, "fit", to_dict(config), {}, fit.VERSION, overwrite=True)
     fit.optimise(state, config, run)
     return state

@@ -154,7 +154,7 @@ def _seeds_of(
         kept &= stored.confidence[row, column] >= SEED_CONFIDENCE * 255
     row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
-    channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channel is None else stored.channel[row, column]
+    channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channels is None else stored.channels[row, column]
     train_id = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))[np.minimum(channel, len(classes))]
     scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
     rgb = stored.rgb[row, column]

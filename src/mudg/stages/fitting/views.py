@@ -7,7 +7,7 @@ gets is a function of (run seed, step) alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch import Tensor
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import Frame, FusedCloud, Observation, Scene, Sweep, Track, View
+from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
 from mudg.data import scene as scenefile
 from mudg.data.clips.condition import ConditionRules, project_sparse
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
@@ -40,55 +40,64 @@ class LidarPixels:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """One view to learn from.
+class TrainView:
+    """One view as tensors, ready for a step.
 
     Args:
         name: e.g. ``front/000012`` or ``front_shift+2.0/000003``, for messages.
-        observation: semantics hold *channel numbers* of the model's classes here (255 = unlabelled).
+        kind: recorded or virtual.
+        rgb: f32[3, H, W] in [0, 1].
+        channels: i64[H, W], numbers of the model's class channels (255 = unlabelled), or None.
+        confidence: f32[1, H, W] in [0, 1]: of all that a virtual view shows, of the labels alone for a recorded one.
+        mask: bool[1, H, W], pixels that may be used at all.
         sky: bool[1, H, W] or None if unknown.
+        depth: f32[1, H, W] metres of a virtual view (NaN = none), or None.
         lidar: or None.
     """
 
     name: str
-    observation: Observation
+    view: View
+    kind: ObservationKind
+    rgb: Tensor
+    channels: Tensor | None
+    confidence: Tensor
+    mask: Tensor
     sky: Tensor | None
+    depth: Tensor | None
     lidar: LidarPixels | None
 
 
 @dataclass(frozen=True)
 class StoredView:
-    """One view in bytes: rgb u8[H, W, 3]; channel u8[H, W] or None; sky, mask bool[H, W] or None; depth f16 m (NaN = none)
-    of virtual views; confidence u8 of all a virtual view shows, of the labels alone for a recorded one (None = 1)."""
+    """A ``TrainView`` in bytes: rgb u8[H, W, 3]; channels u8[H, W]; sky, mask bool[H, W]; depth f32[H, W]; confidence u8[H, W] (255 =
+    1). None where there is none; no mask: all pixels, no confidence: 1."""
 
     name: str
     view: View
-    kind: str
-    source: str
+    kind: ObservationKind
     rgb: NDArray[np.uint8]
-    channel: NDArray[np.uint8] | None
-    sky: NDArray[np.bool_] | None
-    mask: NDArray[np.bool_] | None
+    channels: NDArray[np.uint8] | None = None
+    sky: NDArray[np.bool_] | None = None
+    mask: NDArray[np.bool_] | None = None
     lidar: LidarPixels | None = None
     depth: NDArray[np.float32] | None = None
     confidence: NDArray[np.uint8] | None = None
 
-    def sample(self) -> Sample:
-        """The view as tensors."""
-        height, width = self.rgb.shape[:2]
-        everywhere = torch.ones(1, height, width)
-        observation = Observation(
+    def as_tensors(self) -> TrainView:
+        """The view for a step."""
+        everywhere = torch.ones(1, *self.rgb.shape[:2])
+        return TrainView(
+            name=self.name,
             view=self.view,
-            rgb=torch.from_numpy(self.rgb).permute(2, 0, 1).float().div_(255),
-            depth=None if self.depth is None else torch.from_numpy(self.depth)[None],
-            semantics=None if self.channel is None else torch.from_numpy(self.channel).long(),
+            kind=self.kind,
+            rgb=torch.from_numpy(self.rgb).permute(2, 0, 1).contiguous().float().div_(255),
+            channels=None if self.channels is None else torch.from_numpy(self.channels).long(),
             confidence=everywhere if self.confidence is None else torch.from_numpy(self.confidence)[None].float().div_(255),
             mask=everywhere.bool() if self.mask is None else torch.from_numpy(self.mask)[None],
-            kind="recorded" if self.kind == "recorded" else "virtual",
-            source=self.source,
+            sky=None if self.sky is None else torch.from_numpy(self.sky)[None],
+            depth=None if self.depth is None else torch.from_numpy(self.depth)[None],
+            lidar=self.lidar,
         )
-        sky = None if self.sky is None else torch.from_numpy(self.sky)[None]
-        return Sample(self.name, observation, sky, self.lidar)
 
 
 @dataclass(frozen=True)
@@ -98,7 +107,7 @@ class ViewSet:
     recorded: tuple[StoredView, ...]
     virtual: tuple[StoredView, ...]
 
-    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[Sample, ...]:
+    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[TrainView, ...]:
         """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
 
         Recorded views come in a fresh random order per round, so that every one is seen equally often.
@@ -108,15 +117,15 @@ class ViewSet:
         """
         generator = seeds.numpy_rng(run_seed, step, "view")
         if self.virtual and generator.random() < virtual_probability:
-            drawn = self.virtual[int(generator.integers(len(self.virtual)))].sample()
+            drawn = self.virtual[int(generator.integers(len(self.virtual)))].as_tensors()
             return (self._recorded_of(run_seed, step), drawn) if beside else (drawn,)
         return (self._recorded_of(run_seed, step),)
 
-    def _recorded_of(self, run_seed: int, step: int) -> Sample:
+    def _recorded_of(self, run_seed: int, step: int) -> TrainView:
         """The recorded view of a step."""
         turn, place = divmod(step, len(self.recorded))
         order = seeds.numpy_rng(run_seed, turn, "recorded order").permutation(len(self.recorded))
-        return self.recorded[int(order[place])].sample()
+        return self.recorded[int(order[place])].as_tensors()
 
 
 # ---- recorded ----------------------------------------------------------------------------------------------------
@@ -148,8 +157,7 @@ def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, Obse
         found |= set(np.unique(scenefile.read_label(scene, frame, "semantics")).tolist())
     for observations in virtual.values():
         for index in range(0, len(observations), 6):
-            semantics = observations[index].semantics
-            found |= set() if semantics is None else set(torch.unique(semantics).tolist())
+            found |= set(np.unique(observations.arrays(index).get("semantics", UNLABELLED)).tolist())
     found -= {UNLABELLED}
     return tuple(sorted(found | {ID["sky"]})) if found else ()
 
@@ -178,7 +186,7 @@ def load_recorded(
         without_lidar += lidar is None
         stored.append(
             StoredView(
-                frame.id, view, "recorded", "camera", resized_rgb(scenefile.read_image(scene, frame), size),
+                frame.id, view, "recorded", resized_rgb(scenefile.read_image(scene, frame), size),
                 None if semantics is None or not classes else to_channels(semantics, classes), sky,
                 None if labels["ego"] is None else ~labels["ego"].astype(bool), lidar,
                 confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
@@ -212,10 +220,18 @@ def load_virtual(
     """All observations of these sets, with the sparse depth that ``measured`` gives for a view."""
     stored = []
     for name, observations in sets.items():
-        for index in range(len(observations)):
-            seen = observations[index]
-            lidar = None if measured is None else measured(seen.view)
-            stored.append(replace(stored_observation(f"{name}/{index:06d}", seen, classes), lidar=lidar))
+        for index, view in enumerate(observations.views):
+            arrays = observations.arrays(index)
+            semantics, confidence = arrays.get("semantics"), arrays["confidence"].astype(np.float32).clip(0, 1)
+            stored.append(
+                StoredView(
+                    f"{name}/{index:06d}", view, "virtual", observations.rgb_u8(index).copy(),
+                    None if semantics is None or not classes else to_channels(semantics, classes),
+                    None if semantics is None else semantics == ID["sky"], arrays["mask"].astype(bool),
+                    None if measured is None else measured(view), arrays["depth"].copy() if "depth" in arrays else None,
+                    (confidence * 255).round().astype(np.uint8),
+                )
+            )  # fmt: skip
     return tuple(stored)
 
 
@@ -225,27 +241,13 @@ def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], 
     Points behind others are left out as in the diffusion model's condition (``data.clips.project_sparse``).
     """
 
-    def at(view: View) -> LidarPixels:
+    def measured(view: View) -> LidarPixels:
         camera = view.camera
         seen = project_sparse(cloud, tracks, view, ConditionRules(camera.width, camera.height, far_m=MAX_LIDAR_M))
         pixel = seen.valid.reshape(-1).nonzero()[:, 0]
         return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
 
-    return at
-
-
-def stored_observation(name: str, observation: Observation, classes: Sequence[int]) -> StoredView:
-    """One virtual observation in bytes."""
-    semantics = None if observation.semantics is None else observation.semantics.numpy().astype(np.uint8)
-    return StoredView(
-        name, observation.view, observation.kind, observation.source,
-        (observation.rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy(),
-        None if semantics is None or not classes else to_channels(semantics, classes),
-        None if semantics is None else semantics == ID["sky"],
-        observation.mask[0].numpy(), None,
-        None if observation.depth is None else observation.depth[0].numpy().astype(np.float32),
-        (observation.confidence[0].clamp(0, 1) * 255).round().byte().numpy(),
-    )  # fmt: skip
+    return measured
 
 
 def to_channels(train_ids: NDArray[np.integer], classes: Sequence[int]) -> NDArray[np.uint8]:
