@@ -21,7 +21,7 @@ from mudg.models.scene.appearance import Appearance, owner, rigid_motion
 from mudg.models.scene.model import compose
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
-from mudg.stages.fitting.objects import boxes_in_view, convex_outline, objects_only
+from mudg.stages.fitting.objects import boxes_in_view, objects_only
 
 SIZE = (60, 40)
 RECORDED = ("front/000000", "front/000001", "left/000000")
@@ -136,15 +136,6 @@ def test_state_round_trip():
     assert torch.equal(again.tables["exposure"].moment1["affine"], made.tables["exposure"].moment1["affine"])
     assert not Appearance.from_state(*Appearance({}).state())
     assert owner("front/000001") == "front"
-
-
-# ---- objects by themselves -------------------------------------------------------------------------------------------
-
-
-def test_outline_of_points():
-    square = np.array([[0, 0], [2, 0], [2, 2], [0, 2], [1, 1], [1, 0], [0.5, 1.5]], float)
-    corners = {tuple(corner) for corner in convex_outline(square).tolist()}
-    assert corners == {(0, 0), (2, 0), (2, 2), (0, 2)}
 
 
 # ---- fits ------------------------------------------------------------------------------------------------------------

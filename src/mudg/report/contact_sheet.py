@@ -48,7 +48,7 @@ _COLD_TO_WARM: Final = np.array(
 )
 
 _EDGES: Final = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
-"""Pairs of corners; corner bits: 4 = front, 2 = left, 1 = top."""
+"""Pairs of corners (``geometry.box_corners``)."""
 
 PEOPLE: Final = frozenset(
     ("pedestrian", "person", "person_sitting", "person (sitting)", "cyclist", "rider", "motorcyclist", "bicyclist", "stroller",
@@ -152,12 +152,6 @@ def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> Non
     pixels[rows, columns] = depth_colours(z[order])[:, None]
 
 
-def box_corners(size_m: Floats, world_from_object: Floats) -> Floats:
-    """Corners f64[8, 3] of a box; see ``_EDGES`` for their order."""
-    signs = np.array([[1 if n & 4 else -1, 1 if n & 2 else -1, 1 if n & 1 else -1] for n in range(8)])
-    return geometry.transform_points(world_from_object, signs * size_m / 2)
-
-
 def visible_edges(view: View, corners_world: Floats) -> list[tuple[int, Floats]]:
     """Edges of a box as the camera sees them: number of the edge and its ends f64[2, 2] in pixels.
 
@@ -193,7 +187,7 @@ def cut_near(ends: Floats) -> Floats | None:
 def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, track: Track) -> None:
     """A box as lines in its class' colour, those of its front red; on a dark edge where it is large enough, so that points do not
     hide it."""
-    edges = visible_edges(view, box_corners(track.size_m, world_from_object))
+    edges = visible_edges(view, geometry.transform_points(world_from_object, geometry.box_corners(track.size_m)))
     if not edges:
         return
     line = 1 + view.camera.width // _THICKER_FROM_PX
@@ -249,7 +243,7 @@ def top_view(scene: Scene, width: int, height: int) -> Image.Image:
         draw.line(_pairs(at(track.world_from_object[:, :3, 3])), fill=(150, 110, 60))
         pose = track.pose_at(middle_s)
         if pose is not None:
-            corners = at(box_corners(track.size_m, pose)[[0, 2, 6, 4]])
+            corners = at(geometry.transform_points(pose, geometry.box_corners(track.size_m)[[0, 2, 6, 4]]))
             draw.polygon(_pairs(corners), outline=box_colour(track.label))
             draw.line(_pairs(corners[[2, 3]]), fill=_FRONT_COLOUR, width=2)
     if len(path) > 1:
