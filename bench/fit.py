@@ -29,7 +29,8 @@ from mudg.core.raster import cpu as raster_cpu
 from mudg.data.city.config import CityConfig
 from mudg.models.scene.densify import DensifyStats
 from mudg.stages import fit, fuse, ingest
-from mudg.stages.config import DensifyConfig, FitConfig, FuseConfig, IngestConfig
+from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
+from mudg.stages.config.fit import DensifyConfig
 from mudg.stages.fitting.views import ViewSet
 
 FORWARD = ("project", "sort", "bin", "blend")

@@ -9,7 +9,7 @@ from test_score_metrics import lpips_state
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.core import losses, metrics
-from mudg.stages.config import VirtualConfig
+from mudg.stages.config.fit import VirtualConfig
 from mudg.stages.fitting.perception import perception_of
 
 

@@ -507,7 +507,7 @@ def load_model(folder: Path) -> SceneModel:
     return SceneModel.from_state(values, groups)
 
 
-# ---- looking at it --------------------------------------------------------------------------------------------------
+# ---- pictures -------------------------------------------------------------------------------------------------------
 
 
 def _progress(state: FitState, view: TrainView, render: Render, terms: Mapping[str, Tensor]) -> dict[str, float]:

@@ -28,7 +28,7 @@ LIMBED_LABELS: Final = frozenset(
 )
 """Labels of tracks that change their shape while they move."""
 SYMMETRIC_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "vehicle", "trailer", "motorcycle"})
-"""Labels of tracks whose two sides look alike."""
+"""Labels of tracks whose two sides are alike."""
 LEAST_NOISE_M: Final = 0.01
 LEAST_NOISE_RAD: Final = 0.002
 DEFORM_CELLS: Final = (2, 3, 6)
@@ -102,7 +102,7 @@ class StaticNode:
 
 
 class RigidNode:
-    """A tracked moving object: rows in the frame of its box, carried by the box's pose.
+    """A tracked dynamic object: rows in the frame of its box, carried by the box's pose.
 
     The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in
     the frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
@@ -137,7 +137,7 @@ class RigidNode:
 
     @property
     def symmetric(self) -> bool:
-        """Whether its left side looks like its right one."""
+        """Whether its left side is like its right one."""
         return self.label.lower() in SYMMETRIC_LABELS
 
     def _own_columns(self, keys: int) -> dict[str, Tensor]:
@@ -328,7 +328,7 @@ class DeformableNode(RigidNode):
 
 
 def object_node(track: Track, learn_pose: bool = False, deformable: bool = False) -> RigidNode:
-    """The node of a moving track: one that deforms for those who walk or ride, if asked for; else a rigid one."""
+    """The node of a dynamic track: with ``deformable``, one that deforms for those who walk or ride; else a rigid one."""
     kind = DeformableNode if deformable and track.label.lower() in LIMBED_LABELS else RigidNode
     node = kind.from_track(track, learn_pose)
     if learn_pose:

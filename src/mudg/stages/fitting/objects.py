@@ -1,4 +1,4 @@
-"""Moving objects by themselves: their Gaussians alone, and where their boxes lie in a view."""
+"""Dynamic objects by themselves: their Gaussians alone, and where their boxes lie in a view."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NEAREST_CORNER_M = 0.3
 
 
 def objects_only(gaussians: Gaussians) -> Gaussians:
-    """The rows of moving objects (node above 0), without class channels."""
+    """The rows of dynamic objects (node above 0), without class channels."""
     if gaussians.node is None:
         raise ValueError("the Gaussians do not say which node they belong to")
     rows = gaussians.node > 0

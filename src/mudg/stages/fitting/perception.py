@@ -13,7 +13,7 @@ from mudg.base.errors import UsageError
 from mudg.core import losses
 from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures
 from mudg.models.mdm import model as mdm
-from mudg.stages.config import VirtualConfig
+from mudg.stages.config.fit import VirtualConfig
 
 Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Render ``[3, H, W]`` and target ``[3, H, W]`` in [0, 1], weight ``[1, H, W]`` -> distance, differentiable in the render."""

@@ -1,7 +1,7 @@
 """Starting values of a scene model: fused points become Gaussians, what LiDAR never reached is filled in, the sky is painted.
 
 What LiDAR does not reach in a street: facades above the topmost beam, and everything beyond its range. Both are filled from
-the recorded images: a pixel that is not sky, not a moving thing and has no point near it takes the depth of the surface of
+the recorded images: a pixel that is neither sky nor a dynamic object and has no point near it takes the depth of the surface of
 the same class below it in its column (walls, trees and poles stand upright, so their camera z hardly changes upwards); where
 there is none it is put on a far shell. This needs semantic labels; without them nothing is filled and the sky stands in.
 """
