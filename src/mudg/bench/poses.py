@@ -38,15 +38,8 @@ from mudg.data.scene import read_image, read_label, read_scene
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
-from mudg.stages.config import (
-    BenchConfig,
-    DensifyConfig,
-    FitConfig,
-    FuseConfig,
-    PoseConfig,
-    RecordedLossConfig,
-    StartConfig,
-)
+from mudg.stages.config import BenchConfig, FitConfig, FuseConfig
+from mudg.stages.config.fit import DensifyConfig, PoseConfig, RecordedLossConfig, StartConfig
 from mudg.stages.fuse import rules_of, scene_sweeps
 
 LISTS: dict[str, tuple[int, ...]] = {
