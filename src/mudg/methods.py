@@ -35,8 +35,3 @@ METHODS: Final[dict[str, Method]] = {
     "mudg_r": Method("Diffusion output", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }
-
-
-def fitted_methods() -> tuple[str, ...]:
-    """Methods that ``mudg fit`` knows."""
-    return tuple(name for name, method in METHODS.items() if method.made_by == "render")

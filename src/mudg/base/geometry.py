@@ -59,11 +59,6 @@ def all_rigid(transforms: Matrix, tolerance: float = 1e-4) -> bool:
     return not (error > tolerance).any() and not (np.linalg.det(rotation) < 0).any()
 
 
-def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
-    """Whether ``transform`` is a finite, right-handed rigid 4x4 matrix within ``tolerance``."""
-    return rigid_problem(transform, tolerance) is None
-
-
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
     """4x4 matrix from a 3x3 rotation and a translation of 3 metres-components."""
     matrix = np.eye(4)

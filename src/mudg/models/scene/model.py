@@ -176,7 +176,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
 
 def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> Tensor:
     """Colours ``[3, H, W]`` over the sky: ``rgb + (1 - alpha) * sky``."""
-    return rgb if model.sky is None else native_ops.over(rgb, alpha, model.sky.coarsely_at(view))
+    return rgb if model.sky is None else native_ops.over(rgb, alpha, model.sky.coarse_picture(view))
 
 
 def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:

@@ -38,12 +38,7 @@ class SkyNode:
         """Rows of the panorama."""
         return int(self.table["panorama"].shape[2])
 
-    def at(self, view: View) -> Tensor:
-        """Sky colour ``[3, H, W]`` at every pixel of a view; differentiable in the panorama."""
-        size = (view.camera.height, view.camera.width)
-        return F.interpolate(self.coarsely_at(view)[None], size=size, mode="bilinear", align_corners=False)[0]
-
-    def coarsely_at(self, view: View) -> Tensor:
+    def coarse_picture(self, view: View) -> Tensor:
         """Sky colour ``[3, h, w]`` on a coarse grid of a view's pixels; differentiable in the panorama.
 
         The panorama is far coarser than an image, so it is sampled for every s-by-s block of pixels (s chosen such that samples
