@@ -112,7 +112,9 @@ def test_poses_that_are_not_learnt_stay(fitted):
 
 
 def test_rounds_are_spread_over_the_run():
-    config = fit_config(method="street_gaussians", iterations=200, poses__learn=True, poses__rounds=4, poses__start=0.25)
+    config = fit_config(
+        method="street_gaussians", iterations=200, poses__learn=True, poses__rounds=4, poses__start=0.25
+    )
     assert [step for step in range(1, 201) if fit.pose_round_due(config, step)] == [50, 90, 130, 170]
     off = fit_config(method="street_gaussians", iterations=200, poses__rounds=4)
     assert not any(fit.pose_round_due(off, step) for step in range(1, 201))

@@ -68,7 +68,9 @@ def columns_from_points(
     return columns
 
 
-def box_grid(size_m: Sequence[float], rgb: Sequence[float], per_axis: int = 12) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def box_grid(
+    size_m: Sequence[float], rgb: Sequence[float], per_axis: int = 12
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one colour."""
     axis = np.linspace(-0.5, 0.5, per_axis)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)

@@ -95,7 +95,9 @@ class SceneModel:
         owner = renumber[self.table.labels["node"].long()]
         rows = (owner >= 0).nonzero()[:, 0]
         table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]})
-        return SceneModel(table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts))
+        return SceneModel(
+            table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts)
+        )
 
     # -- state ------------------------------------------------------------------------------------------------------
 
@@ -122,7 +124,9 @@ class SceneModel:
         for index, facts in enumerate(values["nodes"]):
             if facts["kind"] not in NODES:
                 raise InputError("unknown kind of scene node", expected=", ".join(NODES), got=str(facts["kind"]))
-            own = {key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")}
+            own = {
+                key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")
+            }
             node = NODES[facts["kind"]].from_state(facts, own)
             if isinstance(node, SkyNode):
                 sky = node
@@ -131,7 +135,9 @@ class SceneModel:
         table = Table.from_state(groups["gaussians"])
         owner = table.labels["node"]
         if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
-            raise InputError("a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}")
+            raise InputError(
+                "a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}"
+            )
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
@@ -184,7 +190,11 @@ def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
 
     The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
     """
-    return None if ID["sky"] not in model.classes else (model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0]))
+    return (
+        None
+        if ID["sky"] not in model.classes
+        else (model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0]))
+    )
 
 
 def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
