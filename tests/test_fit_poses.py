@@ -8,8 +8,9 @@ import torch
 from fit_settings import fit_config
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
-from mudg.base import geometry, store
+from mudg.base import geometry
 from mudg.base.config import to_dict
+from mudg.base.run_folder import RunDir
 from mudg.bench.poses import pose_errors
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.scene import read_scene
@@ -31,7 +32,7 @@ def fitted(tmp_path_factory) -> fit.FitState:
         method="street_gaussians", iterations=60, start__gaussians=1500, densify__kind="none", loss__semantic_every=999
     )
     state = fit.start_state(config, scene, fused_cloud(FRAMES), *fit.recorded_views(config, scene))
-    fit.optimise(state, config, store.RunDir.open(root / "fit", "fit", to_dict(config), {}, 1, False))
+    fit.optimise(state, config, RunDir.open(root / "fit", fit.OUTPUT, to_dict(config), {}))
     return state
 
 

@@ -19,6 +19,7 @@ from PIL import Image
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Observation, Trajectory
 from mudg.bench import shift_tables as tables
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
@@ -33,7 +34,7 @@ FIRST_CRF, LAST_CRF = 29, 41
 VIDEO_BYTES: Final = 900 * 1024
 """A video larger than this is made anew in lower quality: eight logs of seven lines stay under 60 MB."""
 ROWS: Final = ("colour", "colour error", "depth")
-_VERSION = 1
+_OUTPUT: Final = VerbOutput("film", 1, ("*.mp4", "*.jpg"))
 
 
 # ---- videos ----
@@ -45,9 +46,10 @@ def film(views: Mapping[str, Path], paths: Sequence[Trajectory], out: Path, *, o
     Args:
         views: column -> folder of observation folders; "truth" is needed, and has every trajectory.
     """
+    refuse_overlap(out, views)
     inputs = {name: store.digest(folder) for name, folder in views.items()}
     asked = {"columns": list(views), "trajectories": [path.name for path in paths], "panel_width_px": PANEL_WIDTH}
-    folder = store.RunDir.open(out, "film", asked, inputs, _VERSION, overwrite)
+    folder = RunDir.open(out, _OUTPUT, asked, inputs, overwrite)
     if folder.complete:
         return folder.reused()
     found = {name: list_observation_sets(path) for name, path in views.items()}
@@ -58,13 +60,13 @@ def film(views: Mapping[str, Path], paths: Sequence[Trajectory], out: Path, *, o
             raise InputError("no truth to show", where=f"{views.get('truth')}: {path.name}")
         pictures = list(_atlases(sets, list(views), len(path)))
         if playable:
-            store.atomic_write(out / f"{path.name}.mp4", _video(pictures))
+            store.atomic_write(folder.path / f"{path.name}.mp4", _video(pictures))
         poster = io.BytesIO()
         middle = Image.fromarray(pictures[len(pictures) // 2])
         middle.resize((middle.width // 2, middle.height // 2), Image.Resampling.BOX).save(poster, "JPEG", quality=75)
-        store.atomic_write(out / f"{path.name}.jpg", poster.getvalue())
+        store.atomic_write(folder.path / f"{path.name}.jpg", poster.getvalue())
     folder.finish({"columns": list(views), "videos": playable})
-    return out
+    return folder.path
 
 
 def _video(pictures: Sequence[NDArray[np.uint8]]) -> bytes:

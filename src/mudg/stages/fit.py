@@ -31,6 +31,7 @@ from torch import Tensor
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import losses, metrics, native_ops
 from mudg.core.raster.rasterize import RasterConfig, rasterize
@@ -60,7 +61,10 @@ from mudg.stages.fitting.views import (
     virtual_sets,
 )
 
-VERSION = 2
+OUTPUT = VerbOutput(
+    "fit", 2,
+    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "preview/*.png", "steps/"),
+)  # fmt: skip
 PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
@@ -92,6 +96,9 @@ def run(
     learns_virtual = "virtual" in METHODS[config.method].supervision
     if learns_virtual and observations is None:
         raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and hand its folder on")
+    refuse_overlap(
+        out, {"scene": scene, "fused": fused, "observations": observations, "virtual.lpips-weights": config.virtual.lpips_weights}
+    )
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
     virtual: Mapping[str, ObservationSet] = {}
     if learns_virtual and observations is not None:
@@ -99,7 +106,7 @@ def run(
         inputs["observations"] = store.digest(Path(observations))
     if config.virtual.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
-    folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
+    folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     with _one_torch_thread():
@@ -174,7 +181,7 @@ def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewS
 # ---- the loop ------------------------------------------------------------------------------------------------------
 
 
-def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
+def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``VirtualConfig.beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all

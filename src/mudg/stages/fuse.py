@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw
 
 from mudg.base import log, store
 from mudg.base.config import to_dict
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Scene
 from mudg.core.fusion import FusionReport, FusionRules, Shot, SweepShots, fuse_sweeps
 from mudg.data.cloudfile import write_fused
@@ -24,7 +25,7 @@ from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.stages import batch
 from mudg.stages.config import FuseConfig
 
-_VERSION = 1
+_OUTPUT = VerbOutput("fuse", 1, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
 _TOP_VIEW_PX = 1400
 _MOVER_COLOUR = (255, 90, 60)
 _PATH_COLOUR = (60, 200, 255)
@@ -41,7 +42,8 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
     Raises:
         InputError: the scene is malformed. UsageError: ``out`` holds something else.
     """
-    folder = store.RunDir.open(out, "fuse", to_dict(config), {"scene": store.digest(scene)}, _VERSION, overwrite)
+    refuse_overlap(out, {"scene": scene})
+    folder = RunDir.open(out, _OUTPUT, to_dict(config), {"scene": store.digest(scene)}, overwrite)
     if folder.complete:
         return folder.reused()
     loaded = read_scene(scene)
@@ -66,7 +68,7 @@ def run_many(
     """``run`` for every scene of a list; see ``stages/batch.py``."""
     entries = batch.shard(batch.read_list(listed), shard)
     work = functools.partial(_one_of_many, config)
-    return batch.run_batch("fuse", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+    return batch.run_batch("fuse", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed)
 
 
 def _one_of_many(config: FuseConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:

@@ -27,11 +27,18 @@ from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, palette, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
+from mudg.data.observations import (
+    OBSERVATION_FILES,
+    ObservationSet,
+    ObservationWriter,
+    list_observation_sets,
+    read_observations,
+)
 from mudg.data.scene import read_scene
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
 from mudg.models.mdm import model as mdm
@@ -50,7 +57,10 @@ Made = TypeVar("Made")
 BASELINE: Final = "nearest_fill"
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
 DEPTH_LIMIT_M: Final = 80.0
-_VERSION: Final = 2
+_OUTPUT: Final = VerbOutput(
+    "score", 2,
+    ("metrics.json", "metrics.md", "errors/*.png", *below("truth/*", OBSERVATION_FILES), *below(f"{BASELINE}/*", OBSERVATION_FILES)),
+)  # fmt: skip
 _NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
 
 
@@ -110,6 +120,7 @@ def run(
     """
     if not methods:
         raise UsageError("nothing to score", expected="at least one method with its folder of rendered views")
+    refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, "lpips-weights": config.lpips_weights})
     inputs = {"scene": store.digest(scene)} | {name: store.digest(folder) for name, folder in methods.items()}
     if fused is not None and config.baseline:
         inputs["fused"] = store.digest(fused)
@@ -117,7 +128,7 @@ def run(
         inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
     if truth is not None:
         inputs["truth"] = store.digest(truth)
-    work = store.RunDir.open(out, "score", configuration.to_dict(config), inputs, version=_VERSION, overwrite=overwrite)
+    work = RunDir.open(out, _OUTPUT, configuration.to_dict(config), inputs, overwrite)
     if work.complete:
         return work.reused()
     recorded = read_scene(scene)
@@ -130,7 +141,7 @@ def run(
     with log.task("score", sum(len(course.views) for course in courses)) as bar:
         for course in courses:
             bar.update(course.name)
-            results += _score_course(course, yardstick, out, bar.advance)
+            results += _score_course(course, yardstick, work.path, bar.advance)
     names = [*([BASELINE] if baseline is not None else []), *methods]
     rows = {
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
@@ -138,10 +149,10 @@ def run(
     }
     record = courses_record(courses)
     document = score_tables.document(recorded, true.exact, record, names, results, rows, DEPTH_LIMIT_M)
-    store.write_json(out / "metrics.json", document)
-    store.write_text(out / "metrics.md", score_tables.markdown(document))
+    store.write_json(work.path / "metrics.json", document)
+    store.write_text(work.path / "metrics.md", score_tables.markdown(document))
     work.finish({"trajectories": len(courses), "methods": names})
-    return out
+    return work.path
 
 
 def _distances(config: ScoreConfig) -> dict[str, Callable[[metrics.Pair], float | None]]:

@@ -18,18 +18,19 @@ from torch import Tensor
 
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Frame, Observation, Scene, Trajectory, View
 from mudg.core.pictures import resize_nearest, resize_rgb
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
-from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 
 MOVING_FILE: Final = "moving.safetensors"
 SAME_SWEEP_S: Final = 0.05
 SAME_TIME_S: Final = 1e-4
 SAME_PLACE_M: Final = 1e-3
-_VERSION = 1
+_OUTPUT: Final = VerbOutput("truth", 1, below("*", (*OBSERVATION_FILES, MOVING_FILE)))
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,12 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
     Raises:
         InputError: the scene was not generated.
     """
+    refuse_overlap(out, {"scene": scene})
     views = [
         [v.time_s, *v.world_from_cam.ravel().tolist(), v.camera.width] for path in trajectories for v in path.views
     ]
     asked = {"trajectories": [path.name for path in trajectories], "views": views}
-    folder = store.RunDir.open(out, "truth", asked, {"scene": store.digest(scene)}, _VERSION, overwrite)
+    folder = RunDir.open(out, _OUTPUT, asked, {"scene": store.digest(scene)}, overwrite)
     if folder.complete:
         return folder.reused()
     truth = truth_of(read_scene(scene))
@@ -86,7 +88,7 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
     with log.task("truth", sum(map(len, trajectories))) as bar:
         for path in trajectories:
             masks = []
-            with ObservationWriter(out / path.name, path.name, "truth", "recorded") as writer:
+            with ObservationWriter(folder.path / path.name, path.name, "truth", "recorded") as writer:
                 for view in path.views:
                     true = truth.at(view, None, path.name)
                     if true is None or true.moving is None:
@@ -97,9 +99,9 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
                     else:
                         writer.add(true.seen)
                     bar.advance()
-            store.write_safetensors(out / path.name / MOVING_FILE, {"moving": np.stack(masks)})
+            store.write_safetensors(folder.path / path.name / MOVING_FILE, {"moving": np.stack(masks)})
     folder.finish({"trajectories": [path.name for path in trajectories]})
-    return out
+    return folder.path
 
 
 def stored_truth(folder: Path) -> Truth:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import geometry, palette, seeds, store
+from mudg.base.config import differences
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition, Frame, FusedCloud, PointCloud, Scene, Sweep, View
 from mudg.core.project import project_points
@@ -338,7 +339,7 @@ def claim(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]) -> No
         found = store.read_json(path)
         if found != wanted:
             raise UsageError("the folder holds training clips of other logs or settings", where=str(folder),
-                             got="; ".join(store.differences(found, wanted)[:4]), remedy="give another --clips")  # fmt: skip
+                             got="; ".join(differences(found, wanted)[:4]), remedy="give another --clips")  # fmt: skip
         return
     if folder.is_dir() and any(folder.glob("*.safetensors")):
         raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --clips")
