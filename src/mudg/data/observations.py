@@ -110,19 +110,25 @@ class ObservationSet:
         """Colour u8[H, W, 3] of one observation."""
         return read_image_file(self.path / "rgb" / f"{index:06d}.png", self.views[index].camera)
 
-    def __getitem__(self, index: int) -> Observation:
+    def arrays(self, index: int) -> dict[str, NDArray[Any]]:
+        """What the data file of one observation holds, as stored: confidence f16, mask u8, and where there are any depth f32 and
+        semantics u8, [H, W] each; InputError where an array is missing or of another size."""
         if not 0 <= index < len(self):
             raise IndexError(index)
-        view = self.views[index]
+        camera = self.views[index].camera
         path = self.path / "data" / f"{index:06d}.safetensors"
         arrays = store.read_safetensors(path)
-        shape = (view.camera.height, view.camera.width)
+        shape = (camera.height, camera.width)
         wanted = ["confidence", "mask"] + ["depth"] * self.has_depth[index] + ["semantics"] * self.has_semantics[index]
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
                 raise InputError("an observation file does not fit its view", where=f"{path}: {name}",
                     expected=str(shape), got=got)  # fmt: skip
+        return {name: arrays[name] for name in wanted}
+
+    def __getitem__(self, index: int) -> Observation:
+        arrays, view = self.arrays(index), self.views[index]
         return Observation(
             view=view,
             rgb=torch.from_numpy(self.rgb_u8(index).copy()).permute(2, 0, 1).float() / 255,
