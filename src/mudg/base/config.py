@@ -104,3 +104,13 @@ def field_type(config_type: Any, name: str) -> Any:
     import typing
 
     return typing.get_type_hints(config_type).get(name)
+
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        found = []
+        for name in sorted(set(old) | set(new), key=str):
+            found += differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
+        return found
+    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]
