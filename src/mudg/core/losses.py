@@ -1,17 +1,19 @@
-"""Every loss of the scene fit, as pure functions: maps where they are maps, scalars where a sum is part of the idea.
+"""Losses of the scene fit, as pure functions: maps where they are maps, scalars where a sum is part of the idea.
 
 All work in float32 and float64 and are differentiable in the prediction. Masks are boolean and never change the shape of
 the work. Published form: Street Gaussians (recorded views) and the supervision of MuDG's scene stage (virtual views).
 
     recorded:  (1 - w) L1 + w (1 - SSIM)  +  trimmed LiDAR depth  +  sky  +  semantics
     virtual:   perceptual + robust dense depth + semantics, every pixel weighted by the observation's confidence
+
+``core.fused`` holds native twins of some, ``core.perceptual`` the distance in a network's features. The losses of the diffusion
+model stand beside that model.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -82,7 +84,7 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
 
-    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.fused.photometric`` computes the same value and
+    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes the same value and
     gradient in one native pass.
     """
     if weight is not None:
@@ -171,7 +173,7 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
 def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
 
-    ``core.fused.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
+    ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
     """
     if lift is not None:
         logits = logits.index_add(0, torch.tensor([lift[0]], device=logits.device), lift[1].detach()[None].to(logits.dtype))
@@ -191,6 +193,28 @@ def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) 
     return torch.where(inside_boxes, entropy, -torch.log(1 - alpha))
 
 
+# ---- regularisers ------------------------------------------------------------------------------------------------
+
+
+def opacity_and_scale(opacity: Tensor, scales_m: Tensor, opacity_weight: float, scale_weight: float) -> dict[str, Tensor]:
+    """Weighted mean opacity and mean scale of all Gaussians (Kheradmand et al. 2024), scalars by name; a weight of 0 leaves a term out.
+
+    Args:
+        opacity: ``[N]`` in [0, 1]. scales_m: ``[N, 3]`` metres.
+    """
+    terms = {}
+    if opacity_weight:
+        terms["opacity"] = opacity_weight * opacity.mean()
+    if scale_weight:
+        terms["scale"] = scale_weight * scales_m.mean()
+    return terms
+
+
+def identity_distance(difference: Tensor) -> Tensor:
+    """Mean absolute entry (scalar) of what a colour map differs from the identity by, ``[3, 4]`` (Street Gaussians)."""
+    return difference.abs().mean()
+
+
 # ---- features ----------------------------------------------------------------------------------------------------
 
 
@@ -207,31 +231,6 @@ def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Ten
         scale_weight = F.adaptive_avg_pool2d(weight.to(mine.dtype), (mine.shape[-2], mine.shape[-1]))
         total = total + confident_mean((mine - theirs).abs(), scale_weight)
     return total / len(prediction)
-
-
-def unit_feature_distance(
-    prediction: Sequence[Tensor], target: Sequence[Tensor], weight: Tensor, channel_weights: Sequence[Tensor] | None = None
-) -> Tensor:
-    """LPIPS-like distance (Zhang et al. 2018, eq. 1) with every place weighted by its confidence; see ``metrics.perceptual_distance``.
-
-    Args:
-        prediction, target: per stage ``[C_l, h_l, w_l]``; every place's vector is brought to length 1.
-        weight: ``[1, H, W]`` in [0, 1] at full size; averaged down to each stage.
-        channel_weights: per stage ``[C_l]``; the stages are then summed as LPIPS does, else averaged.
-    """
-    total = prediction[0].new_zeros(())
-    for stage, (mine, theirs) in enumerate(zip(prediction, target)):
-        _same_shape(mine, theirs, "unit_feature_distance")
-        squared = (_unit(mine) - _unit(theirs)) ** 2
-        if channel_weights is not None:
-            squared = squared * channel_weights[stage].view(-1, 1, 1)
-        share = F.adaptive_avg_pool2d(weight.to(mine.dtype), (mine.shape[-2], mine.shape[-1]))
-        total = total + confident_mean(squared.sum(0, keepdim=True), share)
-    return total / len(prediction) if channel_weights is None else total
-
-
-def _unit(features: Tensor) -> Tensor:
-    return features / (features.square().sum(0, keepdim=True) + 1e-12).sqrt()
 
 
 def _same_shape(a: Tensor, b: Tensor, what: str) -> None:

@@ -21,6 +21,7 @@ import contextlib
 import importlib.util
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from torch.nn import functional
 from mudg.base import checkpoint, log, seeds, store
 from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.clips import from_log
 from mudg.data.clips.from_log import LogClipRules
 from mudg.data.clips.shards import Batch
@@ -75,6 +77,13 @@ HOW = (
 """Settings that say how a run is computed and not what comes out; a run may be continued with other ones."""
 
 
+_OUTPUT = VerbOutput(
+    "learn", 1,
+    ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", "samples/*.png", "latents/", "tensorboard/", "loss.png",
+     "metrics.json", "model/*", "model.part/"),
+)  # fmt: skip
+
+
 def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     """Train a model, from nothing or from an earlier one; returns the folder of the exported model (`OUT/model`).
 
@@ -105,27 +114,39 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     return out / "model"
 
 
-def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> store.RunDir | None:
+def _refuse_overlap(config: LearnConfig, out: Path, sources: Sequence[from_log.LogSource], overwrite: bool) -> None:
+    """UsageError where `out` touches something that is read. Clips may lie in `out` where they do by default, unless a result there
+    is to be replaced."""
+    read: dict[str, Path | str] = {"start": mdm.folder_of(config.start) if config.start else ""}
+    for number, source in enumerate(sources):
+        read |= {f"scene {number}": source.scene, f"fused {number}": source.fused}
+    own_clips = not overwrite and Path(config.clips).resolve() == (out / "clips").resolve()
+    refuse_overlap(out, {**read, "clips": "" if own_clips else config.clips})
+
+
+def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunDir | None:
     """The run's folder, locked by the leader; None if a finished result is there and was verified."""
-    opened: list[store.RunDir] = []
+    opened: list[RunDir] = []
     asked = {name: value for name, value in to_dict(config).items() if name not in HOW}
 
-    def open_it() -> bool:
+    def open_it() -> str:
+        sources = [from_log.log_source(text) for text in config.scenes]
+        _refuse_overlap(config, out, sources, overwrite)
         inputs = {"start": mdm.digest(config.start)} if config.start else {}
-        for number, text in enumerate(config.scenes):
-            source = from_log.log_source(text)
+        for number, source in enumerate(sources):
             inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
-        opened.append(store.RunDir.open(out, verb="learn", config=asked, inputs=inputs, overwrite=overwrite))
+        opened.append(RunDir.open(out, _OUTPUT, asked, inputs, overwrite))
         if opened[0].complete:
             opened[0].reused()
-        return opened[0].complete
+        return "" if opened[0].complete else str(opened[0].path)
 
-    if ranks.leader_does(open_it):
+    path = ranks.leader_does(open_it)
+    if not path:
         return None
-    return opened[0] if ranks.leads else store.RunDir(out, "learn", "", {}, complete=False)
+    return opened[0] if ranks.leads else RunDir(out, Path(path), _OUTPUT, "", {})
 
 
-def _run(model: Model, fresh: set[str], config: LearnConfig, directory: store.RunDir, ranks: Ranks) -> None:
+def _run(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
     out = directory.path
     bf16 = choose_bf16(config.precision)
     clips = Path(config.clips) if config.clips else out / "clips"
@@ -153,7 +174,7 @@ def _run(model: Model, fresh: set[str], config: LearnConfig, directory: store.Ru
 
 
 def _finish(
-    model: Model, weights: dict[str, Tensor], config: LearnConfig, asked: LearnConfig, directory: store.RunDir, clips: Path,
+    model: Model, weights: dict[str, Tensor], config: LearnConfig, asked: LearnConfig, directory: RunDir, clips: Path,
     bf16: bool, rules: LogClipRules | None,
 ) -> None:  # fmt: skip
     """Score and export what was trained."""
@@ -230,7 +251,7 @@ def model_config(config: LearnConfig) -> MDMConfig:
 # codec ----------------------------------------------------------------------------------------------------------------
 
 
-def _train_codec(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool) -> None:
+def _train_codec(model: MDM, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool) -> None:
     """Fit the linear parts on the first cities, then train the decoder on noisy latents."""
     codec, out = model.codec, run_dir.path / "codec"
     optimizer = torch.optim.AdamW(codec.parameters(), lr=config.codec_lr, betas=(0.9, 0.99), weight_decay=1e-3)
@@ -385,7 +406,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
 
 
 def _train_network(
-    model: Model, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool, ranks: Ranks
+    model: Model, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool, ranks: Ranks
 ) -> dict[str, Tensor]:
     """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
     out = run_dir.path / "steps"
@@ -452,7 +473,7 @@ def _losses(
         return kind_of(model).loss(objective, model, config, part, weights)
 
 
-def _write_down(run_dir: store.RunDir, board: _Board | None, step: int, values: dict[str, float]) -> None:
+def _write_down(run_dir: RunDir, board: _Board | None, step: int, values: dict[str, float]) -> None:
     run_dir.log(step=step, **values)
     learn_score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
     if board is not None:
@@ -475,7 +496,7 @@ class _Board:
         self._writer.close()
 
 
-def _look(shown: Model, config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool) -> None:
+def _look(shown: Model, config: LearnConfig, run_dir: RunDir, folder: Path, step: int, bf16: bool) -> None:
     """Score a model on a few held-out clips and draw a grid of what it makes."""
     scores = learn_score.score(
         shown, learn_clips.scored_shards(config)[: config.watched], folder, steps=config.sample_steps, seed=config.seed,

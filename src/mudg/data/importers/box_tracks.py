@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -22,6 +22,9 @@ LONGER_THAN_WIDE: Final = frozenset(("car", "van", "bus", "vehicle"))
 """Labels whose boxes are longer than wide in every data set (a truck's cab may be a box of its own)."""
 _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
+_SAME_TIME_S: Final = 1e-4
+Speeds = Callable[[NDArray[np.float64], Matrix, Sequence[NDArray[np.intp]]], Matrix]
+"""Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities f64[n, 3] m/s."""
 
 
 def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, float, float]:
@@ -102,11 +105,18 @@ class BoxTracks:
         member.standing = standing
         member.rows.extend((time_s, late_s, *size, *world_from_box[:3].ravel().tolist()))
 
-    def tracks(self) -> tuple[list[Track], list[str]]:
+    def tracks(
+        self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
+    ) -> tuple[list[Track], list[str]]:
         """All tracks in the order of their first boxes, and notes for people.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to its last
         moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
+
+        Args:
+            speeds: how velocities are found; None = from the neighbouring boxes of a piece.
+            images_s: time of a box -> times of the first and last image that show the object; a track reaches from the first
+                image of its first box to the last one of its last. None = from box to box.
 
         Raises:
             InputError: an object has two boxes at one moment; length and width are swapped.
@@ -131,12 +141,14 @@ class BoxTracks:
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
             split += len(pieces) > 1
-            for piece in pieces:
-                poses[piece, :3, 3] -= _velocity(times[piece] + rows[piece, 1], poses[piece, :3, 3]) * rows[piece, 1:2]
-            tracks += [
-                Track(f"{name}.{part}" if part else name, label, size, times[piece], poses[piece])
-                for part, piece in enumerate(pieces)
-            ]
+            velocity = (speeds or neighbour_speeds)(times + rows[:, 1], poses[:, :3, 3], pieces)
+            poses[:, :3, 3] -= velocity * rows[:, 1:2]
+            for part, piece in enumerate(pieces):
+                keys = times[piece], poses[piece]
+                if images_s is not None:
+                    ends_s = images_s[float(times[piece[0]])][0], images_s[float(times[piece[-1]])][1]
+                    keys = _reaching(*keys, velocity[piece], ends_s)
+                tracks.append(Track(f"{name}.{part}" if part else name, label, size, *keys))
         check_sides(tracks, self._where)
         tracks.sort(key=lambda track: float(track.times_s[0]))
         return tracks, self._notes(split)
@@ -167,6 +179,11 @@ def check_sides(tracks: Sequence[Track], where: str) -> None:
             f"{length:.2f} m long, {width:.2f} m wide", remedy="check the order in which the sizes were written")  # fmt: skip
 
 
+def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
+    """Velocities of an object's boxes, f64[n, 3], by their neighbours within each of the ``pieces`` of its track."""
+    return np.concatenate([_velocity(measured_s[piece], places[piece]) for piece in pieces])
+
+
 def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:
     """Velocity at each measurement, f64[n, 3]: from the neighbours on both sides, or from the one there is."""
     if len(places) < 2:
@@ -177,6 +194,20 @@ def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:
     short = span < _MIN_STEP_S  # two measurements at nearly one moment, at an end: go by the neighbour
     velocity[short] = velocity[np.where(before == np.arange(len(places)), after, before)][short]
     return velocity
+
+
+def _reaching(
+    times_s: NDArray[np.float64], poses: Matrix, velocity: Matrix, ends_s: tuple[float, float]
+) -> tuple[NDArray[np.float64], Matrix]:
+    """Keys with one more at each of ``ends_s`` that lies outside of them."""
+    start_s, end_s = ends_s[0] - times_s[0], ends_s[1] - times_s[-1]
+    if start_s < -_SAME_TIME_S:
+        times_s, poses = np.concatenate([ends_s[:1], times_s]), np.concatenate([poses[:1], poses])
+        poses[0, :3, 3] += velocity[0] * start_s
+    if end_s > _SAME_TIME_S:
+        times_s, poses = np.concatenate([times_s, ends_s[1:]]), np.concatenate([poses, poses[-1:]])
+        poses[-1, :3, 3] += velocity[-1] * end_s
+    return times_s, poses
 
 
 def _mean_pose(poses: Matrix) -> Matrix:

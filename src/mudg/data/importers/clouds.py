@@ -80,17 +80,18 @@ _PCD_KEYS: Final = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIG
 
 @dataclass(frozen=True, slots=True)
 class _PcdField:
-    """One field; padding is called ``_`` and may have a count of 0."""
+    """One field of one number a point: its type, and where it stands in a row (byte and number)."""
 
     name: str
     kind: str
-    count: int
+    byte: int
+    column: int
 
 
 def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     """Point Cloud Data file of version 0.6 or 0.7: fields of one number a point, by name."""
     header, start = _pcd_header(content, where)
-    fields = _pcd_fields(header, where)
+    fields, size, columns = _pcd_fields(header, where)
     points = _count(header["POINTS"][0], f"{where}: POINTS")
     width, height = (_count(header[key][0], f"{where}: {key}") for key in ("WIDTH", "HEIGHT"))
     if width * height != points:
@@ -99,12 +100,17 @@ def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     body = content[start:]
     kind = header["DATA"][0].lower()
     if kind == "ascii":
-        return _pcd_ascii(body, fields, points, where)
-    size = sum(np.dtype(f.kind).itemsize * f.count for f in fields)
+        table = _number_table(body, columns, points, where)
+        return {field.name: table[:, field.column] for field in fields}
     if kind == "binary":
-        return _pcd_binary(body, fields, points, size, where)
-    if kind == "binary_compressed":
-        return _pcd_compressed(body, fields, points, size, where)
+        _enough(body, points * size, where)
+        names, kinds, offsets = ([getattr(f, part) for f in fields] for part in ("name", "kind", "byte"))
+        layout = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": size})
+        rows = np.frombuffer(body, layout, points)
+        return {name: rows[name].copy() for name in names}
+    if kind == "binary_compressed":  # field after field, all points of one together
+        flat = _pcd_unpacked(body, points, size, where)
+        return {field.name: np.frombuffer(flat, field.kind, points, field.byte * points).copy() for field in fields}
     raise InputError("cloud's DATA is of no known kind", where=where, expected="ascii, binary or binary_compressed",
         got=kind[:40])  # fmt: skip
 
@@ -130,37 +136,24 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
     return header, start
 
 
-def _pcd_fields(header: dict[str, list[str]], where: str) -> list[_PcdField]:
+def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[list[_PcdField], int, int]:
+    """Fields of one number a point, each name once (padding, called ``_``, and descriptors are passed over); bytes and numbers a row."""
     names, sizes, types, counts = (header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT"))
     if not len(names) == len(sizes) == len(types) == len(counts):
         raise InputError("PCD header contradicts itself", where=where,
             expected="as many SIZE, TYPE and COUNT as FIELDS",
             got=f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}")  # fmt: skip
-    fields = []
+    fields: dict[str, _PcdField] = {}
+    byte = column = 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         key = (kind.upper(), _count(size, f"{where}: SIZE"))
         if key not in _PCD_TYPES:
             raise InputError("PCD field has an unknown type", where=f"{where}: {name}", got=f"{kind}{size}")
-        fields.append(_PcdField(name, _PCD_TYPES[key], _count(count, f"{where}: COUNT", 65536)))
-    return fields
-
-
-def _wanted(fields: list[_PcdField]) -> list[tuple[int, _PcdField]]:
-    """Fields of one number, each name once; padding and descriptors are passed over."""
-    taken: set[str] = set()
-    chosen = []
-    for index, field in enumerate(fields):
-        if field.count == 1 and field.name != "_" and field.name not in taken:
-            taken.add(field.name)
-            chosen.append((index, field))
-    return chosen
-
-
-def _pcd_ascii(body: bytes, fields: list[_PcdField], points: int, where: str) -> dict[str, NDArray]:
-    columns = sum(field.count for field in fields)
-    table = _number_table(body, columns, points, where)
-    first = np.cumsum([0, *(field.count for field in fields)])
-    return {field.name: table[:, first[index]] for index, field in _wanted(fields)}
+        numbers = _count(count, f"{where}: COUNT", 65536)
+        if numbers == 1 and name != "_":
+            fields.setdefault(name, _PcdField(name, _PCD_TYPES[key], byte, column))
+        byte, column = byte + key[1] * numbers, column + numbers
+    return list(fields.values()), byte, column
 
 
 def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[np.float64]:
@@ -176,37 +169,14 @@ def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[n
     return table.reshape(rows, columns)
 
 
-def _pcd_binary(body: bytes, fields: list[_PcdField], points: int, size: int, where: str) -> dict[str, NDArray]:
-    _enough(body, points * size, where)
-    offsets = np.cumsum([0, *(np.dtype(f.kind).itemsize * f.count for f in fields)])
-    chosen = _wanted(fields)
-    layout = np.dtype(
-        {
-            "names": [field.name for _, field in chosen], "formats": [field.kind for _, field in chosen],
-            "offsets": [int(offsets[index]) for index, _ in chosen], "itemsize": size,
-        }
-    )  # fmt: skip
-    rows = np.frombuffer(body, layout, points)
-    return {field.name: rows[field.name].copy() for _, field in chosen}
-
-
-def _pcd_compressed(body: bytes, fields: list[_PcdField], points: int, size: int, where: str) -> dict[str, NDArray]:
+def _pcd_unpacked(body: bytes, points: int, size: int, where: str) -> bytes:
     _enough(body, 8, where)
     packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
     _enough(body, 8 + packed, where)
     if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
         raise InputError("compressed cloud contradicts itself", where=where,
             expected=f"{points} points of {size} bytes", got=f"{packed} bytes said to unpack to {unpacked}")  # fmt: skip
-    flat = lzf_decompress(body[8 : 8 + packed], unpacked, where)
-    columns: dict[str, NDArray] = {}
-    chosen = {index for index, _ in _wanted(fields)}
-    at = 0
-    for index, field in enumerate(fields):  # field after field, all points of one together
-        length = np.dtype(field.kind).itemsize * field.count * points
-        if index in chosen:
-            columns[field.name] = np.frombuffer(flat, field.kind, points, at).copy()
-        at += length
-    return columns
+    return lzf_decompress(body[8 : 8 + packed], unpacked, where)
 
 
 def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:

@@ -1,24 +1,19 @@
-"""What importers share: work over frames in parallel, and the traps that every format has (units of time, poses).
+"""What importers share: work over items in parallel, units of time, poses that must be rigid, and the vehicle's path.
 
-A typical importer::
+A typical importer reads what is small, checks it, and hands the rest to the writer item by item::
 
     times_s = seconds(raw_times, "us", where)                     # refuses milliseconds called microseconds
-    fits = {name: fit_images(camera, lens, options) for ...}      # images.py: rectified and resized in one place
-    with SceneWriter(out, scene_id, source) as writer:
-        for fit in fits.values():
-            writer.add_camera(fit.camera)
-        for_each(records, convert, workers=options.workers, title="importing", name=str)
-        ...
-        return writer.finish()
+    fits = {name: fit_images(camera, options, lens) for ...}      # images.py: rectified and resized in one place
+    content = SceneContent(name, source, fits, items, convert, item_name, ego)
+    return write_scene(content, out, options)                     # drive_log.py
 
-``SceneWriter.add_*`` may be called from several threads and orders frames and sweeps by time, so the scene is the same for
-any number of workers.
+The scene is the same for any number of workers: frames and sweeps are ordered by time when all are there.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, Literal, TypeVar
 
@@ -188,7 +183,7 @@ def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> Non
             remedy="are records of another log, or of another unit, mixed in?")  # fmt: skip
 
 
-def nearest_index(sorted_times_s: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.intp]:
+def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
     """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to the earlier."""
     return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
 
@@ -366,23 +361,3 @@ def blend_motion(
             before, after = (transform_points(corrections[n], points[chosen]) for n in (index, index + 1))
             out[chosen] = before + share * (after - before)
     return out
-
-
-# --- moments ----------------------------------------------------------------------------------------------------------
-
-
-def moments(times_s: Mapping[str, Sequence[float]]) -> list[list[str]]:
-    """Group frames for ``holdout_split``: the first camera's images are the moments, others join the nearest one.
-
-    Args:
-        times_s: camera -> times of its frames in order; frame n of a camera has the id ``<camera>/00000n``.
-
-    Returns:
-        Frame ids of each moment, in time order.
-    """
-    clock = np.array(next((times for times in times_s.values() if len(times)), []))
-    groups: list[list[str]] = [[] for _ in clock]
-    for camera, times in times_s.items():
-        for index, time_s in enumerate(times):
-            groups[int(np.abs(clock - time_s).argmin())].append(f"{camera}/{index:06d}")
-    return groups

@@ -165,12 +165,12 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     if node is None:
         raise InputError(f"box has no {key}", where=where)
     rows, columns = _integer(node, "rows", f"{where}.{key}"), _integer(node, "cols", f"{where}.{key}")
-    words = (node.findtext("data") or "").split()
-    if rows * columns != len(words) or not 0 < rows * columns <= _MAX_VALUES:
+    texts = (node.findtext("data") or "").split()
+    if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
         raise InputError("matrix does not have the size it declares", where=f"{where}.{key}",
-            expected=f"{rows} x {columns} numbers", got=f"{len(words)} values")  # fmt: skip
+            expected=f"{rows} x {columns} numbers", got=f"{len(texts)} values")  # fmt: skip
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([float(text) for text in texts])
     except ValueError as error:
         raise InputError("matrix holds no number", where=f"{where}.{key}", got=str(error)) from error
     if not np.isfinite(values).all():

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.data.importers.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, Record, read_pickle
+from mudg.data.importers.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
 
 _MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
 MAX_COLUMNS: Final = 1000
@@ -100,7 +100,7 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
 
 
 def _columns(frame: Any) -> dict[str, NDArray[Any]]:
-    if not isinstance(frame, Record) or frame.name != "pandas.core.frame.DataFrame":
+    if not isinstance(frame, PickledObject) or frame.name != "pandas.core.frame.DataFrame":
         raise ValueError(f"holds a {getattr(frame, 'name', type(frame).__name__)}")
     manager = frame.state["_mgr"] if "_mgr" in frame.state else frame.state["_data"]
     if manager.name not in _MANAGERS:
@@ -131,7 +131,7 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
 
 def _block_parts(block: Any) -> tuple[Any, Any]:
     """Values and places of a block in the forms of pandas 1.3 (a partial call) and later (a tuple)."""
-    if isinstance(block, Record):
+    if isinstance(block, PickledObject):
         if block.name != "functools.partial":
             raise ValueError(f"a block is a {block.name}")
         partial, values, places = block.arguments

@@ -393,7 +393,7 @@ def _converted(plan: _Plan, frame: FrameRecord, content: FrameContent, index: in
             log.info(f"waymo: {where}: {points.without_pose} points have no pose and were left out")
 
 
-def _points(plan: _Plan, frame: FrameRecord, name: str, scan: LaserScan) -> sensors.Points:
+def _points(plan: _Plan, frame: FrameRecord, name: str, scan: LaserScan) -> sensors.ScanPoints:
     return sensors.points_of_scan(
         scan, plan.waymo.lasers[name], frame.global_from_vehicle, f"{frame.where}: LiDAR {name}"
     )

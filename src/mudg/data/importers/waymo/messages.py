@@ -61,7 +61,7 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
     Raises:
         InputError: cut off, a wire type that does not fit, or text that is not UTF-8.
     """
-    reader = _Reader(data, message, where)
+    reader = _MessageReader(data, message, where)
     values: dict[str, Any] = {}
     parts: dict[int, list[Any]] = {
         n: [] for n, f in message.fields.items() if f.kind in ("doubles", "floats", "ints", "messages")
@@ -85,7 +85,7 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
     return values
 
 
-class _Reader:
+class _MessageReader:
     """The fields of one message; what is wrong is said with its name and the byte."""
 
     def __init__(self, data: bytes | memoryview, message: Message, where: str) -> None:

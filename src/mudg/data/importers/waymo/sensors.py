@@ -65,7 +65,7 @@ other things."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Points:
+class ScanPoints:
     """Points of one turn in the LiDAR's frame at the frame's pose, where each came from in the range images, and how many
     were left out because no pose was recorded for their pixel.
 
@@ -84,7 +84,7 @@ class Points:
     without_pose: int
 
 
-def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str) -> Points:
+def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str) -> ScanPoints:
     """All points of a scan, first returns and then second ones.
 
     Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured to
@@ -124,7 +124,7 @@ def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle
             xyz = _carried(xyz, poses.astype(np.float64), laser.vehicle_from_lidar, global_from_vehicle)
         parts.append((xyz, values[:, 1], turn[column], pixel, np.full(len(pixel), index)))
     xyz, intensity, turns, pixels, images = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Points(xyz, intensity, turns, pixels, images, without_pose)
+    return ScanPoints(xyz, intensity, turns, pixels, images, without_pose)
 
 
 def heading_of(laser: LaserCalibration) -> float:
@@ -156,7 +156,7 @@ def _carried(
     return (in_vehicle - vehicle_from_lidar[:3, 3]) @ vehicle_from_lidar[:3, :3]
 
 
-def sweep_points(points: Points, dt_s: NDArray[np.float64]) -> SweepPoints:
+def sweep_points(points: ScanPoints, dt_s: NDArray[np.float64]) -> SweepPoints:
     """Points as a sweep holds them. Intensity has no limit in the data set; tanh, as is customary, brings it to 0..1."""
     intensity = np.tanh(np.maximum(points.intensity.astype(np.float64), 0))
     return SweepPoints(points.xyz.astype(np.float32), intensity.astype(np.float32), dt_s.astype(np.float32))
@@ -304,7 +304,7 @@ def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[A
 
 
 def projection_errors(
-    points: Points,
+    points: ScanPoints,
     scan: LaserScan,
     laser: LaserCalibration,
     global_from_vehicle: Matrix,
