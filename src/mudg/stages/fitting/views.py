@@ -20,7 +20,7 @@ from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Sweep, Track, View
-from mudg.core.pictures import resize_area, resize_nearest
+from mudg.core.pictures import resize_area, resize_nearest, to_bytes
 from mudg.data import scene as scenefile
 from mudg.data.clips.condition import ConditionRules, project_sparse
 from mudg.data.observations import list_observation_sets, read_observations
@@ -262,7 +262,7 @@ def stored_observation(name: str, observation: Observation, classes: Sequence[in
     semantics = None if observation.semantics is None else observation.semantics.numpy().astype(np.uint8)
     return StoredView(
         name, observation.view, observation.kind, observation.source,
-        (observation.rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy(),
+        to_bytes(observation.rgb),
         None if semantics is None or not classes else to_channels(semantics, classes),
         None if semantics is None else semantics == ID["sky"],
         observation.mask[0].numpy(), None,
