@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, ObservationKind, View
+from mudg.core.pictures import to_bytes
 from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
@@ -57,7 +58,7 @@ class ObservationWriter:
         if not bool(torch.isfinite(observation.rgb).all()):
             count = int((~torch.isfinite(observation.rgb)).sum())
             raise InputError("colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values")
-        rgb = (observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+        rgb = to_bytes(observation.rgb)
         with store.atomic_path(self._out / "rgb" / f"{name}.png") as temporary:
             Image.fromarray(rgb).save(temporary, compress_level=1)
         arrays = {"confidence": _numpy(observation.confidence[0], np.float16), "mask": _numpy(observation.mask[0], np.uint8)}
