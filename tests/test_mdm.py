@@ -284,6 +284,15 @@ def test_every_sampler_costs_one_pass_per_step_and_repeats_itself(sampler):
     assert torch.equal(first.rgb, model.sample(condition, steps=3, sampler=sampler).rgb)
 
 
+def test_a_setting_that_the_sampler_does_not_take_is_refused():
+    model, condition = randomised(TINY), some_condition()
+    with pytest.raises(UsageError, match="dpm_solver does not take the setting eta"):
+        model.sample(condition, steps=2, sampler="dpm_solver", eta=0.5)
+    plain, half = (model.sample(condition, steps=3, eta=eta).rgb for eta in (None, 0.5))
+    assert torch.equal(plain, model.sample(condition, steps=3, eta=1.0).rgb)
+    assert not torch.equal(plain, half)
+
+
 def test_depth_that_contradicts_a_measurement_costs_confidence():
     condition = some_condition(frames=1)
     same = mdm.depth_agreement(condition.depth, condition)

@@ -7,6 +7,7 @@ import torch
 from scipy import ndimage
 from toy_scene import ToyStreet
 
+from mudg import cli
 from mudg.base.errors import InputError, UsageError
 from mudg.core import trajectory
 from mudg.data.clips.condition import ConditionRules, build_conditions
@@ -177,6 +178,16 @@ def test_bad_requests(world, tmp_path):
         made(world, tmp_path / "c", shifts_m=())
     with pytest.raises(UsageError, match="same trajectory"):
         made(world, tmp_path / "d", shifts_m=(1.0, 1.01))
+
+
+def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, capsys):
+    """Before any work: neither scene nor cloud is there, and nothing is written."""
+    words = ["synthesize", str(tmp_path / "scene"), "--fused", str(tmp_path / "fused"), "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--sampler", "dpm_solver", "--eta", "0.5"]) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in ("dpm_solver", "eta", "ddim"))
+    assert list(tmp_path.iterdir()) == []
+    assert cli.main([*words, "--sampler", "ddim", "--eta", "0.5"]) == 3  # on to the next fault: no such scene
 
 
 def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):

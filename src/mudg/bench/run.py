@@ -26,7 +26,7 @@ from mudg.base.errors import UsageError
 from mudg.bench import mdm_ablation
 from mudg.bench import poses as bench_poses
 from mudg.bench import shift as bench_shift
-from mudg.core import flicker
+from mudg.core import flicker, noise
 from mudg.data.clips import from_city
 from mudg.data.clips.condition import ConditionRules, Source, build_condition
 from mudg.data.clips.from_city import CityClipRules
@@ -66,6 +66,7 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
 
 
 def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
+    noise.check_sampler(config.sampler, [] if config.eta is None else ["eta"])
     model = mdm.load(config.model)
     bf16 = choose_bf16(config.precision)
     cities, rules = from_city.LISTS[config.cities][: config.count], CityClipRules(window=model.config.window)

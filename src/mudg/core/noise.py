@@ -18,7 +18,7 @@ A step index `t` runs from 0 (nearly clean) to `steps - 1` (pure noise).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -189,7 +189,7 @@ def ddim(
     step_indices: Sequence[int],
     *,
     prediction: Prediction = "x0",
-    eta: float = 0.0,
+    eta: float = 1.0,
     draw: Callable[[], Tensor] | None = None,
     last: Literal["x0", "first_alpha"] = "x0",
     on_step: Callable[[int, Tensor], None] | None = None,
@@ -229,11 +229,6 @@ def ddim(
     return x
 
 
-def ancestral(denoise: Denoise, start: Tensor, schedule: Schedule, step_indices: Sequence[int], **options: object) -> Tensor:
-    """DDIM with eta 1: fresh noise at every step, as in the original reverse process."""
-    return ddim(denoise, start, schedule, step_indices, **{**options, "eta": 1.0})  # type: ignore[arg-type]
-
-
 def dpm_solver(
     denoise: Denoise,
     start: Tensor,
@@ -242,14 +237,13 @@ def dpm_solver(
     *,
     prediction: Prediction = "x0",
     on_step: Callable[[int, Tensor], None] | None = None,
-    **_: object,
 ) -> Tensor:
     """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order from two consecutive estimates of x0, deterministic.
 
     With lambda = log(alpha / sigma) and h its step, x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) D, where D is
     extrapolated from the last two estimates. A first step at zero SNR (lambda = -infinity) is taken at first order, and so
-    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. `eta` and `draw`
-    are not used. A dynamic rescale is refused. Arguments and result as for `ddim`.
+    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. A dynamic rescale
+    is refused. Arguments and result as for `ddim`.
     """
     if bool((schedule.scale != 1).any()):
         raise UsageError("dpm_solver does not know the dynamic rescale", expected="sampler = ddim", got="base_scale set")
@@ -275,36 +269,6 @@ def dpm_solver(
     return x
 
 
-def renoise(
-    denoise: Denoise,
-    start: Tensor,
-    schedule: Schedule,
-    step_indices: Sequence[int],
-    *,
-    prediction: Prediction = "x0",
-    draw: Callable[[], Tensor] | None = None,
-    on_step: Callable[[int, Tensor], None] | None = None,
-    **_: object,
-) -> Tensor:
-    """Few-step sampling: state x0, add fresh noise for the next level, repeat (as consistency models are sampled).
-
-    All of the noise is fresh at each step, so an error of the first estimate is not carried on. Meant for 1 to 4 steps.
-    Arguments and result as for `ddim`; a dynamic rescale multiplies x0 as in training.
-    """
-    if draw is None and len(step_indices) > 1:
-        raise UsageError("stochastic sampling needs a source of noise", where="noise.renoise")
-    x, x0 = start, start
-    for number, t in enumerate(step_indices):
-        x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0]
-        x0 = x0 / schedule.scale[t]
-        if on_step is not None:
-            on_step(number, x0)
-        if number + 1 < len(step_indices) and draw is not None:
-            following = step_indices[number + 1]
-            x = schedule.alpha[following] * schedule.scale[following] * x0 + schedule.sigma[following] * draw()
-    return x0
-
-
 def partial_steps(indices: Sequence[int], steps: int, strength: float) -> list[int]:
     """The part of descending step `indices` that a start from given data runs: those below `strength` * steps.
 
@@ -316,11 +280,23 @@ def partial_steps(indices: Sequence[int], steps: int, strength: float) -> list[i
     return kept or [indices[-1]]
 
 
-SAMPLERS: dict[str, Callable[..., Tensor]] = {
-    "ddim": ddim,
-    "ancestral": ancestral,
-    "dpm_solver": dpm_solver,
-    "renoise": renoise,
-}
-"""Every sampler by name. A new one is a function with the signature of `ddim` and one row here. Each costs one denoiser
-pass per step (two with classifier-free guidance)."""
+SAMPLERS: dict[str, Callable[..., Tensor]] = {"ddim": ddim, "dpm_solver": dpm_solver}
+"""Every sampler by name. Each costs one denoiser pass per step (two with classifier-free guidance). A new one is a function
+that takes the positional arguments, `prediction` and `on_step` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""
+
+SAMPLER_SETTINGS: dict[str, tuple[str, ...]] = {"ddim": ("eta", "draw", "last"), "dpm_solver": ()}
+"""Sampler -> its further settings. Any other is refused by `check_sampler`, never ignored."""
+
+
+def check_sampler(sampler: str, settings: Iterable[str] = ()) -> None:
+    """UsageError unless there is such a sampler and it takes all `settings` (names of arguments)."""
+    if sampler not in SAMPLERS:
+        raise UsageError("unknown sampler", expected=", ".join(SAMPLERS), got=sampler)
+    for name in settings:
+        if name not in SAMPLER_SETTINGS[sampler]:
+            takers = ", ".join(other for other, taken in SAMPLER_SETTINGS.items() if name in taken)
+            raise UsageError(
+                f"the sampler {sampler} does not take the setting {name}", where=f"sampler {sampler}",
+                expected=f"{name} with {takers}" if takers else ", ".join(SAMPLER_SETTINGS[sampler]) or "no settings", got=name,
+                remedy=f"leave {name} out, or choose a sampler that takes it",
+            )  # fmt: skip

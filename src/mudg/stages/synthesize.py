@@ -30,7 +30,7 @@ from mudg.base import log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
-from mudg.core import trajectory
+from mudg.core import noise, trajectory
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.clips.condition import ConditionRules, Recorded, Source, Sparse, build_conditions
 from mudg.data.cloudfile import read_fused
@@ -78,7 +78,9 @@ def run(
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
-    if published_model.is_published(config.model):
+    published = published_model.is_published(config.model)
+    noise.check_sampler(config.sampler, [*(["last"] if published else []), *([] if config.eta is None else ["eta"])])
+    if published:
         if fitted is not None:
             raise UsageError("a published-type model takes points only", where="--fitted", remedy="leave it out")
         config = replace(config, processes=config.processes or 1)  # one copy of a large model in memory

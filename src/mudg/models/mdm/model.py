@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -477,7 +477,7 @@ class MDM(nn.Module):
         seed: int = 0,
         index: int = 0,
         sampler: str = "ddim",
-        eta: float = 1.0,
+        eta: float | None = None,
         modalities: Sequence[Modality] = MODALITIES,
         n_samples: int = 1,
         known: Mapping[Modality, Tensor] | None = None,
@@ -491,7 +491,7 @@ class MDM(nn.Module):
         condition   T views; H and W multiples of `config.pixel_multiple`
         steps       denoiser passes (per modality unless joint); 1 is the regression of the clip on its condition
         seed, index all noise is drawn from (seed, index): same in, same out
-        sampler     a row of `noise.SAMPLERS`
+        sampler, eta  a row of `noise.SAMPLERS`, and the noise it adds between steps (None = its own default)
         known       latents [k,C,h,w] of the clip's first k frames, from the previous window: they are kept
         start       latents [T,C,h,w] of all modalities to start from instead of pure noise, for example of the condition
                     (`condition_latents`) or of a render; `strength` in (0, 1] is the share of the schedule that is run
@@ -501,7 +501,7 @@ class MDM(nn.Module):
 
         Measured depth (`condition.valid`) replaces generated depth.
         """
-        check_request(sampler, modalities)
+        check_request(sampler, modalities, () if eta is None else ("eta",))
         encoded = self.encode_condition(condition)
         passes = self.passes if self.config.joint else tuple((m,) for m in MODALITIES if m in modalities)
         drawn: list[dict[Modality, Tensor]] = []
@@ -555,7 +555,7 @@ class MDM(nn.Module):
         steps: int,
         noise_seed: int,
         sampler: str,
-        eta: float,
+        eta: float | None,
         known: Mapping[Modality, Tensor] | None,
         start: Mapping[Modality, Tensor] | None,
         strength: float,
@@ -592,18 +592,24 @@ class MDM(nn.Module):
 
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):  # around all steps: the weights are converted once
             x = noise.SAMPLERS[sampler](
-                denoise, begin, self.schedule, indices, prediction=self.config.head, eta=eta, draw=draw, on_step=watch
-            )
+                denoise, begin, self.schedule, indices, prediction=self.config.head, on_step=watch,
+                **sampler_settings(sampler, draw, eta=eta),
+            )  # fmt: skip
         moved = torch.stack([(e - x[:, :, : sizes[0]]).abs().mean(2, keepdim=True) for e in estimates]).mean(0)
         return dict(zip(names, x.split(sizes, 2))), moved
 
 
-def check_request(sampler: str, modalities: Sequence[str]) -> None:
-    """UsageError unless there is such a sampler and at least one modality is asked for, all of them known."""
-    if sampler not in noise.SAMPLERS:
-        raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
+def check_request(sampler: str, modalities: Sequence[str], settings: Sequence[str]) -> None:
+    """UsageError unless there is a sampler that takes these settings and at least one modality is asked for, all of them known."""
+    noise.check_sampler(sampler, settings)
     if not modalities or any(m not in MODALITIES for m in modalities):
         raise UsageError("unknown or no modality", expected=", ".join(MODALITIES), got=str(list(modalities)))
+
+
+def sampler_settings(sampler: str, draw: Callable[[], Tensor], **given: Any) -> dict[str, Any]:
+    """Arguments for a sampler: what was `given` (None = its own default), and the source of noise if it draws any."""
+    settings = {name: value for name, value in given.items() if value is not None}
+    return settings | ({"draw": draw} if "draw" in noise.SAMPLER_SETTINGS[sampler] else {})
 
 
 def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:

@@ -27,7 +27,15 @@ from mudg.core import noise
 from mudg.core.align import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
 from mudg.models.mdm.codec import MODALITIES, Modality
-from mudg.models.mdm.model import LABELS, Losses, Sample, check_request, confidence_of, depth_agreement
+from mudg.models.mdm.model import (
+    LABELS,
+    Losses,
+    Sample,
+    check_request,
+    confidence_of,
+    depth_agreement,
+    sampler_settings,
+)
 from mudg.models.published.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, ImageTower, TowerConfig
 from mudg.models.published.kl_vae import Autoencoder, AutoencoderConfig
 from mudg.models.published.resampler import Resampler, ResamplerConfig
@@ -391,7 +399,7 @@ class PublishedMDM(nn.Module):
         seed: int = 0,
         index: int = 0,
         sampler: str = "ddim",
-        eta: float = 1.0,
+        eta: float | None = None,
         modalities: Sequence[Modality] = MODALITIES,
         n_samples: int = 1,
         known: Mapping[Modality, Tensor] | None = None,
@@ -410,7 +418,7 @@ class PublishedMDM(nn.Module):
         align       bring each frame's depth to the measured scale (`core.align`); otherwise depth is what the model says
         Other arguments as in `MDM.sample`.
         """
-        check_request(sampler, modalities)
+        check_request(sampler, modalities, ("last",) if eta is None else ("last", "eta"))
         self.check_frames(len(condition.views))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16 and self.dtype == torch.float32):
             before = known.get("rgb") if known else None
@@ -462,7 +470,7 @@ class PublishedMDM(nn.Module):
         seed: int,
         index: int,
         sampler: str,
-        eta: float,
+        eta: float | None,
         start: Mapping[Modality, Tensor] | None,
         strength: float,
     ) -> tuple[dict[Modality, Tensor], Tensor]:
@@ -495,10 +503,8 @@ class PublishedMDM(nn.Module):
             self.schedule,
             indices,
             prediction="v",
-            eta=eta,
-            draw=draw,
-            last="first_alpha",
             on_step=watch,
+            **sampler_settings(sampler, draw, eta=eta, last="first_alpha"),
         )
         moved = torch.stack([(e - x[0]).abs().mean(1, keepdim=True) for e in estimates]).mean(0)
         return {m: x[n] for n, m in enumerate(names)}, moved

@@ -22,10 +22,11 @@ class SynthesizeConfig:
     """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
     steps: int = Field(default=2, ge=1, le=1000)
     """Denoising steps. More give more texture, and less agreement with the truth pixel by pixel."""
-    sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
-    """How the steps are taken. Each costs one pass of the network per step."""
-    eta: float = Field(default=1.0, ge=0, le=1)
-    """Noise that ddim adds between steps: 0 = deterministic, 1 = ancestral."""
+    sampler: Literal["ddim", "dpm_solver"] = "ddim"
+    """How the steps are taken. Each costs one pass of the network per step. ddim: first order, with fresh noise between steps.
+    dpm_solver: second order and deterministic, for many steps."""
+    eta: float | None = Field(default=None, ge=0, le=1)
+    """ddim: noise added between steps, 0 = deterministic, 1 = as much as the reverse process has (not given: 1)."""
     start: Literal["noise", "condition", "render"] = "noise"
     """condition, render: start from the condition, or from the fitted scene's renders, with noise on it, and run only the
     share `strength` of the schedule."""

@@ -44,7 +44,7 @@ def score(
     steps: int,
     seed: int,
     bf16: bool,
-    eta: float = 1.0,
+    eta: float | None = None,
     sampler: str = "ddim",
     prepare: Callable[[Batch], Batch] | None = None,
     picture: Path | None = None,
