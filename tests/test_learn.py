@@ -12,7 +12,8 @@ from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.data.clips import from_city
 from mudg.data.clips import shards as clip_shards
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import GeneratedClip
+from mudg.models.mdm import files
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import score as learn_score
@@ -24,7 +25,7 @@ def clips(tmp_path_factory):
 
 
 def weights(folder):
-    return mdm.load(folder).state_dict()
+    return files.load(folder).state_dict()
 
 
 def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, tmp_path, monkeypatch):
@@ -131,7 +132,7 @@ def test_clips_that_never_come_are_an_error(tmp_path):
 def test_perfect_samples_score_perfectly(clips):
     batch = clip_shards.read_batch(clips, [(from_city.HELD_OUT, 0, range(WINDOW))])
     depth = batch.depth[0].clamp(max=100.0)
-    sample = mdm.Sample(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
+    sample = GeneratedClip(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
     row, counts = learn_score.score_clip(batch, sample)
     assert row["psnr"] == float("inf")
     assert row["abs_rel"] == pytest.approx(0.0, abs=1e-6)

@@ -10,8 +10,7 @@ from toy_clips import WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.models.mdm import model as mdm
-from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm import files
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
@@ -35,31 +34,18 @@ def stage_one(clips, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def separate(tmp_path_factory):
-    """A model with one pass per modality, in which the modality label matters, and a reference image in the first frame."""
+def unrefined(tmp_path_factory):
+    """A model without refiner, of another network than the settings describe by default."""
     model = MDM(
         MDMConfig(
-            codec=CodecConfig(semantics_code="palette"),
-            joint=False,
-            head="v",
-            copy_condition=False,
-            backdrop=False,
-            mask_planes="none",
-            reference="first_frame",
-            widths=(16, 32),
-            blocks=(1, 1),
-            spatial_attention=(False, True),
-            temporal_attention=(False, True),
-            given_classes=False,
-            refine_widths=(),
-            refine_blocks=(),
-            window=WINDOW,
-        )  # fmt: skip
-    )
+            widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), patch=2,
+            refine_widths=(), refine_blocks=(), window=WINDOW, area_px=192 * 128,
+        )
+    )  # fmt: skip
     learn.draw_weights(model.net, 3, "weights")
     learn.draw_weights(model.codec, 3, "codec")
-    folder = tmp_path_factory.mktemp("separate") / "model"
-    mdm.save(model, folder, "card", {})
+    folder = tmp_path_factory.mktemp("unrefined") / "model"
+    files.save(model, folder, "card", {})
     return folder
 
 
@@ -68,10 +54,10 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, sta
         large_clips, start=str(stage_one), steps=1, width=96, height=64, frozen="temporal_transformers", average_decay=0
     )
     begun, fresh = learn.starting_model(config)
-    before, start = mdm.load(stage_one).state_dict(), begun.state_dict()
+    before, start = files.load(stage_one).state_dict(), begun.state_dict()
     assert not fresh
     assert all(torch.equal(before[name], start[name]) for name in before)
-    after = mdm.load(learn.run(config, tmp_path / "two")).state_dict()
+    after = files.load(learn.run(config, tmp_path / "two")).state_dict()
     kept = {name for name in before if name.startswith("codec.") or ".temporal." in name}
     assert kept > {n for n in before if n.startswith("codec.")}
     assert all(torch.equal(before[name], after[name]) for name in kept)
@@ -80,14 +66,14 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, sta
     assert not list((tmp_path / "two" / "steps").glob("*/average.*"))  # no average was asked for
 
 
-def test_the_modality_embedding_survives_a_change_of_stage(stage_one, separate, clips):
+def test_the_modality_embedding_survives_a_change_of_stage(stage_one, unrefined, clips):
     """It once was overwritten by the time embedding in the published second stage."""
-    for folder, changes in ((stage_one, {}), (stage_one, {"refine_widths": (16, 16)}), (separate, {})):
-        if folder is separate:
+    for folder, changes in ((stage_one, {}), (stage_one, {"refine_widths": (16, 16)}), (unrefined, {})):
+        if folder is unrefined:
             config = replace(learn.LearnConfig(), start=str(folder), clips=str(clips), window=WINDOW)
         else:
             config = tiny(clips, start=str(folder), **changes)
-        label = mdm.load(folder).net.label.state_dict()
+        label = files.load(folder).net.label.state_dict()
         begun, _ = learn.starting_model(config)
         assert all(torch.equal(value, begun.net.label.state_dict()[name]) for name, value in label.items())
         assert not torch.equal(label["0.weight"], begun.net.time.state_dict()["0.weight"])
@@ -104,20 +90,20 @@ def test_frozen_layers_need_some_to_freeze(clips):
     assert count == sum(p.numel() for n, p in other.net.named_parameters() if n in frozen)
 
 
-def test_an_embedded_kind_of_network_need_not_be_described_again(separate, clips, tmp_path):
+def test_an_embedded_kind_of_network_need_not_be_described_again(unrefined, clips, tmp_path):
     config = replace(
-        tiny(clips, start=str(separate), steps=2, log_every=1, augment=False),
+        tiny(clips, start=str(unrefined), steps=2, log_every=1, augment=False),
         **{n: getattr(learn.LearnConfig(), n) for n in ("widths", "blocks", "spatial_attention", "temporal_attention")},
         refine_widths=learn.LearnConfig().refine_widths, refine_blocks=learn.LearnConfig().refine_blocks,
     )  # fmt: skip
-    model = mdm.load(learn.run(config, tmp_path / "run"))
-    assert model.config == replace(mdm.load(separate).config, area_px=48 * 32)
+    model = files.load(learn.run(config, tmp_path / "run"))
+    assert model.config == replace(files.load(unrefined).config, area_px=48 * 32)
 
 
-def test_kept_latents_change_nothing_and_are_made_once(separate, clips, tmp_path, monkeypatch):
+def test_kept_latents_change_nothing_and_are_made_once(unrefined, clips, tmp_path, monkeypatch):
     def losses(name, **changes):
         config = replace(
-            learn.LearnConfig(), start=str(separate), clips=str(clips), workers=0, cities=3, first_cities=3, held_out=1, steps=3,
+            learn.LearnConfig(), start=str(unrefined), clips=str(clips), workers=0, cities=3, first_cities=3, held_out=1, steps=3,
             width=48, height=32, window=WINDOW, batch_frames=8, full_window_share=1.0, augment=False, reference_dropout=0.0,
             score_steps=1, sample_steps=1, log_every=1, precision="float32", **changes,
         )  # fmt: skip
@@ -134,16 +120,17 @@ def test_kept_latents_change_nothing_and_are_made_once(separate, clips, tmp_path
     )  # fmt: skip
     plain, kept = losses("plain"), losses("kept", cache_latents=True)
     assert kept == pytest.approx(plain, rel=1e-6)
-    files = list((tmp_path / "kept" / "latents").rglob("*.safetensors"))
-    assert 0 < len(encoded) == len(files) <= 5 * 6  # five encoded maps of at most six clips
-    model = mdm.load(separate)
-    assert {path.parent.parent.name for path in files} == {learn_latents.codec_digest(model.codec)[:16]}
+    kept_files = list((tmp_path / "kept" / "latents").rglob("*.safetensors"))
+    assert 0 < len(encoded) == len(kept_files) <= 6 * 6  # six encoded maps of at most six clips
+    model = files.load(unrefined)
+    assert {path.parent.parent.name for path in kept_files} == {learn_latents.codec_digest(model.codec)[:16]}
     with pytest.raises(UsageError, match="latents cannot be kept"):
         learn.run(tiny(clips, cache_latents=True), tmp_path / "varied")
 
 
 def test_a_latent_belongs_to_its_codec_and_its_pixels(tmp_path):
-    codec, other = (MDM(MDMConfig(widths=(16,), blocks=(1,), spatial_attention=(False,), temporal_attention=(False,))).codec
+    codec, other = (MDM(MDMConfig(widths=(16,), blocks=(1,), spatial_attention=(False,), temporal_attention=(False,), patch=2,
+                            refine_widths=(), refine_blocks=(), window=8, area_px=24576)).codec
                     for _ in range(2))  # fmt: skip
     with torch.no_grad():
         other.rgb_scale.mul_(2)

@@ -15,7 +15,8 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
+from mudg.models.mdm.model import MDM
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import parallel as learn_parallel
@@ -84,7 +85,7 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     off = {step: abs(one[step] - other[step]) / one[step] for step in (3, 4, 5, 6)}
     print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
     assert max(off.values()) < SAME, off
-    first, second = (mdm.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
+    first, second = (files.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
     for name in first:  # stored in half precision
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
@@ -109,7 +110,7 @@ def test_torchrun_trains(clips, tmp_path):
     command = torchrun(clips, tmp_path / "out")
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
-    assert mdm.load(tmp_path / "out" / "model").config.widths == (16, 32)
+    assert files.load(tmp_path / "out" / "model").config.widths == (16, 32)
 
 
 @pytest.mark.slow
@@ -147,16 +148,8 @@ def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
         assert own.shift_m == whole.shift_m[part]
 
 
-@pytest.mark.parametrize("kind", ["joint", "separate"])
-def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips, kind):
-    config = learn.model_config(tiny(clips))
-    if kind == "separate":
-        codec = mdm.CodecConfig(semantics_code="palette")
-        config = mdm.MDMConfig(
-            codec=codec, joint=False, head="v", copy_condition=False, backdrop=False, given_classes=False, widths=(16, 32),
-            blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), refine_widths=(), refine_blocks=(),
-        )  # fmt: skip
-    model = mdm.MDM(config)
+def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
+    model = MDM(learn.model_config(tiny(clips)))
     learn.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
     weights = learn_clips.class_weights(clips, 2, 0.5)

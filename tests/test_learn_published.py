@@ -21,12 +21,12 @@ from mudg.data.clips.condition import ConditionRules, build_condition
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
+from mudg.models.published import files as published_files
 from mudg.models.published import model as published
 from mudg.models.published.model import PAPER_DROPOUT, RELEASED_DROPOUT, ContextDropout, PublishedMDM
 from mudg.stages import convert, fuse, learn, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import published_model
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +61,11 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
         one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
     )
     begun, fresh = learn.starting_model(config)
-    first, start = (published_model.read(folder).state_dict() for folder in (converted, one))
+    first, start = (published_files.load(folder).state_dict() for folder in (converted, one))
     assert not fresh
     assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
     two = learn.run(config, tmp_path / "two")
-    last = published_model.read(two)
+    last = published_files.load(two)
     end = last.state_dict()
     trained = {name for name in first if name.startswith(("net.", "image_tokens."))}
     temporal = begun.temporal_parameters("transformers")
@@ -76,7 +76,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
         assert not torch.equal(state["net.label.0.weight"], first["net.label.0.weight"])
         assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
     assert (last.config.width, last.config.height) == (36, 32)
-    assert torch.equal(last.schedule.scale, published_model.read(converted).schedule.scale)
+    assert torch.equal(last.schedule.scale, published_files.load(converted).schedule.scale)
     assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
     assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
     view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
@@ -159,7 +159,7 @@ def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
     off = {step: abs(one[step] - other[step]) / one[step] for step in (1, 2, 3)}
     print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
     assert max(off.values()) < SAME, off
-    first, second = (published_model.read(tmp_path / name / "model").state_dict() for name in ("one", "both"))
+    first, second = (published_files.load(tmp_path / name / "model").state_dict() for name in ("one", "both"))
     for name in first:
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 

@@ -16,7 +16,8 @@ from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_city import HELD_OUT
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.scene import SceneWriter, read_image, read_label, read_points, read_scene
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm.model import MDM
+from mudg.models.mdm.refine import Refined, refine_loss
 from mudg.stages import fuse, learn
 from mudg.stages.config import FuseConfig
 
@@ -120,7 +121,7 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
     clip_shards.write_shard(
         tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], [0.0], gaps=True)
     )
-    model = mdm.MDM(learn.model_config(tiny(tmp_path, width=64, height=32, window=3)))
+    model = MDM(learn.model_config(tiny(tmp_path, width=64, height=32, window=3)))
     batch = clip_shards.read_batch(tmp_path, [(0, 0, range(3))])
     assert not bool(batch.depth_known.all())
 
@@ -128,8 +129,8 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
         shown = replace(batch, depth=torch.where(batch.depth_known, batch.depth, depth))
         truth = model.pixel_truth(shown.rgb, shown.depth, shown.semantics, shown.depth_known)
         code = truth.depth_code.clone().requires_grad_()
-        made = mdm.Refined(truth.rgb, torch.zeros_like(code), torch.zeros(3, 19, 32, 64), torch.zeros_like(code))
-        return float(mdm.refine_loss(made, truth)["pixel_depth"])
+        made = Refined(truth.rgb, torch.zeros_like(code), torch.zeros(3, 19, 32, 64), torch.zeros_like(code))
+        return float(refine_loss(made, truth)["pixel_depth"])
 
     assert terms(torch.tensor(3.0)) == terms(torch.tensor(90.0))
     mirrored = clip_shards.vary(batch, np.random.Generator(np.random.PCG64(1)))

@@ -255,15 +255,6 @@ def test_every_sampler_takes_its_settings_and_no_other():
         noise.check_sampler("magic")
 
 
-def test_a_start_from_given_data_runs_the_late_steps_only():
-    indices = noise.trailing_steps(1000, 10)
-    assert noise.partial_steps(indices, 1000, 1.0) == indices
-    assert noise.partial_steps(indices, 1000, 0.5) == [499, 399, 299, 199, 99]
-    assert noise.partial_steps(indices, 1000, 0.01) == [99]
-    with pytest.raises(UsageError):
-        noise.partial_steps(indices, 1000, 0.0)
-
-
 def test_solver_refuses_what_it_does_not_know():
     with pytest.raises(UsageError, match="rescale"):
         noise.dpm_solver(lambda x, t: x, torch.zeros(1, 2), Schedule(ScheduleConfig(base_scale=0.7)), [999, 499])

@@ -14,7 +14,7 @@ from mudg.data.clips.condition import ConditionRules, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import list_observation_sets, read_observations
 from mudg.data.scene import read_scene
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import fit, fuse, synthesize
@@ -33,10 +33,11 @@ def world(tmp_path_factory):
     model = MDM(
         MDMConfig(
             widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4,
-            embed_width=16, codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+            embed_width=16, codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(64, 128), refine_blocks=(2, 3),
+            area_px=192 * 128,
         )
     )  # fmt: skip
-    mdm.save(model, root / "model", "", {})
+    files.save(model, root / "model", "", {})
     config = SynthesizeConfig(
         cameras=("front",), shifts_m=(1.0,), model=str(root / "model"), steps=2, width_px=48, full_size=False,
         precision="float32", processes=1,
@@ -138,16 +139,6 @@ def test_overlap_must_leave_something_new():
         synthesize.windows(20, 8, 8)
 
 
-def test_model_size_keeps_aspect_and_area():
-    assert synthesize.model_size(480, 320, 16, 128 * 192) == (192, 128)
-    assert synthesize.model_size(1920, 1280, 16, 128 * 192) == (192, 128)
-    width, height = synthesize.model_size(1242, 375, 16, 128 * 192)
-    assert width % 16 == height % 16 == 0
-    assert abs(width / height / (1242 / 375) - 1) < 0.1
-    assert abs(width * height / (128 * 192) - 1) < 0.3
-    assert synthesize.model_size(480, 320, 16, 1, width_px=100) == (96, 64)
-
-
 def test_detail_is_given_back_where_the_sample_agrees(world):
     generator = torch.Generator().manual_seed(0)
     fine = torch.rand(2, 3, 32, 48, generator=generator)
@@ -187,11 +178,14 @@ def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, cap
     said = capsys.readouterr().err
     assert all(word in said for word in ("dpm_solver", "eta", "ddim"))
     assert list(tmp_path.iterdir()) == []
+    for flags, word in ((("--guidance", "3"), "guidance"), (("--memory-budget-gb", "3"), "memory-budget")):
+        assert cli.main([*words, *flags]) == 2
+        assert word in capsys.readouterr().err
     assert cli.main([*words, "--sampler", "ddim", "--eta", "0.5"]) == 3  # on to the next fault: no such scene
 
 
 def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
-    """Views change where nothing was measured, the scene's class stands there, and its renders may be started from."""
+    """Views change where nothing was measured, and the scene's class stands there."""
     root, config = world
     fitted = fit.run(
         FitConfig(method="street_gaussians", iterations=4, initial_gaussians=900, max_gaussians=1500), root / "scene", root / "fused",
@@ -216,9 +210,3 @@ def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
     )
     usual = frames_of(made(world, tmp_path / "plain") / "front_shift+1.0")
     assert not all(torch.equal(a.rgb, b.rgb) for a, b in zip(usual, frames_of(run("helped") / "front_shift+1.0")))
-    assert len(frames_of(run("started", start="render", strength=0.5) / "front_shift+1.0")) == FRAMES
-    model = mdm.load(root / "model")
-    latents = look.latents(model, [view.resized(48, 32)])
-    assert torch.equal(latents["rgb"], model.codec.encode_rgb(look.observation(view.resized(48, 32)).rgb[None]))
-    with pytest.raises(UsageError, match="nothing to start from"):
-        made(world, tmp_path / "refused", start="render")

@@ -228,8 +228,8 @@ VERBS: dict[str, Verb] = {
         _score,
     ),
     "bench": Verb(
-        "Measurements against exact truth: mdm, mdm-ablation, poses, shift.",
-        ("mudg bench mdm --out runs/bench", "mudg bench mdm-ablation --out runs/ablation", "mudg bench poses --out runs/poses",
+        "Measurements against exact truth: mdm, poses, shift.",
+        ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses",
          "mudg bench shift --list development --logs 1 --variant strong=virtual_probability:0.4 --out runs/shift"),
         _bench,
     ),

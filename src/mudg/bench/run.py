@@ -2,7 +2,6 @@
 
 mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
                without given classes, at several numbers of steps, and the seam between windows of a longer video
-mdm-ablation   what of its condition the model lives on (see `bench_ablation`)
 poses          how much of the error of tracked boxes a fit takes out (see `bench_poses`); needs no diffusion model
 shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
 
@@ -23,14 +22,14 @@ import torch
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
-from mudg.bench import mdm_ablation
 from mudg.bench import poses as bench_poses
 from mudg.bench import shift as bench_shift
-from mudg.core import flicker, noise
+from mudg.core import flicker
 from mudg.data.clips import from_city
 from mudg.data.clips.condition import ConditionRules, Source, build_condition
 from mudg.data.clips.from_city import CityClipRules
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import SampleRequest
+from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages.config import BenchConfig, SynthesizeConfig
 from mudg.stages.learning import score as learn_score
@@ -52,8 +51,7 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
         return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
         raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
-    read = {"mdm": config.model, "mdm-ablation": "embedded"}.get(name)  # poses reads no diffusion model
-    inputs = {} if read is None else {"model": mdm.digest(read)}
+    inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     directory = store.RunDir.open(out, f"bench {name}", to_dict(config), inputs, _VERSION, overwrite)
     if directory.complete:
         return directory.reused()
@@ -66,12 +64,12 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
 
 
 def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    noise.check_sampler(config.sampler, [] if config.eta is None else ["eta"])
-    model = mdm.load(config.model)
+    MDM.check_request(SampleRequest(1, sampler=config.sampler, eta=config.eta))
+    model = mdm_files.load(config.model)
     bf16 = choose_bf16(config.precision)
     cities, rules = from_city.LISTS[config.cities][: config.count], CityClipRules(window=model.config.window)
     from_city.write_missing(rules, cities, out / "clips")
-    result: dict[str, Any] = {"cities": list(cities), "model": mdm.digest(config.model), "bf16": bf16, "rows": []}
+    result: dict[str, Any] = {"cities": list(cities), "model": mdm_files.digest(config.model), "bf16": bf16, "rows": []}
     lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
     with log.task("scoring", 2 * len(config.steps)) as bar:
         for given in (True, False):
@@ -116,9 +114,7 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
         )
         shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
-        made = model.sample(condition, steps=usual.steps, seed=config.seed, index=number, known=known, bf16=bf16)
-        if made.rgb is None:
-            raise UsageError("the model makes no colour", where=config.model)
+        made = model.sample(condition, SampleRequest(usual.steps, config.seed, number, known=known, bf16=bf16))
         frames += list(made.rgb[shared if tail else 0 :])
         tail = dict(made.latents)
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
@@ -146,7 +142,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
-    "mdm-ablation": mdm_ablation.measure,
     "poses": bench_poses.measure,
 }
 """Every measurement that is one folder, by name."""

@@ -34,7 +34,7 @@ from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter, read_observations
 from mudg.data.scene import read_scene
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
 from mudg.stages import fit, fuse, ingest, render, score, score_truth, synthesize
 from mudg.stages.config import (
@@ -192,7 +192,7 @@ def rows_as_values(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
     """What was asked for, for JSON."""
     return {
-        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm.digest(config.model),
+        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
         "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
         "held_out_every": TEST_EVERY, "ablation": config.ablation,
     }  # fmt: skip

@@ -269,17 +269,6 @@ def dpm_solver(
     return x
 
 
-def partial_steps(indices: Sequence[int], steps: int, strength: float) -> list[int]:
-    """The part of descending step `indices` that a start from given data runs: those below `strength` * steps.
-
-    At least the last one. strength 1 = all of them, from pure noise (Meng et al., "SDEdit").
-    """
-    if not 0 < strength <= 1:
-        raise UsageError("strength is out of range", expected="0 < strength <= 1", got=str(strength))
-    kept = [t for t in indices if t < strength * steps]
-    return kept or [indices[-1]]
-
-
 SAMPLERS: dict[str, Callable[..., Tensor]] = {"ddim": ddim, "dpm_solver": dpm_solver}
 """Every sampler by name. Each costs one denoiser pass per step (two with classifier-free guidance). A new one is a function
 that takes the positional arguments, `prediction` and `on_step` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""

@@ -21,11 +21,11 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.data import weights
 from mudg.models.published import clip
+from mudg.models.published import files as published_files
 from mudg.models.published.clip import TextTower
 from mudg.models.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
 from mudg.stages import confined, convert_depthlab
 from mudg.stages.config import ConvertConfig
-from mudg.stages.learning import published_model
 
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
@@ -140,7 +140,7 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
         "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
     }  # fmt: skip
-    published_model.write(
+    published_files.save(
         to,
         network,
         tensors,

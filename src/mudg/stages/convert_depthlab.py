@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mudg.base import store
+from mudg.base import shards, store
 from mudg.base.errors import InputError
 from mudg.data import weights
 from mudg.models import folders
@@ -184,7 +184,7 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
     }  # fmt: skip
     with store.atomic_directory(to) as partial:
         parts = {
-            part: {"config": configs[part], "files": weights.write_shards(partial / part, found[part], shard_bytes, dtype)}
+            part: {"config": configs[part], "files": shards.write_shards(partial / part, found[part], shard_bytes, dtype)}
             for part in PARTS
         }  # fmt: skip
         store.write_text(partial / "MODEL_CARD.md", _card(facts))

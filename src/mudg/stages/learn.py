@@ -35,9 +35,10 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.data.clips import from_log
 from mudg.data.clips.from_log import LogClipRules
 from mudg.data.clips.shards import Batch
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.codec import PatchCodec
-from mudg.models.mdm.model import MDM, Losses, MDMConfig
+from mudg.models.mdm.model import MDM, Losses, MDMConfig, same_denoiser, with_refiner
+from mudg.models.published.files import is_published
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import (
     clips as learn_clips,
@@ -47,9 +48,6 @@ from mudg.stages.learning import (
 )
 from mudg.stages.learning import (
     published as learn_published,
-)
-from mudg.stages.learning import (
-    published_model,
 )
 from mudg.stages.learning import (
     score as learn_score,
@@ -111,7 +109,7 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> stor
     asked = {name: value for name, value in to_dict(config).items() if name not in HOW}
 
     def open_it() -> bool:
-        inputs = {"start": mdm.digest(config.start)} if config.start else {}
+        inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
         for number, text in enumerate(config.scenes):
             source = from_log.log_source(text)
             inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
@@ -166,7 +164,7 @@ def _finish(
     store.write_json(directory.path / "metrics.json", scores)
     facts: dict[str, Any] = {"recipe": to_dict(asked), "held_out": scores}
     if config.start:
-        facts["continued_from"] = mdm.facts(config.start)
+        facts["continued_from"] = mdm_files.facts(config.start)
     words = learn_clips.data_words(config, rules)
     kind.save(made, directory.path / "model", kind.card(made, config, scores, words), facts)
     directory.finish({"held_out": scores["average"]})
@@ -176,8 +174,8 @@ def _finish(
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
 
-    With `start` the network is that of the earlier model, grown by a refiner and given classes where the settings ask for
-    them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
+    With `start` the network is that of the earlier model, with a new refiner where the settings ask for
+    one. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
     size and length than before.
 
     Raises:
@@ -186,24 +184,24 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     wanted = model_config(config)
     if not config.start:
         return MDM(wanted), {"codec", "refiner"}
-    if published_model.is_published(config.start):
+    if is_published(config.start):
         if not _says_nothing(config):
             raise UsageError("the network of a published-type model cannot be described", where="--start",
                              remedy="leave out widths, blocks, attention, patch and refiner")  # fmt: skip
         return learn_published.starting(config), set()
-    before = mdm.load(config.start)
+    before = mdm_files.load(config.start)
     if before.config.window != config.window:
         log.info(f"learn: clips of {config.window} frames; the model to continue from had {before.config.window}")
     now = {"window": config.window, "area_px": wanted.area_px}
     resized = MDM(replace(before.config, **now))
     resized.load_state_dict(before.state_dict())
-    if wanted != resized.config and not mdm.same_denoiser(resized.config, wanted) and _says_nothing(config):
+    if wanted != resized.config and not same_denoiser(resized.config, wanted) and _says_nothing(config):
         log.info("learn: the network is that of the model to continue from")
         wanted = resized.config
     if wanted == resized.config:
         return resized, set()
     grows_refiner = bool(wanted.refine_widths) and before.refiner is None
-    return mdm.grown(resized, wanted), {"refiner"} if grows_refiner else set()
+    return with_refiner(resized, wanted), {"refiner"} if grows_refiner else set()
 
 
 def _says_nothing(config: LearnConfig) -> bool:

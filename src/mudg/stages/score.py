@@ -34,7 +34,7 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scene import read_scene
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.score_truth import (
@@ -148,7 +148,7 @@ def _distances(config: ScoreConfig) -> dict[str, Callable[[metrics.Pair], float 
     """The rows that need weights and have them."""
     found: dict[str, Callable[[metrics.Pair], float | None]] = {}
     if config.perceptual_views:
-        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
+        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec))
     if config.lpips_weights:
         state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
         network = LpipsFeatures(state, config.lpips_weights)

@@ -152,7 +152,7 @@ class UNet(nn.Module):
         widths, embed, area = config.widths, config.embed_width, config.patch**2
         self.patch = config.patch
         self.time = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
-        self.label = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
+        self.label = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))  # of label 0: all modalities at once
         self.enter = nn.Conv2d(planes_in * area, widths[0], 1)
         width, skips = widths[0], [widths[0]]
         self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
@@ -183,10 +183,10 @@ class UNet(nn.Module):
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
 
-    def forward(self, x: Tensor, t: Tensor, label: Tensor) -> Tensor:
-        """`x` [B,T,planes_in,h,w], `t` and `label` i64[B] -> f32 [B,T,planes_out,h,w]."""
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        """`x` [B,T,planes_in,h,w], `t` i64[B] -> f32 [B,T,planes_out,h,w]."""
         batch, frames = x.shape[:2]
-        embedding = self.time(sinusoid(t, 64)) + self.label(sinusoid(label, 64))
+        embedding = self.time(sinusoid(t, 64)) + self.label(sinusoid(torch.zeros_like(t), 64))
         embedding = functional.silu(embedding).repeat_interleave(frames, 0)
         h = functional.pixel_unshuffle(x.flatten(0, 1), self.patch)
         h = self.enter(h.contiguous(memory_format=torch.channels_last))

@@ -29,13 +29,9 @@ class BenchConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
-    """mdm, mdm-ablation, poses: threads of torch."""
+    """mdm, poses: threads of torch."""
     seed: int = 0
     """Fixes every random draw."""
-    ablation_steps: int = Field(default=1500, ge=1)
-    """mdm-ablation: training steps of each variant."""
-    ablation_cities: int = Field(default=40, ge=1)
-    """mdm-ablation: cities to train on."""
     list: Literal["development", "reported"] = "development"
     """shift: list of logs; nothing is chosen on the reported one."""
     logs: int = Field(default=8, ge=1, le=8)

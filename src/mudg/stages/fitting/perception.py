@@ -12,7 +12,7 @@ from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.core import losses
 from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.stages.config import FitConfig
 
 Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -28,7 +28,7 @@ def perception_of(config: FitConfig) -> Perception:
     if config.virtual_perception == "filters":
         return _compared(FilterBank(), losses.feature_distance)
     if config.virtual_perception == "codec":
-        codec = mdm.load("embedded").codec
+        codec = mdm_files.load("embedded").codec
         return _compared(CodecFeatures(codec.requires_grad_(False)), losses.unit_feature_distance)
     if not config.lpips_weights:
         raise UsageError("LPIPS needs a file of its weights", where="--virtual-perception lpips", remedy="give it with --lpips-weights")

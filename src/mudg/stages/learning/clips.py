@@ -19,9 +19,9 @@ from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_log import LogClipRules, LogSource, LogWindow
 from mudg.data.clips.shards import Batch
 from mudg.data.scene import read_scene
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import sized_to_area
+from mudg.models.mdm.codec import CLASSES
 from mudg.stages.config import LearnConfig
-from mudg.stages.synthesize import model_size
 
 
 def held_out(config: LearnConfig) -> list[int]:
@@ -113,7 +113,7 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
         raise InputError("the scene has no such camera", where=f"--scene-cameras, {scene.root}",
                          expected=", ".join(scene.cameras), got=names[0])  # fmt: skip
     camera = scene.cameras[names[0]]
-    width, height = model_size(camera.width, camera.height, multiple, config.width * config.height)
+    width, height = sized_to_area(config.width * config.height, camera.width / camera.height, multiple)
     if points_alone:
         width, height = config.width, config.height
     return LogClipRules(
@@ -221,9 +221,9 @@ def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
         await_shard(folder, city)
         ids = clip_shards.read_batch(folder, [(city, 0, range(1))]).semantics
         counts += torch.bincount(ids.flatten(), minlength=256)
-    if not bool(counts[: mdm.CLASSES].any()):  # logs without labels
-        return torch.ones(mdm.CLASSES)
-    share = counts[: mdm.CLASSES] / counts[: mdm.CLASSES].sum().clamp(min=1)
+    if not bool(counts[: CLASSES].any()):  # logs without labels
+        return torch.ones(CLASSES)
+    share = counts[: CLASSES] / counts[: CLASSES].sum().clamp(min=1)
     floor = max(float(share[share > 0].min()) if bool((share > 0).any()) else 1.0, 1e-3)
     weight = share.clamp(min=floor) ** -balance
     return (weight / (weight * share).sum().clamp(min=1e-9)).float()

@@ -18,7 +18,8 @@ from torch.nn import functional
 
 from mudg.base import seeds
 from mudg.base.errors import UsageError
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
+from mudg.models.mdm.codec import semantic_shares
 from mudg.models.mdm.model import MDM, Losses
 from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import LearnConfig
@@ -80,7 +81,7 @@ def mdm_loss(objective: Objective, model: MDM, config: LearnConfig, part: Part, 
                                       batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
         cells = functional.avg_pool2d(known.float().flatten(0, 1), model.codec.factor).unflatten(0, known.shape[:2])
         pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics, known)
-        shares = mdm.truth_shares(batch.semantics)
+        shares = semantic_shares(batch.semantics)
     return objective(
         truth, encoded, seeds.torch_generator(config.seed, part.step, "noise"), shares=shares, class_weights=weights,
         depth_known=cells, pixels=pixels, window=refined_window(config, model, part.step), first=part.first,
@@ -109,7 +110,7 @@ def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
 
 
 KINDS: dict[type[nn.Module], Kind] = {
-    MDM: Kind(mdm_loss, mdm.save, learn_score.model_card, mdm_rebuilt),
+    MDM: Kind(mdm_loss, mdm_files.save, learn_score.model_card, mdm_rebuilt),
     PublishedMDM: Kind(
         learn_published.loss, learn_published.save, learn_published.card, learn_published.rebuilt, drops_reference=True,
         points_alone=True,

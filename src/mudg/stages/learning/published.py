@@ -21,9 +21,9 @@ from mudg.base.errors import InputError, UsageError
 from mudg.data.clips.shards import Batch
 from mudg.models.mdm.codec import MODALITIES, Modality
 from mudg.models.mdm.model import Losses
-from mudg.models.published.model import ContextDropout, Encoded, PublishedMDM, Sampling
+from mudg.models.published import files as published_files
+from mudg.models.published.model import ContextDropout, PublishedLatents, PublishedMDM, WorkSplit
 from mudg.stages.config import LearnConfig
-from mudg.stages.learning import published_model
 from mudg.stages.learning import score as learn_score
 
 Objective = Callable[..., Losses]
@@ -46,7 +46,7 @@ def starting(config: LearnConfig) -> PublishedMDM:
         UsageError: clips of another length than the image tokens are made for, or of a size that does not fit the strides; a
             setting that does not apply to this model.
     """
-    model = published_model.read(Path(config.start), dtype=torch.float32)
+    model = published_files.load(Path(config.start), dtype=torch.float32)
     frames = model.config.window
     if config.window != frames or config.full_window_share < 1:
         raise UsageError(
@@ -63,7 +63,7 @@ def starting(config: LearnConfig) -> PublishedMDM:
         for value in (*model.parameters(), *model.buffers()):
             value.data = value.data.clone()
     model.config = replace(model.config, width=config.width, height=config.height)
-    model.sampling = replace(Sampling(), frames_at_once=1)
+    model.split = WorkSplit(frames_at_once=1)
     return model
 
 
@@ -108,9 +108,9 @@ def _cells(mask: Tensor, factor: int) -> Tensor:
     return functional.avg_pool2d(mask.float().flatten(0, 1), factor).unflatten(0, mask.shape[:2])
 
 
-def _joined(clips: list[Encoded]) -> Encoded:
+def _joined(clips: list[PublishedLatents]) -> PublishedLatents:
     planes, features, seen = (torch.cat([getattr(c, name) for c in clips]) for name in ("planes", "features", "seen"))
-    return Encoded(planes, features, clips[0].grey, seen)
+    return PublishedLatents(planes, features, clips[0].grey, seen)
 
 
 def rebuilt(model: PublishedMDM, weights: Mapping[str, Tensor]) -> PublishedMDM:
@@ -123,7 +123,7 @@ def rebuilt(model: PublishedMDM, weights: Mapping[str, Tensor]) -> PublishedMDM:
     made.load_state_dict({**fixed, **trained}, assign=True)
     made.requires_grad_(False)
     made.adopt_scale()
-    made.sampling = model.sampling
+    made.split = model.split
     return made.eval()
 
 
@@ -136,7 +136,7 @@ def save(model: PublishedMDM, folder: Path, text: str, facts: Mapping[str, Any])
     handed_on = {name: before[name] for name in ("licence", "caption", "base_scale") if name in before}
     licence = f"\n## Licence\n\n{handed_on['licence']}\n" if "licence" in handed_on else ""
     tensors = {name: value.cpu() for name, value in model.state_dict().items()}
-    published_model.write(folder, model.config, tensors, {**facts, **handed_on}, text + licence)
+    published_files.save(folder, model.config, tensors, {**facts, **handed_on}, text + licence)
 
 
 def card(model: PublishedMDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:

@@ -21,7 +21,8 @@ from mudg.core import metrics
 from mudg.core.flicker import flicker
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.shards import Batch
-from mudg.models.mdm.model import MDM, Sample
+from mudg.models.diffusion import GeneratedClip, SampleRequest
+from mudg.models.mdm.model import MDM
 from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import LearnConfig
 
@@ -58,15 +59,14 @@ def score(
     """
     rows: dict[str, list[dict[str, float]]] = {}
     counts: dict[str, Tensor] = {}
-    shown: list[tuple[Batch, Sample]] = []
+    shown: list[tuple[Batch, GeneratedClip]] = []
     for city in cities:
         for clip in range(clip_shards.clips_in(folder, city)):
             frames = range(model.config.window)
             batch = clip_shards.read_batch(folder, [(city, clip, frames)])
             batch = batch if prepare is None else prepare(batch)
-            sample = model.sample(
-                condition_of(batch), steps=steps, seed=seed, index=city * 16 + clip, sampler=sampler, eta=eta, bf16=bf16
-            )
+            request = SampleRequest(steps, seed, city * 16 + clip, sampler, eta, bf16=bf16)
+            sample = model.sample(condition_of(batch), request)
             shift = batch.shift_m[0]
             name = "recorded" if shift == 0 else f"{abs(shift):.0f} m"
             row, matrix = score_clip(batch, sample)
@@ -106,14 +106,12 @@ def condition_of(batch: Batch, index: int = 0) -> Condition:
     )
 
 
-def score_clip(batch: Batch, sample: Sample) -> tuple[dict[str, float], Tensor]:
+def score_clip(batch: Batch, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip (batch of one) and its class confusion i64[19,20]."""
     rgb, depth, ids = batch.rgb[0], batch.depth[0], batch.semantics[0]
     depth = torch.where(
         batch.depth_known[0], depth, torch.full_like(depth, clip_shards.FAR_M)
     )  # far depth does not count
-    if sample.rgb is None or sample.depth is None or sample.semantics is None:
-        raise ValueError("scoring needs all three modalities")
     seen = batch.valid[0] | batch.warped[0]
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
@@ -222,13 +220,11 @@ def rgb_image(rgb: Tensor) -> NDArray[np.uint8]:
     return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
 
 
-def save_grid(path: Path, shown: Sequence[tuple[Batch, Sample]], frame: int = 4) -> None:
+def save_grid(path: Path, shown: Sequence[tuple[Batch, GeneratedClip]], frame: int = 4) -> None:
     """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes; confidence."""
     rows = []
     for batch, sample in shown:
         t = min(frame, len(sample.confidence) - 1)
-        if sample.rgb is None or sample.depth is None or sample.semantics is None:
-            continue
         measured = torch.where(
             batch.valid[0, t], batch.sparse_depth[0, t], torch.full_like(batch.sparse_depth[0, t], 100.0)
         )
