@@ -18,16 +18,10 @@ from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import EgoPath, Ref, Source, Sweep, View
 from mudg.core.complete import ray_elevation
 from mudg.data.scene import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
-from mudg.models.depth.networks import Prediction
-from mudg.models.labels.labellers import (
-    LABELLERS,
-    TRAIN_ID_OF,
-    LabelInput,
-    box_outline,
-    find_sky,
-    label_by_geometry,
-    labeller,
-)  # fmt: skip
+from mudg.models.depth.inputs import Prediction
+from mudg.models.labels.by_geometry import find_sky, label_by_geometry
+from mudg.models.labels.inputs import TRAIN_ID_OF, LabelInput, box_outline
+from mudg.models.labels.labellers import LABELLERS, labeller
 from mudg.stages import annotate
 from mudg.stages.config import AnnotateConfig
 from mudg.stages.labelling import depth as annotate_depth

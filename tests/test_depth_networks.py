@@ -14,12 +14,10 @@ from tiny_networks import package
 
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.core.complete import CompletionRules
+from mudg.models.depth.inputs import DepthInput, DepthOptions, Prediction
 from mudg.models.depth.marigold import Marigold
 from mudg.models.depth.networks import (
     KINDS,
-    DepthInput,
-    DepthOptions,
-    Prediction,
     align_to_lidar,
     kind_of,
     lidar_cue,

@@ -25,14 +25,15 @@ from toy_scene import ToyStreet
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.data.scene import read_label, read_scene
 from mudg.models.depth import depthlab
-from mudg.models.depth.depthlab import DepthLab, Sampling, clip_crop, known_depth, linear_fill, prepare
-from mudg.models.depth.networks import DepthInput, DepthOptions, kind_of, load_depth_network
+from mudg.models.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
+from mudg.models.depth.inputs import DepthInput, DepthOptions
+from mudg.models.depth.networks import kind_of, load_depth_network
 from mudg.models.folders import Place
 from mudg.stages import annotate, convert, convert_depthlab
 from mudg.stages.config import AnnotateConfig, ConvertConfig
 
 pytestmark = pytest.mark.filterwarnings("ignore")
-SAMPLING = Sampling(processing_px=48, steps=5)
+SAMPLING = DepthLabSampling(processing_px=48, steps=5)
 
 
 @pytest.fixture(scope="module")
@@ -344,7 +345,7 @@ def spelled_out(unet: Any, bank: dict[str, Tensor], *, reads: bool) -> Any:
     return unet
 
 
-def twin(made: dict[str, Any], inputs: depthlab.Prepared, noise: Tensor, sampling: Sampling) -> Tensor:
+def twin(made: dict[str, Any], inputs: depthlab.Prepared, noise: Tensor, sampling: DepthLabSampling) -> Tensor:
     """The published algorithm in float64, both guidance passes in one batch, its noise schedule as formulas."""
     nets = {name: made[name].double() for name in ("denoising_unet", "reference_unet", "vae", "clip", "mapping_layer")}
     bank: dict[str, Tensor] = {}

@@ -20,7 +20,8 @@ from mudg.base.palette import CLASSES, ID
 from mudg.core.complete import ray_elevation, visible_depth
 from mudg.models.labels import street_net
 from mudg.models.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
-from mudg.models.labels.labellers import TRAIN_ID_OF, labeller
+from mudg.models.labels.inputs import TRAIN_ID_OF
+from mudg.models.labels.labellers import labeller
 from mudg.models.labels.street_labels import at_size, reduced, settled, settled_by_color
 from mudg.models.labels.street_net import StreetNet, StreetNetConfig
 

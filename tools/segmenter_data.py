@@ -20,7 +20,7 @@ from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, measu
 from mudg.data.city import CityConfig, CityWorld
 from mudg.data.city import logs as city_logs
 from mudg.models.labels.evidence import Evidence, gather
-from mudg.models.labels.labellers import LabelInput
+from mudg.models.labels.inputs import LabelInput
 
 FRAMES = 14
 VIEWS = 4

@@ -36,8 +36,8 @@ from mudg.base.errors import ResourceError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.data.city import logs as city_logs
 from mudg.models.labels import street_net
+from mudg.models.labels.by_geometry import label_by_geometry
 from mudg.models.labels.evidence import encode
-from mudg.models.labels.labellers import label_by_geometry
 from mudg.models.labels.street_labels import StreetLabeller
 from mudg.models.labels.street_net import StreetNet, StreetNetConfig
 

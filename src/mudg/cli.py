@@ -104,7 +104,7 @@ def _fit(args: f.Fit) -> dict[str, Any]:
     return {"model": made}
 
 
-def _render(args: f.Render) -> dict[str, Any]:
+def _render(args: f.RenderFlags) -> dict[str, Any]:
     from mudg.stages import render
 
     return {"views": render.run(args.settings, args.scene, args.model, args.out, overwrite=args.overwrite)}

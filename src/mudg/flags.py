@@ -142,7 +142,7 @@ class Fit(Output):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Output):
+class RenderFlags(Output):
     """Flags of ``mudg render``."""
 
     scene: Positional[Path]
@@ -216,7 +216,7 @@ class Doctor(Common):
 
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
-    "convert": Convert, "synthesize": Synthesize, "fit": Fit, "render": Render, "score": Score, "bench": Bench,
+    "convert": Convert, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
 }  # fmt: skip
 
 

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
-MAX_FILE_LINES = 800
-MAX_FUNCTION_LINES = 100
+MAX_FILE_LINES = 600
+MAX_FUNCTION_LINES = 60  # without the docstring
+MAX_PARAMETERS = 8  # without self and cls
+MAX_FILES_IN_STAGES = 16
 
 # Floor of each part of the package; an import may only reach a lower number, or its own part.
 FLOORS = {
@@ -213,6 +215,14 @@ def test_no_blind_except(package_dir: Path) -> None:
     refuse(problems)
 
 
+def length_without_docstring(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    length = (node.end_lineno or node.lineno) - node.lineno + 1
+    first = node.body[0]
+    if ast.get_docstring(node, clean=False) is not None:
+        length -= (first.end_lineno or first.lineno) - first.lineno + 1
+    return length
+
+
 def test_files_and_functions_stay_short(package_dir: Path) -> None:
     problems = []
     for path in sources(package_dir):
@@ -222,10 +232,101 @@ def test_files_and_functions_stay_short(package_dir: Path) -> None:
     for name, tree in parsed(package_dir):
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                length = (node.end_lineno or node.lineno) - node.lineno + 1
+                length = length_without_docstring(node)
                 if length > MAX_FUNCTION_LINES:
                     problems.append(f"{name}:{node.lineno}: {node.name} has {length} lines")
     refuse(problems)
+
+
+def test_stages_hold_verbs_only(package_dir: Path) -> None:
+    """Parts of a verb lie in a folder below; a flat folder of fifty files is not read."""
+    flat = sorted(path.name for path in (package_dir / "stages").glob("*.py"))
+    if len(flat) > MAX_FILES_IN_STAGES:
+        refuse([f"stages holds {len(flat)} files: {', '.join(flat)}"])
+
+
+def test_functions_take_few_parameters(package_dir: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            count = sum(argument.arg not in ("self", "cls", "ctx") for argument in every)
+            if count > MAX_PARAMETERS:
+                problems.append(
+                    f"{name}:{node.lineno}: {node.name} takes {count} parameters; make a frozen dataclass of them"
+                )
+    refuse(problems)
+
+
+def test_class_names_are_unique(package_dir: Path) -> None:
+    """A name that two classes share cannot be searched for."""
+    homes: dict[str, list[str]] = {}
+    for name, tree in parsed(package_dir):
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(f"{name}:{node.lineno}")
+    refuse([f"{name}: {', '.join(places)}" for name, places in sorted(homes.items()) if len(places) > 1])
+
+
+def module_imports(package_dir: Path) -> dict[str, set[str]]:
+    """Module -> modules of the package that it imports anywhere, late imports included, type-checking ones left out."""
+    modules = {}
+    for path in sources(package_dir):
+        dotted_name = (
+            path.relative_to(package_dir)
+            .with_suffix("")
+            .as_posix()
+            .replace("/", ".")
+            .removesuffix("__init__")
+            .rstrip(".")
+        )
+        modules[f"mudg.{dotted_name}".rstrip(".")] = path
+    found: dict[str, set[str]] = {}
+    for module, path in modules.items():
+        reached = set()
+        for _, imported in imported_modules(syntax_of(path, path.stat().st_mtime_ns)):
+            while imported and imported not in modules:
+                imported = imported.rpartition(".")[0]
+            if imported not in ("", "mudg", module):
+                reached.add(imported)
+        found[module] = reached
+    found.pop("mudg", None)  # the lazy names of the package root
+    return found
+
+
+def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that reach each other (Tarjan's strongly connected components of more than one module)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    groups: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in sorted(graph.get(node, ())):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            group = []
+            while not group or group[-1] != node:
+                group.append(stack.pop())
+            if len(group) > 1:
+                groups.append(sorted(group))
+
+    for node in sorted(graph):
+        if node not in index:
+            visit(node)
+    return groups
+
+
+def test_no_import_cycles_even_late_ones(package_dir: Path) -> None:
+    refuse([" <-> ".join(group) for group in cycles(module_imports(package_dir))])
 
 
 def public_definitions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef | ast.ClassDef, bool]]:
@@ -333,6 +434,10 @@ def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> No
         ("from mudg.stages import fit\n", test_imports_point_down),
         ("import torch\n", test_torch_is_not_imported_where_help_must_be_fast),
         ("x = 1\n" * (MAX_FILE_LINES + 1), test_files_and_functions_stay_short),
+        ("def f():\n    'long'\n" + "    x = 1\n" * MAX_FUNCTION_LINES, test_files_and_functions_stay_short),
+        ("def f(a, b, c, d, e, *, g, h, i, j):\n    pass\n", test_functions_take_few_parameters),
+        ("class Table:\n    pass\n\n\nclass Table:\n    pass\n", test_class_names_are_unique),
+        ("def f():\n    from mudg.base import other\n", test_no_import_cycles_even_late_ones),
     ],
 )
 def test_each_rule_catches_its_offence(tmp_path: Path, snippet: str, test: object) -> None:
@@ -340,6 +445,7 @@ def test_each_rule_catches_its_offence(tmp_path: Path, snippet: str, test: objec
     (tmp_path / "base").mkdir()
     for number in range(12):
         (tmp_path / "base" / f"fine{number}.py").write_text('"""Fine."""\n')
+    (tmp_path / "base" / "other.py").write_text('"""Other."""\n\nfrom mudg.base import bad\n')
     test(tmp_path)  # type: ignore[operator]
     (tmp_path / "base" / "bad.py").write_text('"""Bad."""\n' + snippet)
     with pytest.raises(AssertionError):

@@ -65,7 +65,7 @@ def warn(message: str) -> None:
         _console().print(f"warning: {message}", markup=False, style="yellow")
 
 
-class Task:
+class ProgressTask:
     """One running progress bar. On a terminal it is drawn; elsewhere a line is written now and then."""
 
     def __init__(self, description: str, total: int, start: int) -> None:
@@ -119,9 +119,9 @@ class Task:
 
 
 @contextlib.contextmanager
-def task(description: str, total: int, start: int = 0) -> Iterator[Task]:
+def task(description: str, total: int, start: int = 0) -> Iterator[ProgressTask]:
     """Show progress over ``total`` items, ``start`` of which are already done."""
-    bar = Task(description, total, start)
+    bar = ProgressTask(description, total, start)
     try:
         yield bar
     finally:

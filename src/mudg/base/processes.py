@@ -1,31 +1,243 @@
-"""Pieces of work that need nothing of each other, each in a process of its own, at the same time.
+"""Processes, threads, interrupts, and errors that cross a process boundary. Everything of that kind in the package is here.
 
-The parent shows the progress of all. Ctrl-C (or a parent that dies) stops every child as Ctrl-C stops a verb: at the end of a
-step, after a checkpoint; a second Ctrl-C ends them at once. If one fails, the others are stopped in the same way and its own
-error is raised here. What parent and child tell each other is JSON text.
+    run_side_by_side    named tasks at the same time, each with its own progress, stopped and resumed like a verb
+    run_in_processes    one function over many arguments, several processes at a time
+    run_limited         one call on a foreign file, under a limit of address space
+    Interruption        Ctrl-C and SIGTERM wait for the end of a step
+    one_torch_thread    results that do not depend on how many cores are free
+    child_environment   threads of processes that are started meanwhile
+
+Children are spawned, never forked. What parent and child tell each other beside arguments and results is JSON text.
 """
 
 from __future__ import annotations
 
 import _thread
+import concurrent.futures
 import contextlib
 import json
 import multiprocessing
 import os
 import signal
+import sys
 import threading
+import time
+import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 from mudg.base import log
 from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsError, ResourceError, UsageError
 
+Result = TypeVar("Result")
+
 _ERRORS: dict[str, type[MudgError]] = {
     cls.__name__: cls for cls in (UsageError, InputError, IntegrityError, ResourceError, NumericsError)
 }
-_PATIENCE_S = 0.5
+_POLL_S = 0.5
+GIB = 1 << 30
+
+
+# ---- threads and environment -----------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """One torch thread in this block: sums depend on the number of threads, results must not depend on how many cores are free."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def child_environment(threads: int, torch_threads: int = 1) -> Iterator[None]:
+    """Environment of processes started in this block: their threads, and waiting without spinning.
+
+    Args:
+        threads: threads of the native library in each child. torch_threads: threads of torch and OpenMP in each child.
+    """
+    wanted = {"OMP_NUM_THREADS": str(torch_threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads)}
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+# ---- interrupts ------------------------------------------------------------------------------------------------------
+
+
+class Interruption:
+    """Ctrl-C and SIGTERM wait for the end of the step, so that a checkpoint can be written; a second one does not wait.
+
+    Outside the main thread signals are left as they are.
+
+    Args:
+        repeated_within_s: a signal that comes again within this time is taken for the same one. Launchers such as torchrun pass on
+            a signal that the terminal has sent already.
+    """
+
+    def __init__(self, repeated_within_s: float = 0.0) -> None:
+        self._repeated_within_s = repeated_within_s
+        self._number = 0
+        self._since_s = 0.0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Interruption:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+        self._before = {}
+
+    def _note(self, number: int, frame: types.FrameType | None) -> None:
+        now = time.monotonic()
+        if self._number and now - self._since_s > self._repeated_within_s:
+            self.stop_now(number, frame)
+        if not self._number:
+            self._number, self._since_s = number, now
+            log.info("stopping after this step; once more to stop at once")
+
+    @property
+    def requested(self) -> bool:
+        """Whether this process was asked to stop."""
+        return self._number != 0
+
+    def stop_now(self, number: int = 0, frame: types.FrameType | None = None) -> None:
+        """Do what the signal would have done at once: raise KeyboardInterrupt, or what the program has set."""
+        before = self._before.get(number or self._number)
+        if callable(before):
+            before(number or self._number, frame)
+        raise KeyboardInterrupt
+
+
+# ---- errors as JSON values -------------------------------------------------------------------------------------------
+
+
+def error_record(error: MudgError) -> dict[str, Any]:
+    """An error as JSON values; ``error_from_record`` makes it again."""
+    fields = {"where": error.where, "expected": error.expected, "got": error.got, "remedy": error.remedy}
+    return {"error": type(error).__name__, "what": error.what, "fields": fields}
+
+
+def error_from_record(record: Mapping[str, Any]) -> MudgError:
+    """The error that ``error_record`` wrote; the class comes from a literal table."""
+    return _ERRORS.get(record["error"], MudgError)(record["what"], **record["fields"])
+
+
+# ---- one function over many arguments --------------------------------------------------------------------------------
+
+
+def run_in_processes(
+    function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
+) -> Iterator[tuple[int, Result]]:
+    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each.
+
+    Yields:
+        Index of the arguments and the result, as they come.
+
+    Raises:
+        ResourceError: a process ended from outside. Whatever the function raises; calls that have not begun are dropped.
+    """
+    context = multiprocessing.get_context("spawn")
+    with (
+        child_environment(1),
+        concurrent.futures.ProcessPoolExecutor(processes, mp_context=context, initializer=_prepare_child) as pool,
+    ):
+        futures = {pool.submit(function, *items): index for index, items in enumerate(arguments)}
+        try:
+            for future in concurrent.futures.as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool as error:
+            raise ResourceError(
+                "a process ended without a word, most likely for want of memory", got=str(error),
+                remedy="take fewer processes, or a machine with more memory; repeat the command to resume",
+            ) from error  # fmt: skip
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _prepare_child() -> None:
+    import torch
+
+    log.set_quiet(True)
+    torch.set_num_threads(1)
+
+
+# ---- one call under a limit of memory --------------------------------------------------------------------------------
+
+
+def run_limited(
+    work: Callable[[], None], limit_bytes: int, where: Path, out_of_memory: Callable[[RuntimeError], bool]
+) -> int:
+    """Do the work in a fresh process that may take ``limit_bytes`` of address space beyond the program's own (on Linux).
+
+    Args:
+        work: a call that can be sent to another process. where: the file it reads, for messages.
+        out_of_memory: whether a RuntimeError (of torch) says that memory is short; a module's function.
+
+    Returns:
+        Peak of resident memory in bytes, 0 where the system has no such limit.
+
+    Raises:
+        ResourceError: the limit was reached, or the process was ended from outside. And what the work itself raises.
+    """
+    if sys.platform != "linux":
+        log.warn("this system has no limit of address space; a hostile file may take all memory")
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context, initializer=_prepare_child) as pool:
+        try:
+            return pool.submit(_limited, work, limit_bytes, where, out_of_memory).result()
+        except BrokenProcessPool as error:
+            raise ResourceError(
+                "the converting process was ended from outside, most likely for want of memory", where=str(where),
+                expected=f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most",
+                remedy="close other programs, or convert on a machine with more memory",
+            ) from error  # fmt: skip
+
+
+def _limited(
+    work: Callable[[], None], limit_bytes: int, where: Path, out_of_memory: Callable[[RuntimeError], bool]
+) -> int:
+    if sys.platform != "linux":
+        work()
+        return 0
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + limit_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    try:
+        work()
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not out_of_memory(error):
+            raise
+        raise ResourceError(
+            "conversion needs more memory than it may take", where=str(where), expected=f"<= {limit_bytes / 1e9:.1f} GB",
+            got=(str(error).splitlines() or [""])[0][:200], remedy="raise --memory-gb, unless the file should be small",
+        ) from error  # fmt: skip
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+# ---- tasks side by side ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -49,6 +261,9 @@ class _Child:
 
 def run_side_by_side(tasks: Sequence[Task], threads_each: int) -> None:
     """Do all tasks at the same time, each in a process with ``threads_each`` native threads and one of torch's.
+
+    The parent shows the progress of all. Ctrl-C (or a parent that dies) stops every child as Ctrl-C stops a verb: at the end of a
+    step, after a checkpoint; a second Ctrl-C ends them at once. If one fails, the others are stopped in the same way.
 
     Raises:
         MudgError: the error of the first task that failed, after the others have stopped; ResourceError if its process
@@ -74,17 +289,17 @@ def _start(task: Task, threads: int) -> _Child:
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, task, log.is_quiet()), name=task.name, daemon=True)
-    with _environment(threads), _deaf_to_ctrl_c():
+    with child_environment(threads), _deaf_to_ctrl_c():
         process.start()
     theirs.close()
     return _Child(task, process, mine)
 
 
-def _watch(children: Sequence[_Child], bar: log.Task) -> _Child | None:
+def _watch(children: Sequence[_Child], bar: log.ProgressTask) -> _Child | None:
     """Show what the children say until all have ended or one has failed, which is returned."""
     running = list(children)
     while running:
-        for pipe in wait([child.pipe for child in running], _PATIENCE_S):
+        for pipe in wait([child.pipe for child in running], _POLL_S):
             child = next(c for c in running if c.pipe is pipe)
             if _heard(child):
                 bar.update(" | ".join(c.progress for c in running))
@@ -136,7 +351,7 @@ def _raise(child: _Child) -> None:
     if "stopped" in outcome:
         raise KeyboardInterrupt
     if "error" in outcome:
-        raise _ERRORS[outcome["error"]](outcome["what"], **outcome["fields"])
+        raise error_from_record(outcome)
     code = child.process.exitcode
     if code == 1:
         raise RuntimeError(f"{child.task.name} failed; what went wrong is written above")
@@ -166,11 +381,7 @@ def _work(pipe: Connection, task: Task, quiet: bool) -> None:
         task.function(*task.arguments, **task.named)
         tell({"done": True})
     except MudgError as error:
-        name = next((n for n, cls in _ERRORS.items() if type(error) is cls), "")
-        if not name:
-            raise
-        fields = {"where": error.where, "expected": error.expected, "got": error.got, "remedy": error.remedy}
-        tell({"error": name, "what": error.what, "fields": fields})
+        tell(error_record(error))
     except KeyboardInterrupt:
         tell({"stopped": True})
 
@@ -184,22 +395,6 @@ def _listen(pipe: Connection) -> None:
         signal.pthread_kill(main, signal.SIGINT)  # wakes it even where it waits for something
     else:
         _thread.interrupt_main()
-
-
-@contextlib.contextmanager
-def _environment(threads: int) -> Iterator[None]:
-    """Environment for children: their threads, and waiting without spinning; must be there before they import torch."""
-    wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads)}
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 @contextlib.contextmanager

@@ -10,11 +10,8 @@ stopped.
 
 from __future__ import annotations
 
-import concurrent.futures
-import contextlib
 import dataclasses
 import functools
-import multiprocessing
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,15 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mudg.base import log, store
 from mudg.base.config import to_dict
+from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.types import Frame, Scene
 from mudg.data.scene import SceneWriter, read_image, read_scene
 from mudg.models.labels.ground import driven_path
-from mudg.models.labels.labellers import LabelInput, Labels, labeller
+from mudg.models.labels.inputs import LabelInput, Labels
+from mudg.models.labels.labellers import labeller
 from mudg.report.annotate_page import write_page
 from mudg.stages import batch
 from mudg.stages.config import AnnotateConfig
@@ -38,7 +36,6 @@ from mudg.stages.ingest import add_frame_copy, add_rest
 from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import find_ego
 from mudg.stages.labelling.points import NearbyReturns
-from mudg.stages.synthesize import quiet_openmp
 
 _VERSION = 4
 _ASIDE = "labelled"
@@ -115,9 +112,7 @@ def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str
     made_by = f"labeller '{config.labeller}'"
     if "weights" in inputs:
         made_by += annotate_depth.folder_words(config.weights, inputs["weights"])
-    depth = annotate_depth.origin(
-        config, inputs, [frame.id for frame in missing if "depth" not in frame.labels], aside
-    )
+    depth = annotate_depth.origin(config, inputs, [frame.id for frame in missing if "depth" not in frame.labels], aside)
     origins = {"semantics": made_by, "sky": made_by, "depth": depth, "dynamic": "tracked boxes that move and dense depth",
                "ego": "pixels that stay the same while the vehicle moves"}  # fmt: skip
     for name, origin in origins.items():
@@ -141,20 +136,16 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
             for _ in label_and_put_aside(config, scene, todo, aside):
                 bar.advance()
             return
-        parts = [list(part) for part in np.array_split(np.array(todo, dtype=object), 4 * processes)]
-        context = multiprocessing.get_context("spawn")
-        with quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
-            futures = [pool.submit(_label_in_process, config, path, part, aside) for part in parts if part]
-            try:
-                for future in concurrent.futures.as_completed(futures):
-                    bar.advance(future.result())
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+        work = [
+            (config, path, list(part), aside)
+            for part in np.array_split(np.array(todo, dtype=object), 4 * processes)
+            if len(part)
+        ]
+        for _, labelled in run_in_processes(_label_in_process, work, processes):
+            bar.advance(labelled)
 
 
 def _label_in_process(config: AnnotateConfig, path: Path, ids: list[str], aside: Path) -> int:
-    log.set_quiet(True)
     return sum(1 for _ in label_and_put_aside(config, read_scene(path), ids, aside))
 
 
@@ -172,23 +163,12 @@ def label_and_put_aside(config: AnnotateConfig, scene: Scene, ids: Sequence[str]
         near = returns.of(frame)
         given = LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, path, near.beam_gap_deg,
                            near.highest_rad, returns.moving)  # fmt: skip
-        with _one_thread():
+        with one_torch_thread():
             labels = label(given)
             if network is not None and "depth" not in frame.labels:
                 labels = annotate_depth.with_network(network, given, labels, frame_id, aside)
         store.write_safetensors(aside_file(aside, frame_id), label_arrays(config, labels))
         yield frame_id
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """A network's sums depend on the number of threads; labels shall not depend on how many processes share the processors."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def aside_file(aside: Path, frame_id: str) -> Path:

@@ -7,6 +7,7 @@ command can be repeated until nothing fails; one that fails is reported with its
 from __future__ import annotations
 
 import io
+import json
 import multiprocessing
 import os
 import re
@@ -15,14 +16,13 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Final
 
 from mudg import native
-from mudg.base import log, store
+from mudg.base import log, processes, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.data.scene.schema import NAME_PATTERN
 
@@ -170,7 +170,7 @@ def run_batch(
     threads = max(1, native.default_threads() // jobs)
     log.info(f"{verb}: {len(entries)} scenes, {jobs} at a time with {threads} threads each")
     outcomes: dict[str, Outcome] = {}
-    with _environment(OMP_NUM_THREADS=str(threads), MUDG_THREADS=str(threads)), log.task(verb, len(entries)) as bar:
+    with processes.child_environment(threads, torch_threads=threads), log.task(verb, len(entries)) as bar:
         for outcome in _run_all(entries, out, work, jobs, overwrite):
             outcomes[outcome.name] = outcome
             bar.advance()
@@ -217,7 +217,7 @@ def _run_all(entries: list[Entry], out: Path, work: Work, jobs: int, overwrite: 
 def _outcome(entry: Entry, connection: Connection, process: Any, seconds: float) -> Outcome:
     """What the process said, or how it ended without a word."""
     try:
-        state, words, error = connection.recv()
+        state, words, error = json.loads(connection.recv_bytes())
     except EOFError:
         state, words, error = "failed", "", "crash"
     connection.close()
@@ -248,11 +248,16 @@ def _child(connection: Connection, work: Work, entry: Entry, folder: Path, overw
                 raise
             work(entry, folder, True)  # what an earlier failure left of another state of the source
         reused = before != "" and before == _finished(folder)
-        connection.send(("reused" if reused else "done", _contents(folder), ""))
+        connection.send_bytes(json.dumps(["reused" if reused else "done", _contents(folder), ""]).encode())
     except MudgError as error:
-        parts = (error.what, error.where, error.expected and f"expected {error.expected}", error.got and f"got {error.got}")
+        parts = (
+            error.what,
+            error.where,
+            error.expected and f"expected {error.expected}",
+            error.got and f"got {error.got}",
+        )
         words = "; ".join(part for part in parts if part)
-        connection.send(("failed", words, type(error).__name__))
+        connection.send_bytes(json.dumps(["failed", words, type(error).__name__]).encode())
     finally:
         connection.close()
 
@@ -280,20 +285,6 @@ def _unfinished(folder: Path) -> bool:
 def _contents(folder: Path) -> str:
     summary = _state(folder).get("summary", {})
     return ", ".join(f"{value} {name}" for name, value in summary.items() if isinstance(value, int | str))
-
-
-@contextmanager
-def _environment(**values: str) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def table(verb: str, outcomes: Sequence[Outcome]) -> str:

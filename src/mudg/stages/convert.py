@@ -17,14 +17,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mudg.base import log, store
+from mudg.base import log, processes, store
 from mudg.base.errors import InputError, UsageError
 from mudg.data import weights
 from mudg.models.published import clip
 from mudg.models.published import files as published_files
 from mudg.models.published.clip import TextTower
 from mudg.models.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
-from mudg.stages import confined, convert_depthlab
+from mudg.stages import convert_depthlab
 from mudg.stages.config import ConvertConfig
 
 _UNET = "model.diffusion_model."
@@ -65,9 +65,9 @@ def run(
         _from_folder(config, checkpoint, to) if checkpoint.is_dir() else _from_file(config, checkpoint, to, network)
     )
     with log.task("convert", 1) as bar:
-        peak = confined.run(work, limit, checkpoint)
+        peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
         bar.advance()
-    memory = f"; peak memory {peak / confined.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
+    memory = f"; peak memory {peak / processes.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
     log.info(f"convert: {to} is whole{memory}")
     return to
 
@@ -120,7 +120,7 @@ def memory_limit(config: ConvertConfig, *files: Path) -> int:
     if config.memory_gb:
         return int(config.memory_gb * 1e9)
     read = sum(path.stat().st_size * (1 if zipfile.is_zipfile(path) else 2) for path in files)
-    return read + 2 * config.shard_mb * (1 << 20) + 3 * confined.GIB
+    return read + 2 * config.shard_mb * (1 << 20) + 3 * processes.GIB
 
 
 def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig) -> None:

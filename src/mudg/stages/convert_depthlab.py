@@ -190,7 +190,7 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
         store.write_text(partial / "MODEL_CARD.md", _card(facts))
         description = {
             "schema": depthlab.SCHEMA, "kind": depthlab.KIND, "parts": parts, "scheduler": schedule,
-            "sampling": asdict(depthlab.Sampling()), "facts": facts,
+            "sampling": asdict(depthlab.DepthLabSampling()), "facts": facts,
         }  # fmt: skip
         store.write_json(partial / depthlab.DESCRIPTION, description)
         store.sync_tree(partial)

@@ -83,7 +83,7 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
 
 
 def _render_trajectory(
-    model: SceneModel, path: Trajectory, config: RenderConfig, out: Path, source: str, bar: log.Task
+    model: SceneModel, path: Trajectory, config: RenderConfig, out: Path, source: str, bar: log.ProgressTask
 ) -> None:
     """One folder of observations; views that an earlier, interrupted run wrote are kept."""
     if (out / "observations.json").is_file():

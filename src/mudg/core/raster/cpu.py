@@ -125,6 +125,10 @@ def release_memory() -> None:
         library.mudg_raster_free(_Context._free.pop())
 
 
+_PARTS: Final = ("means", "quats", "scales", "opacity", "sh", "extra", "sh_rest")
+"""Fields of Gaussians in the order of the library's structures."""
+
+
 @dataclass(slots=True)
 class _Call:
     """What one call needs besides tensors, and what it hands back besides differentiable ones."""
@@ -145,9 +149,7 @@ def render(request: Request) -> Render:
     if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
         raise InputError("the native rasteriser works on float32 CPU tensors", where="gaussians.means",
                          expected="torch.float32 on cpu", got=f"{gaussians.means.dtype} on {gaussians.means.device}")  # fmt: skip
-    parts = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacity, gaussians.sh, gaussians.extra,
-             gaussians.sh_rest)  # fmt: skip
-    tensors = (*parts, *request.backgrounds, *request.poses)
+    tensors = (*(getattr(gaussians, name) for name in _PARTS), *request.backgrounds, *request.poses)
     keeps_graph = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     means2d, leaves = trace_leaves(request, gaussians.means, keeps_graph)
     absolute = torch.zeros_like(means2d) if request.absgrad and keeps_graph else None
@@ -165,10 +167,8 @@ def _draw(request: Request, index: int, means2d: Tensor, abs_grad2d: Tensor | No
         library=_library(), camera=request.views[index].camera, config=request.config, sh_degree=request.sh_degree,
         keeps_graph=keeps_graph, radii=torch.empty(len(g), 2, dtype=torch.int32), abs_grad2d=abs_grad2d,
     )  # fmt: skip
-    rgb, depth, alpha, extra = _Rasterize.apply(
-        g.means, g.quats, g.scales, g.opacity, g.sh, g.extra, g.sh_rest, request.backgrounds[index],
-        request.pose(index), means2d, call,
-    )
+    parts = (getattr(g, name) for name in _PARTS)
+    rgb, depth, alpha, extra = _Rasterize.apply(call, request.pose(index), request.backgrounds[index], means2d, *parts)
     return Drawn(rgb, depth, alpha, None if g.extra is None else extra, call.radii)
 
 
@@ -187,13 +187,13 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacity: Tensor, sh: Tensor, extra: Tensor | None,
-        sh_rest: Tensor | None, background: Tensor | None, world_from_cam: Tensor, means2d: Tensor, call: _Call,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+        ctx: Any, call: _Call, world_from_cam: Tensor, background: Tensor | None, means2d: Tensor, *given: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """``given``: the tensors of ``_PARTS``."""
         global _last_handle
-        parts = [t.contiguous() if t is not None else None for t in (means, quats, scales, opacity, sh, extra, sh_rest)]
+        parts = [t.contiguous() if t is not None else None for t in given]
         height, width = call.camera.height, call.camera.width
-        channels = 0 if extra is None else extra.shape[1]
+        channels = 0 if parts[5] is None else parts[5].shape[1]
         rgb, depth, alpha = torch.empty(3, height, width), torch.empty(1, height, width), torch.empty(1, height, width)
         features = torch.empty(channels, height, width)
         scene = _scene(parts, background, world_from_cam, call)
@@ -216,7 +216,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(
         ctx: Any, of_rgb: Tensor | None, of_depth: Tensor | None, of_alpha: Tensor | None, of_extra: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        parts, call, needs = ctx.saved_tensors, ctx.call, ctx.needs_input_grad  # reading them checks for edits in place
+        parts, call, needs = ctx.saved_tensors, ctx.call, ctx.needs_input_grad[4:]  # reading them checks for edits in place
         count = parts[0].shape[0]
         upstream = [None if g is None else g.contiguous() for g in (of_rgb, of_depth, of_alpha, of_extra)]
         out = [_recycled_like(t) for t in parts[:4]]
@@ -232,10 +232,10 @@ class _Rasterize(torch.autograd.Function):
             _raise(status, ctx.context, parts)
         if absolute is not None and call.abs_grad2d is not None:
             call.abs_grad2d.add_(absolute)
-        of_background = torch.tensor(list(gradient.background), dtype=ctx.background_type) if needs[7] else None
-        of_pose = _pose_gradient(gradient, ctx.pose_type) if needs[8] else None
+        of_background = torch.tensor(list(gradient.background), dtype=ctx.background_type) if ctx.needs_input_grad[2] else None
+        of_pose = _pose_gradient(gradient, ctx.pose_type) if ctx.needs_input_grad[1] else None
         wanted = [g if needed else None for g, needed in zip(out, needs)]
-        return (*wanted, of_background, of_pose, of_means2d, None)
+        return (None, of_pose, of_background, of_means2d, *wanted)
 
 
 def _pose_gradient(gradient: _Gradient, dtype: torch.dtype) -> Tensor:
@@ -271,8 +271,7 @@ def _raise(status: int, context: _Context, parts: list[Tensor | None] | tuple[Te
     if status == 3:
         found = _statistics(context.library, context.handle)
         row = int(found["first_not_finite"])
-        names = ("means", "quats", "scales", "opacity", "sh", "extra", "sh_rest")
-        bad = [n for n, t in zip(names, parts, strict=True) if t is not None and not torch.isfinite(t[row]).all()]
+        bad = [n for n, t in zip(_PARTS, parts, strict=True) if t is not None and not torch.isfinite(t[row]).all()]
         raise NumericsError(
             "a Gaussian is not finite", where=f"Gaussian {row}: {', '.join(bad) or 'its colour overflows'}",
             got=f"{int(found['not_finite'])} such Gaussians",

@@ -34,8 +34,8 @@ from torch.nn import functional
 from mudg.base import seeds, shards
 from mudg.base.errors import InputError, UsageError
 from mudg.models import folders
+from mudg.models.depth.inputs import DepthInput, Prediction
 from mudg.models.depth.marigold import ddim_scheduler
-from mudg.models.depth.networks import DepthInput, Prediction
 from mudg.models.folders import CPU, Place
 
 KIND: Final = "depthlab"
@@ -53,7 +53,7 @@ _CLIP_MEAN, _CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 
 
 
 @dataclass(frozen=True, slots=True)
-class Sampling:
+class DepthLabSampling:
     """How depth is denoised; the defaults are those of MuDG's depth ground truth.
 
     Args:
@@ -145,7 +145,7 @@ def shapes_of(network: nn.Module) -> dict[str, tuple[int, ...]]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Parts:
+class DepthLabParts:
     """The networks, ready to be asked, and the noise schedule of diffusers (DDIM)."""
 
     denoising_unet: Any
@@ -156,7 +156,7 @@ class Parts:
     scheduler: Any
 
 
-def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -> Parts:
+def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -> DepthLabParts:
     """The networks of a converted folder in float32 on their device, every file checked against its sha256.
 
     Raises:
@@ -182,7 +182,7 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
         _fill_tables(network, name)
         network.to(device).eval().requires_grad_(False)
     scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
-    return Parts(**made, scheduler=ddim_scheduler(scheduler_class, schedule, f"{where}: scheduler"))
+    return DepthLabParts(**made, scheduler=ddim_scheduler(scheduler_class, schedule, f"{where}: scheduler"))
 
 
 def _fill_tables(network: nn.Module, part: str) -> None:
@@ -284,7 +284,7 @@ class Prepared:
     high_m: float
 
 
-def prepare(given: DepthInput, sampling: Sampling, cell: int, crop_px: int) -> Prepared:
+def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: int) -> Prepared:
     """What the networks are given for an image; ``cell``: pixels per latent cell and side, ``crop_px``: side of CLIP's image.
 
     Raises:
@@ -351,7 +351,9 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
 class DepthLab:
     """A DepthLab model ready for use; ``load`` makes one from a converted folder."""
 
-    def __init__(self, parts: Parts, sampling: Sampling = Sampling(), place: Place = CPU) -> None:
+    def __init__(
+        self, parts: DepthLabParts, sampling: DepthLabSampling = DepthLabSampling(), place: Place = CPU
+    ) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
         most = int(parts.scheduler.config.num_train_timesteps)
         if sampling.steps > most:
@@ -429,12 +431,12 @@ class DepthLab:
         return latent.float() * LATENT_SCALE
 
 
-def _sampling(told: object, steps: int, where: str) -> Sampling:
+def _sampling(told: object, steps: int, where: str) -> DepthLabSampling:
     """The sampling that a description tells, with other steps if asked; InputError for another kind of value."""
-    names = {field.name for field in fields(Sampling)}
+    names = {field.name for field in fields(DepthLabSampling)}
     numbers = isinstance(told, dict) and all(type(value) in (int, float) for value in told.values())
     if not isinstance(told, dict) or set(told) != names or not numbers:
         raise InputError("the sampling of a DepthLab model is not described", where=f"{where}: sampling",
                          expected=", ".join(sorted(names)), got=str(told)[:200])  # fmt: skip
-    return Sampling(int(told["processing_px"]), steps or int(told["steps"]), float(told["strength"]),
+    return DepthLabSampling(int(told["processing_px"]), steps or int(told["steps"]), float(told["strength"]),
                     float(told["normalize_scale"]))  # fmt: skip

@@ -30,7 +30,7 @@ from mudg.base import seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.core.align import AffineFit, Space, fit_affine
 from mudg.models import folders
-from mudg.models.depth.networks import DepthInput, Prediction
+from mudg.models.depth.inputs import DepthInput, Prediction
 from mudg.models.folders import CPU, Place
 
 GUIDED_STEPS: Final = 50
@@ -44,7 +44,7 @@ MAX_RETURNS: Final = 50_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Parts:
+class MarigoldParts:
     """The networks of a folder: U-Net, autoencoder and scheduler of diffusers, and the embedding [1, N, D] of the empty text."""
 
     unet: Any
@@ -67,7 +67,7 @@ class Marigold:
     """A Marigold model ready for use; ``load`` makes one from a folder."""
 
     def __init__(
-        self, parts: Parts, *, space: Space = "depth", steps: int = PLAIN_STEPS, guided: bool = False,
+        self, parts: MarigoldParts, *, space: Space = "depth", steps: int = PLAIN_STEPS, guided: bool = False,
         longest_px: int = PROCESSING_PX, place: Place = CPU,
     ) -> None:  # fmt: skip
         """``longest_px``: longest side at which the networks work. Raises: UsageError: more steps than the noise schedule has."""
@@ -92,7 +92,7 @@ class Marigold:
         with torch.no_grad():
             empty_text = text(_empty_tokens(path).to(place.device))[0].float()
         schedule = path / SCHEDULE_FILE
-        parts = Parts(
+        parts = MarigoldParts(
             folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet"),
             folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae"),
             ddim_scheduler(folders.member(diffusers, "DDIMScheduler"), folders.read_settings(schedule), str(schedule)),

@@ -4,8 +4,8 @@
 |---|---|---|
 | PromptDepthAnything | metric depth | image and a small map of depth from LiDAR |
 | Depth Anything, V1 and V2 | inverse depth up to scale and shift, or metric depth | image alone |
-| Marigold (``models.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
-| DepthLab (``models.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
+| Marigold (``models.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
+| DepthLab (``models.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
 Whatever comes out is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the
 sky is put at its fixed distance, and the confidence is taken from how far the aligned depth is off at the returns near a pixel.
@@ -31,6 +31,9 @@ from mudg.base.errors import InputError, ResourceError
 from mudg.core.align import MIN_POINTS, AffineFit, Space, fit_affine
 from mudg.core.complete import CompletionRules, DenseDepth
 from mudg.models import folders
+from mudg.models.depth.depthlab import DepthLab
+from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions, Prediction
+from mudg.models.depth.marigold import Marigold
 from mudg.models.folders import CPU, Place
 
 CUE_PX: Final = 256
@@ -38,47 +41,6 @@ CUE_PX: Final = 256
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _ERROR_SCALE: Final = 0.05
 _SKY_CONFIDENCE: Final = 0.8
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthInput:
-    """What a depth network is given for one image.
-
-    Args:
-        rgb: u8[H, W, 3].
-        measured: f32[H, W] metres, visible LiDAR returns, NaN where there is none.
-        filled: f32[H, W] metres, the returns filled along the image (``core.complete``); NaN where unknown.
-        sky: bool[H, W].
-    """
-
-    rgb: NDArray[np.uint8]
-    measured: NDArray[np.float32]
-    filled: NDArray[np.float32]
-    sky: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
-    """``values`` f32[H, W]: depth or inverse depth (``space``) up to scale and shift."""
-
-    values: NDArray[np.float32]
-    space: Space
-
-
-@dataclass(frozen=True, slots=True)
-class DepthOptions:
-    """Numbers for networks that denoise; others do not read them.
-
-    Args:
-        guided: Marigold: LiDAR steers every denoising step, instead of aligning the result only.
-        steps: denoising steps; 0 = the folder's own number, or 50 where LiDAR steers.
-    """
-
-    guided: bool = True
-    steps: int = 0
-
-
-DepthNetwork = Callable[[DepthInput], Prediction]
 
 
 # --- networks of transformers -----------------------------------------------------------------------------------------
@@ -192,14 +154,10 @@ def _from_image(folder: Path, place: Place, options: DepthOptions) -> DepthNetwo
 
 
 def _marigold(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    from mudg.models.depth.marigold import Marigold
-
     return Marigold.load(folder, place, guided=options.guided, steps=options.steps)
 
 
 def _depthlab(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    from mudg.models.depth.depthlab import DepthLab
-
     return DepthLab.load(folder, place, steps=options.steps)
 
 
@@ -215,6 +173,7 @@ KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] 
 }
 """``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the ``model.json`` that
 ``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders have the shorter name."""
+PLAIN: Final = DepthOptions()
 _DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_class_name"), ("model.json", "kind"))
 
 
@@ -239,7 +198,7 @@ def kind_of(folder: str | Path) -> str:
     )  # fmt: skip
 
 
-def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = DepthOptions()) -> DepthNetwork:
+def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
     """A depth network of the table, read from its folder, or from the Hugging Face cache by its name (``folders.find``).
 
     Raises:

@@ -23,7 +23,7 @@ from mudg.base.types import View
 from mudg.core.complete import beyond_reach, complete_depth, ray_elevation, visible_depth
 from mudg.core.fusion import points_in_box
 from mudg.models.labels.ground import GroundMap, above_plane, beside_path, map_ground
-from mudg.models.labels.labellers import FLOOR_M, GROWTH_M, TRAIN_ID_OF, LabelInput, box_outline, far_to_near
+from mudg.models.labels.inputs import FLOOR_M, GROWTH_M, TRAIN_ID_OF, LabelInput, box_outline, far_to_near
 
 BOX_GROUPS: Final[tuple[tuple[str, ...], ...]] = (
     ("car",), ("truck",), ("bus", "train"), ("person",), ("rider", "motorcycle", "bicycle"),

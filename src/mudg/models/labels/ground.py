@@ -110,9 +110,7 @@ def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.flo
     return cKDTree(line).query(xyz_world[:, :2])[0]
 
 
-def beside_path(
-    xyz_world: NDArray[np.float32], path_world: NDArray[np.float64], step: int
-) -> NDArray[np.float32]:
+def beside_path(xyz_world: NDArray[np.float32], path_world: NDArray[np.float64], step: int) -> NDArray[np.float32]:
     """``distance_to_path`` of the points f32[H, W, 3] of an image, worked out at every ``step``-th pixel; metres f32[H, W], infinite where
     a point is not finite."""
     coarse = xyz_world[::step, ::step]
@@ -171,7 +169,9 @@ def map_ground(
     passable = (known & (step < KERB_M)) | ((away_m > 2 * CELL_M) & (behind < _BLIND_M) & (step < KERB_M))
     way_m = _way(passable, beside)
     joined, direct = np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1]
-    joined, direct = (reached | (_grown(reached) & known) for reached in (joined, direct))  # a step takes a cell from the road, too
+    joined, direct = (
+        reached | (_grown(reached) & known) for reached in (joined, direct)
+    )  # a step takes a cell from the road, too
     floor = ndimage.minimum_filter(ndimage.uniform_filter(height, 3), 2 * round(_FLOOR_WINDOW_M / CELL_M) + 1)
     raised = np.where(known, np.maximum(height - floor, 0), 0).astype(np.float32)
     return GroundMap(corner, plane, joined, direct, raised)

@@ -1,7 +1,7 @@
 """Labels by the network that comes with the package: ``mudg annotate --labeller embedded``.
 
 The network looks at a picture of at most its own focal length, so that things have the size on it that they had in training, with
-the measured evidence of ``models.evidence`` at the same size. What the evidence and plain rules of colour settle is then taken out of
+the measured evidence of ``models.labels.evidence`` at the same size. What evidence and colour rules settle is then taken out of
 its hands (``settled``, ``settled_by_color``), and classes are brought to the image's size by their probabilities.
 """
 
@@ -20,18 +20,9 @@ from torch.nn import functional
 from mudg.base.palette import CLASSES, ID
 from mudg.models.folders import CPU, Place
 from mudg.models.labels import street_net
+from mudg.models.labels.by_geometry import GRASS, GROUND_M, find_sky, greenness_of, label_by_network
 from mudg.models.labels.evidence import BOX_GROUPS, GROUP_OF, Evidence, encode, gather
-from mudg.models.labels.labellers import (
-    GAP_DEG,
-    GRASS,
-    GROUND_M,
-    TRAIN_ID_OF,
-    LabelInput,
-    Labels,
-    find_sky,
-    greenness_of,
-    label_by_network,
-)
+from mudg.models.labels.inputs import GAP_DEG, TRAIN_ID_OF, LabelInput, Labels
 from mudg.models.labels.street_net import StreetNet
 
 RETURN_DEG: Final = 0.12
@@ -90,9 +81,7 @@ def reduced(given: LabelInput, focal_px: float) -> LabelInput:
     return dataclasses.replace(given, view=given.view.resized(width, height), rgb=rgb)
 
 
-def settled(
-    probabilities: NDArray[np.float32], evidence: Evidence, boxes_known: bool = False
-) -> NDArray[np.float32]:
+def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known: bool = False) -> NDArray[np.float32]:
     """Probabilities f32[19, H, W] without what the evidence rules out, with sum 1.
 
     No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface

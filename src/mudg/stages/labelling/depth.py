@@ -16,18 +16,12 @@ import numpy as np
 from mudg.base import log, store
 from mudg.base.errors import UsageError
 from mudg.core.complete import visible_depth
-from mudg.models.depth.networks import (
-    DepthInput,
-    DepthNetwork,
-    DepthOptions,
-    align_to_lidar,
-    enough_returns,
-    kind_of,
-    load_depth_network,
-)
+from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions
+from mudg.models.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.models.folders import Place, find, title
 from mudg.models.labels import street_net
-from mudg.models.labels.labellers import RULES, LabelInput, Labels
+from mudg.models.labels.by_geometry import RULES
+from mudg.models.labels.inputs import LabelInput, Labels
 from mudg.stages.config import AnnotateConfig
 
 _FILLED: Final = ".filled.json"

@@ -1,0 +1,294 @@
+"""Labels for images that came without any: what LiDAR, tracked boxes and plain colour can tell, and how sure it is.
+
+The rules hold no parameters and needs no download. It starts from dense depth (``core.complete``), knows few classes and says 255
+(unlabelled) where it cannot tell:
+
+* **road**: what lies near a ground plane fitted to the LiDAR. Green ground is **terrain**; other ground that the path
+  does not reach without a step or a detour (``ground.map_ground``) is **sidewalk**. Far beside the path all of it has less confidence.
+* **car, truck, bus, train, person, rider, ...**: tracked boxes, where the dense surface lies in them.
+* **sky**: bright or blue, smooth, above the horizon, joined to the top of the image, and without LiDAR returns.
+* **vegetation**: what rises from the ground, or stands above the horizon, and is green.
+* **building**: any other such thing. It means "something static that stands", not architecture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mudg.base import geometry
+from mudg.base.palette import ID, UNLABELLED
+from mudg.base.types import Track, View
+from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation, visible_depth
+from mudg.core.fusion import points_in_box
+from mudg.models.labels.ground import above_plane, beside_path, map_ground
+from mudg.models.labels.inputs import (
+    FLOOR_M,
+    GROWTH_M,
+    TRAIN_ID_OF,
+    LabelInput,
+    Labels,
+    box_outline,
+    far_to_near,
+)
+
+GROUND_M: Final = 0.2
+"""Height above the ground plane up to which a pixel is ground (and a little more far away)."""
+
+
+LANE_M: Final = 2.5
+"""Nearer to the path than this, ground beyond a step is still road: the step is an error."""
+
+
+RULES: Final = CompletionRules()
+
+
+NEAR_ROAD_M: Final = 4.0
+
+
+GRASS: Final = 6.0
+"""Ground greener than this (``greenness_of``) is terrain."""
+
+
+_THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Measured:
+    """Visible returns of an image: ``depth_m`` f32[H, W], NaN = none, and ``away_px`` f32[H, W], distance to the nearest."""
+
+    depth_m: NDArray[np.float32]
+    away_px: NDArray[np.float32]
+    gap_px: float
+
+    @property
+    def any(self) -> bool:
+        return bool(np.isfinite(self.away_px[0, 0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """Dense depth in space: ``xyz_world`` f32[H, W, 3] (NaN = unknown), depth f32[H, W] metres, ``confidence`` f32[H, W]."""
+
+    xyz_world: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+
+
+def label_by_geometry(given: LabelInput) -> Labels:
+    """Label one image from LiDAR, boxes and colour; see the module text. Works, with less, without LiDAR or boxes."""
+    measured = _measure(given)
+    elevation = ray_elevation(given.view)
+    sky = find_sky(given.rgb, elevation, measured.away_px, measured.gap_px)
+    surface = _complete(given, measured, sky)
+    semantics = np.full(sky.shape, UNLABELLED, np.uint8)
+    confidence = np.zeros(sky.shape, np.float32)
+    greenness = greenness_of(given.rgb)
+    if measured.any:
+        _paint_surface(semantics, confidence, given, surface, greenness)
+    standing = (semantics == UNLABELLED) & (elevation > 0) & ~sky
+    semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
+    confidence[standing] = 0.3
+    semantics[sky], confidence[sky] = ID["sky"], 0.8
+    for _, track in far_to_near(given):
+        _paint_box(semantics, confidence, track, given.view, measured, surface)
+    sky &= semantics == ID["sky"]
+    return _with_surface(given, semantics, confidence, sky, surface)
+
+
+def label_by_network(given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32]) -> Labels:
+    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, depth and movers from the rest."""
+    measured = _measure(given)
+    sky = (semantics == ID["sky"]) & ~np.isfinite(measured.depth_m)
+    return _with_surface(given, semantics, confidence, sky, _complete(given, measured, sky))
+
+
+def _with_surface(
+    given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32], sky: NDArray[np.bool_], surface: _Surface
+) -> Labels:  # fmt: skip
+    depth, depth_confidence = surface.depth.copy(), surface.confidence.copy()
+    depth[sky] = RULES.sky_m
+    painted_over = ~sky & (depth == RULES.sky_m)  # a box before the sky that nothing measured
+    depth_confidence[painted_over] = 0
+    return Labels(semantics, confidence, sky, find_dynamic(given, semantics, surface), depth, depth_confidence)
+
+
+def _measure(given: LabelInput) -> _Measured:
+    gap_px = max(1.5, float(np.deg2rad(given.beam_gap_deg)) * given.view.camera.fy)
+    depth = visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg)
+    known = np.isfinite(depth)
+    away = ndimage.distance_transform_edt(~known) if known.any() else np.full(depth.shape, np.inf)
+    return _Measured(depth, np.asarray(away, np.float32), gap_px)
+
+
+def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) -> _Surface:
+    """Dense depth of what is not sky, and its points."""
+    beyond = beyond_reach(given.view, measured.depth_m, given.highest_rad, gap_deg=given.beam_gap_deg)
+    for _, track in far_to_near(given):  # windows of what is tracked are silent, not far
+        pose = track.pose_at(given.view.time_s)
+        outline = None if pose is None else box_outline(given.view, pose, track.size_m)
+        if outline is not None:
+            beyond &= ~outline
+    dense = complete_depth(given.rgb, measured.depth_m, sky, beyond, RULES)
+    rows, columns = np.indices(sky.shape)
+    uv = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], 1)
+    xyz = geometry.unproject(given.view, uv, dense.depth.ravel().astype(np.float64))
+    return _Surface(xyz.reshape(*sky.shape, 3).astype(np.float32), dense.depth, dense.confidence)
+
+
+def _paint_surface(
+    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], given: LabelInput, surface: _Surface,
+    greenness: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Each pixel of known depth by its height above the ground, its place beside the path, and its colour."""
+    known = np.isfinite(surface.depth)
+    height = np.full(known.shape, np.inf, np.float32)
+    direct = np.zeros(known.shape, bool)
+    ground = map_ground(given.xyz_world, given.path_world, given.view.center_world)
+    if ground is not None:
+        height = above_plane(ground.plane, surface.xyz_world)
+        _, direct, _ = ground.at(surface.xyz_world)
+    flat = known & (np.abs(height) < GROUND_M + 0.005 * surface.depth)
+    beside = beside_path(surface.xyz_world, given.path_world, 4)
+    green = greenness > GRASS
+    semantics[flat] = np.where(green[flat], ID["terrain"], ID["road"])
+    sure = np.where(beside < NEAR_ROAD_M, 0.9, np.where(direct, 0.7, 0.5))
+    confidence[flat] = sure[flat] * (0.3 + 0.7 * surface.confidence[flat])
+    kerbed = flat & ~green & ~direct & (beside > LANE_M)
+    semantics[kerbed], confidence[kerbed] = ID["sidewalk"], 0.4
+    standing = known & ~flat & (height > 0)
+    semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
+    confidence[standing] = 0.3 + 0.2 * surface.confidence[standing]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BoxPixels:
+    """Pixels of a box: the part of the image around it, its outline in there, and where the surface lies in the box, both
+    bool[h, w]; ``middle_m`` and ``reach_m`` are its depth and half its diagonal."""
+
+    window: tuple[slice, slice]
+    outline: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+    middle_m: float
+    reach_m: float
+
+
+def _box_pixels(track: Track, view: View, surface: _Surface) -> _BoxPixels | None:
+    pose = track.pose_at(view.time_s)
+    outline = None if pose is None else box_outline(view, pose, track.size_m + 2 * GROWTH_M)
+    if pose is None or outline is None:
+        return None
+    window = (_span(outline.any(1), 1), _span(outline.any(0), 1))
+    outline = outline[window]
+    at = np.nonzero(outline & np.isfinite(surface.depth[window]))
+    local = geometry.transform_points(geometry.invert(pose), surface.xyz_world[window][at].astype(np.float64))
+    inside = np.zeros(outline.shape, bool)
+    inside[at] = points_in_box(local, track.size_m, GROWTH_M, FLOOR_M)
+    middle = float((view.cam_from_world @ pose)[2, 3])
+    return _BoxPixels(window, outline, inside, middle, float(np.linalg.norm(track.size_m)) / 2)
+
+
+def _paint_box(
+    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], track: Track, view: View, measured: _Measured, surface: _Surface
+) -> None:  # fmt: skip
+    """Paint a tracked box: surely where the surface lies in it, less surely in the rest of its outline; not behind nearer things."""
+    box = _box_pixels(track, view, surface)
+    if box is None:
+        return
+    semantics, confidence, depth = (m[box.window] for m in (semantics, confidence, surface.depth))
+    certain = surface.confidence[box.window]
+    if measured.any and not (box.inside & np.isfinite(measured.depth_m[box.window])).any():
+        return  # the LiDAR sees around there and nothing is in the box: it is hidden, or empty
+    label = TRAIN_ID_OF[track.label]
+    if not (measured.any and label in _THIN):  # people and bicycles fill little of their boxes
+        guessed = box.outline & ~box.inside & ~(depth < box.middle_m + box.reach_m) & (certain < 0.15)
+        semantics[guessed], confidence[guessed] = label, 0.4
+    semantics[box.inside], confidence[box.inside] = label, (0.5 + 0.4 * certain)[box.inside]
+
+
+def find_dynamic(given: LabelInput, semantics: NDArray[np.uint8], surface: _Surface) -> NDArray[np.bool_]:
+    """Pixels of tracked things that move, bool[H, W]: the surface lies in their box, or is unsure and has their class."""
+    dynamic = np.zeros(semantics.shape, bool)
+    for number, track in far_to_near(given):
+        box = _box_pixels(track, given.view, surface) if number in given.moving else None
+        if box is not None:
+            unsure = box.outline & ~(surface.confidence[box.window] > 0.3)
+            dynamic[box.window] |= box.inside | (unsure & (semantics[box.window] == TRAIN_ID_OF[track.label]))
+    return dynamic
+
+
+def _span(present: NDArray[np.bool_], margin: int) -> slice:
+    """From the first to the last true entry, and ``margin`` more on either side."""
+    at = np.flatnonzero(present)
+    return slice(max(0, int(at[0]) - margin), int(at[-1]) + margin + 1)
+
+
+def greenness_of(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Positive where a smoothed pixel is green rather than red or blue, or the dark mottled colour of leaves; f32[H, W]."""
+    smooth = ndimage.uniform_filter(rgb.astype(np.float32), (5, 5, 1))
+    red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
+    return green - np.maximum(red * 0.97, blue * 1.04) - 1.5
+
+
+def find_sky(
+    rgb: NDArray[np.uint8], elevation: NDArray[np.float32], away_px: NDArray[np.float32], gap_px: float
+) -> NDArray[np.bool_]:
+    """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, joined to the top of the image.
+
+    Args:
+        rgb: u8[H, W, 3].
+        elevation: of the rays, radians, f32[H, W].
+        away_px: distance to the nearest LiDAR return f32[H, W].
+        gap_px: sky is looked for farther from returns than this, and then grown up to them where it looks the same.
+    """
+    candidates = (elevation > 0) & (away_px > gap_px)
+    if not candidates.any():
+        return candidates
+    smooth = ndimage.uniform_filter(rgb.astype(np.float32), (3, 3, 1))
+    blueness = smooth[..., 2] - smooth[..., 0]
+    score = smooth.max(2) + 1.5 * np.clip(blueness, 0, 60)
+    threshold = _two_group_threshold(score[candidates])
+    rough = ndimage.gaussian_gradient_magnitude(smooth.mean(2), 1.0) > 20
+    looks_so = (score > threshold) & (blueness > -25) & ~rough
+    sky = _at_edges_too(ndimage.binary_opening, candidates & looks_so)
+    pieces, _ = ndimage.label(sky)
+    top = np.flatnonzero(candidates.any(1))[0]
+    joined = np.unique(pieces[top : top + 3])
+    large = np.flatnonzero(np.bincount(pieces.ravel()) > 0.002 * sky.size)
+    keep = np.union1d(joined, large)
+    sky = np.isin(pieces, keep[keep > 0])
+    if not sky.any():
+        return sky
+    sky = _at_edges_too(ndimage.binary_closing, sky) & candidates
+    free = (elevation > 0) & (away_px > 1.5)
+    return ndimage.binary_dilation(sky, iterations=int(np.ceil(gap_px)) + 1, mask=free & (looks_so | sky))
+
+
+def _at_edges_too(
+    morphology: Callable[..., NDArray[np.bool_]], mask: NDArray[np.bool_], reach_px: int = 1
+) -> NDArray[np.bool_]:
+    """Opening or closing by a square, the image going on beyond its edges as it ends there."""
+    grown = reach_px + 1
+    padded = morphology(np.pad(mask, grown, mode="edge"), np.ones((3, 3), bool), iterations=reach_px)
+    return padded[grown:-grown, grown:-grown]
+
+
+def _two_group_threshold(values: NDArray[np.float32]) -> float:
+    """The level that splits values into two groups of least inner variance; at least a modest brightness of 90."""
+    counts, edges = np.histogram(values, 128)
+    centers = (edges[:-1] + edges[1:]) / 2
+    below = np.cumsum(counts)[:-1].astype(np.float64)
+    above = counts.sum() - below
+    sum_below = np.cumsum(counts * centers)[:-1]
+    mean_below = sum_below / np.maximum(below, 1)
+    mean_above = ((counts * centers).sum() - sum_below) / np.maximum(above, 1)
+    between = below * above * (mean_above - mean_below) ** 2
+    best = int(between.argmax())
+    if mean_above[best] - mean_below[best] < 40:  # one group only: all sky if bright, none if dark
+        return 90.0 if centers[int(counts.argmax())] > 150 else float("inf")
+    return max(float(edges[best + 1]), 90.0)

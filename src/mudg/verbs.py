@@ -1,0 +1,168 @@
+"""Every command as a function: paths and keyword settings in, the path of the result out.
+
+    from mudg import verbs
+
+    verbs.fuse("scenes/a", "runs/fused", voxel_m=0.08)
+    verbs.fit("scenes/a", "runs/fused", "runs/fit", method="street_gaussians", loss={"lidar_weight": 0.2})
+
+A setting has the name and the default that ``mudg VERB --help`` shows, without the dashes; a group of settings is a dictionary.
+``config`` names a YAML file that is read before the keyword settings, as ``--config`` does. Unknown settings, values out of range and
+outputs that hold something else are refused as on the command line, with the errors of ``mudg.base.errors``. A finished result of the same
+settings and inputs is verified and reused; an interrupted one is resumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mudg.base import config as configuration
+from mudg.stages import config as stage_config
+
+Config = TypeVar("Config")
+Location = str | Path
+
+
+def ingest(
+    log: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+) -> Path:
+    """Turn a driving log, or the built-in ``"city"``, into a scene folder; returns the folder."""
+    from mudg.stages import ingest as stage
+
+    return stage.run(_settings(stage_config.IngestConfig, config, settings), log, Path(out), overwrite=overwrite)
+
+
+def annotate(
+    scene: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+) -> Path:
+    """Add dense depth, classes, sky and dynamic objects to a scene, each with a confidence; returns the new scene's folder."""
+    from mudg.stages import annotate as stage
+
+    return stage.run(
+        _settings(stage_config.AnnotateConfig, config, settings), Path(scene), Path(out), overwrite=overwrite
+    )
+
+
+def fuse(
+    scene: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+) -> Path:
+    """Fuse the LiDAR of a scene into coloured clouds, one static and one per object; returns their folder."""
+    from mudg.stages import fuse as stage
+
+    return stage.run(_settings(stage_config.FuseConfig, config, settings), Path(scene), Path(out), overwrite=overwrite)
+
+
+def learn(out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any) -> Path:
+    """Train a diffusion model; returns the model's folder."""
+    from mudg.stages import learn as stage
+
+    return stage.run(_settings(stage_config.LearnConfig, config, settings), Path(out), overwrite=overwrite)
+
+
+def convert(
+    checkpoint: Location, to: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+) -> Path:
+    """Turn a published checkpoint into a model folder; returns the folder."""
+    from mudg.stages import convert as stage
+
+    made = _settings(stage_config.ConvertConfig, config, settings)
+    return stage.run(made, Path(checkpoint), Path(to), overwrite=overwrite)
+
+
+def synthesize(
+    scene: Location, fused: Location, out: Location, *,
+    fitted: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Generate colour, depth and classes on shifted trajectories; returns the folder of observation sets."""
+    from mudg.stages import synthesize as stage
+
+    made = _settings(stage_config.SynthesizeConfig, config, settings)
+    return stage.run(made, Path(scene), Path(fused), Path(out), fitted=_optional(fitted), overwrite=overwrite)
+
+
+def fit(
+    scene: Location, fused: Location, out: Location, *,
+    observations: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Fit a dynamic Gaussian scene to recorded and, with ``observations``, generated views; returns the model's folder."""
+    from mudg.stages import fit as stage
+
+    made = _settings(stage_config.FitConfig, config, settings)
+    return stage.run(
+        made, Path(scene), Path(fused), Path(out), observations=_optional(observations), overwrite=overwrite
+    )
+
+
+def render(
+    scene: Location, model: Location, out: Location, *,
+    overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Render a fitted scene on recorded and shifted trajectories; returns the folder of observation sets and videos."""
+    from mudg.stages import render as stage
+
+    made = _settings(stage_config.RenderConfig, config, settings)
+    return stage.run(made, Path(scene), Path(model), Path(out), overwrite=overwrite)
+
+
+def score(
+    scene: Location, views: Mapping[str, Location], out: Location, *,
+    fused: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Score views of several methods (name -> folder) against truth where there is some; returns the folder of ``metrics.json``."""
+    from mudg.stages import score as stage
+
+    made = _settings(stage_config.ScoreConfig, config, settings)
+    folders = {name: Path(folder) for name, folder in views.items()}
+    return stage.run(made, Path(scene), folders, Path(out), fused=_optional(fused), overwrite=overwrite)
+
+
+def run(
+    log: Location, out: Location, *,
+    fast: bool = False, seed: int | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> dict[str, Any]:  # fmt: skip
+    """Run the whole chain on a driving log, a scene or ``"city"``.
+
+    Args:
+        fast: smaller pictures, fewer frames and iterations. seed: of the city and of every random draw.
+        settings: one dictionary per verb, and ``cameras`` and ``shifts_m`` (metres, positive to the left) for all of them.
+
+    Returns:
+        Paths of the report and of what each verb made, and the closing table as ``text``.
+    """
+    from mudg.stages import run as stage
+
+    preset = stage_config.run_preset(fast)
+    if seed is not None:
+        preset = stage_config.with_seed(preset, seed)
+    cameras, shifts_m = settings.pop("cameras", None), settings.pop("shifts_m", None)
+    made = _settings(stage_config.RunConfig, config, settings, preset)
+    return stage.run_chain(
+        stage_config.with_lines(made, cameras=cameras, shifts_m=shifts_m), log, Path(out), overwrite=overwrite
+    )
+
+
+def bench(
+    name: str, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+) -> Path:
+    """Run a benchmark (``mdm``, ``poses``, ``shift``) against exact truth; returns the folder of ``bench.json``."""
+    from mudg.bench import run as stage
+
+    return stage.run(name, _settings(stage_config.BenchConfig, config, settings), Path(out), overwrite=overwrite)
+
+
+def doctor(scene: Location | None = None) -> dict[str, Any]:
+    """Say what this machine offers or, with a scene, what is wrong with it."""
+    from mudg.stages import doctor as stage
+
+    return stage.report_machine() if scene is None else stage.report_scene(Path(scene))
+
+
+def _settings(
+    kind: type[Config], file: Location | None, settings: Mapping[str, Any], preset: Config | None = None
+) -> Config:
+    return configuration.load(kind, preset, _optional(file), settings)
+
+
+def _optional(path: Location | None) -> Path | None:
+    return None if path is None else Path(path)
