@@ -60,31 +60,31 @@ def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clips")
     rules = from_city.CityClipRules(48, 32, 4, clips=2)
     from_city.write_city(rules, from_city.DEVELOPMENT[0], folder)
-    return clip_shards.read_batch(folder, [(from_city.DEVELOPMENT[0], 0, range(4))])
+    return clip_shards.read_clip(folder, from_city.DEVELOPMENT[0], 0, range(4))
 
 
 def test_conditions_of_the_ablation(city):
-    points = mdm_ablation.points_only(city)
-    assert torch.equal(points.color[points.valid.expand_as(points.color)], city.point_color[city.valid.expand_as(city.color)])
-    assert float(points.color[~points.valid.expand_as(points.color)].abs().max()) == 0
-    assert not bool(points.warped.any())
-    assert bool((points.ids == 255).all())
-    nothing = mdm_ablation.nothing_seen(city)
+    points = mdm_ablation.points_only(city).condition
+    seen = points.valid.expand_as(points.color)
+    assert torch.equal(seen, city.condition.valid.expand_as(seen))
+    assert torch.equal(points.color[seen], city.point_color[seen])
+    assert float(points.color[~seen].abs().max()) == 0
+    assert points.warped is None and points.semantics is None and points.backdrop_semantics is None
+    nothing = mdm_ablation.nothing_seen(city).condition
     assert float(nothing.color.abs().max()) == 0
     assert not bool(nothing.valid.any())
-    assert torch.equal(nothing.reference, city.reference)
+    assert torch.equal(nothing.reference, city.condition.reference)
 
 
 def test_concatenated_reference_adds_its_latent_to_every_frame(city):
     plain = MDMConfig(**{**SMALL.__dict__, "reference": "none"})
     both = MDMConfig(**{**SMALL.__dict__, "reference": "concatenated"})
-    given = (city.color, city.sparse_depth, city.valid, city.warped, city.backdrop, city.reference, city.ids, city.backdrop_ids)
-    without, within = MDM(plain).encode_planes(*given).planes, MDM(both).encode_planes(*given).planes
+    without, within = (MDM(config).encode_condition(city.condition).planes for config in (plain, both))
     assert within.shape[2] == without.shape[2] + 4
-    latent = MDM(both).codec.encode_rgb(city.reference)
-    places = [c for c in range(within.shape[2] - 3) if torch.equal(within[0, 0, c : c + 4], latent[0])]
+    latent = MDM(both).codec.encode_rgb(city.condition.reference)
+    places = [c for c in range(within.shape[2] - 3) if torch.equal(within[0, 0, c : c + 4], latent)]
     assert len(places) == 1
-    assert torch.equal(within[0, -1, places[0] : places[0] + 4], latent[0])
+    assert torch.equal(within[0, -1, places[0] : places[0] + 4], latent)
 
 
 def test_reported_and_development_cities_differ():

@@ -13,9 +13,9 @@ and, for comparison, ours: points filled in, recorded images warped in, masks an
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,15 @@ import torch
 
 from mudg.base import log
 from mudg.base.errors import NumericsError
+from mudg.base.types import Clip, Condition
 from mudg.data.clips import from_city
 from mudg.data.clips.from_city import CityClipRules
-from mudg.data.clips.shards import Batch
 from mudg.models.mdm import model as mdm
-from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig
 from mudg.stages import learn
 from mudg.stages.config import BenchConfig, LearnConfig
 from mudg.stages.learning import score as learn_score
-from mudg.stages.learning.models import mdm_loss
 from mudg.stages.learning.precision import choose_bf16
-from mudg.stages.learning.published import Part
 
 WIDTH, HEIGHT = 96, 64
 _SMALL: dict[str, Any] = {"widths": (48, 96, 160), "blocks": (1, 1, 2), "patch": 2}
@@ -43,33 +41,29 @@ _PUBLISHED: dict[str, Any] = {
 }  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Variant:
     """A row of the table: the model's configuration and what its batches are made into."""
 
     config: MDMConfig
-    prepare: Callable[[Batch], Batch]
+    prepare: Callable[[Clip], Clip]
 
 
-def points_only(batch: Batch) -> Batch:
+def points_only(clip: Clip) -> Clip:
     """The published condition: colour and depth of the points, 0 where none was seen; no class, no warped image."""
-    if batch.point_color is None:
+    if clip.point_color is None:
         raise ValueError("the clips were made without point colours")
-    seen = batch.valid.float()
-    color = batch.point_color * seen
-    return dataclasses.replace(
-        learn_score.without_classes(batch), color=color, sparse_depth=batch.sparse_depth * seen,
-        warped=torch.zeros_like(batch.warped), backdrop=color,
-    )  # fmt: skip
+    given = clip.condition
+    seen = given.valid.float()
+    points = Condition(given.views, clip.point_color * seen, given.depth * seen, given.valid, given.reference)
+    return replace(clip, condition=points)
 
 
-def nothing_seen(batch: Batch) -> Batch:
+def nothing_seen(clip: Clip) -> Clip:
     """As `points_only`, without the points."""
-    empty = points_only(batch)
-    zeros = torch.zeros_like(empty.color)
-    return dataclasses.replace(
-        empty, color=zeros, backdrop=zeros, sparse_depth=torch.zeros_like(empty.sparse_depth), valid=torch.zeros_like(empty.valid)
-    )
+    empty = points_only(clip).condition
+    nothing = {name: torch.zeros_like(getattr(empty, name)) for name in ("color", "depth", "valid")}
+    return replace(clip, condition=replace(empty, **nothing))
 
 
 VARIANTS: dict[str, Variant] = {
@@ -122,9 +116,11 @@ def _trained(name: str, variant: Variant, config: LearnConfig, bf16: bool) -> MD
             optimizer.param_groups[0]["lr"] = learn.learning_rate(config, step)
             frames = learn.frames_at(config, step)
             count = max(1, config.batch_frames // frames)
-            batch = variant.prepare(learn.draw_batch(config, Path(config.clips), step, count, frames, "ablation batch"))
+            clips = learn.draw_clips(config, Path(config.clips), step, count, frames, "ablation batch")
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-                losses = mdm_loss(model.loss, model, config, Part(batch, step, 0, count), torch.ones(mdm.CLASSES))
+                losses = model(
+                    [variant.prepare(clip) for clip in clips], BatchPart(config.seed, step, 0, count), LossSettings(refined_share=1.0)
+                )
             optimizer.zero_grad(set_to_none=True)
             losses.total.backward()
             norm = float(torch.nn.utils.clip_grad_norm_(trained, 1.0))
