@@ -201,39 +201,42 @@ def some_clip(frames=3, height=16, width=24):
 
 def test_shards_give_back_what_was_packed(tmp_path):
     clip = some_clip()
-    clip_shards.write_shard(tmp_path, 3, clip_shards.pack_clips([clip, clip], [1.5, 0.0]))
+    clip_shards.write_shard(tmp_path, 3, clip_shards.pack_clips([replace(clip, shift_m=1.5), clip]))
     assert clip_shards.clips_in(tmp_path, 3) == 2
-    batch = clip_shards.read_batch(tmp_path, [(3, 0, [0, 2]), (3, 1, [1, 2])])
-    assert batch.shift_m == (1.5, 0.0)
-    assert torch.allclose(batch.rgb[0], clip.rgb[[0, 2]], atol=0.5 / 255 + 1e-6)
-    assert torch.allclose(batch.color[1], clip.condition.color[[1, 2]], atol=0.5 / 255 + 1e-6)
-    assert torch.equal(batch.valid[0], clip.condition.valid[[0, 2]])
-    assert torch.equal(batch.warped[1], clip.condition.warped[[1, 2]])
-    assert torch.equal(batch.semantics[0], clip.semantics[[0, 2]])
+    first, second = clip_shards.read_clip(tmp_path, 3, 0, [0, 2]), clip_shards.read_clip(tmp_path, 3, 1, [1, 2])
+    assert (first.shift_m, second.shift_m) == (1.5, 0.0)
+    assert torch.allclose(first.rgb, clip.rgb[[0, 2]], atol=0.5 / 255 + 1e-6)
+    assert torch.allclose(second.condition.color, clip.condition.color[[1, 2]], atol=0.5 / 255 + 1e-6)
+    assert torch.equal(first.condition.valid, clip.condition.valid[[0, 2]])
+    assert torch.equal(second.condition.warped, clip.condition.warped[[1, 2]])
+    assert torch.equal(first.semantics, clip.semantics[[0, 2]])
     known = clip.depth_valid[[0, 2]]
-    assert torch.allclose(batch.depth[0][known], clip.depth[[0, 2]][known], rtol=1e-3)
-    assert bool((batch.depth[0][~known] == clip_shards.FAR_M).all())
+    assert torch.allclose(first.depth[known], clip.depth[[0, 2]][known], rtol=1e-3)
+    assert bool((first.depth[~known] == clip_shards.FAR_M).all())
+    for view, original in zip(first.condition.views, (clip.condition.views[0], clip.condition.views[2])):
+        assert np.array_equal(view.world_from_cam, original.world_from_cam)
+        assert replace(view.camera, name="front") == original.camera
 
 
 def test_missing_shard_is_named(tmp_path):
     with pytest.raises(InputError, match="city_0000007"):
-        clip_shards.read_batch(tmp_path, [(7, 0, [0])])
+        clip_shards.read_clip(tmp_path, 7, 0, [0])
 
 
 def test_variation_treats_truth_and_condition_alike(tmp_path):
     clip = some_clip()
     same = replace(clip, condition=replace(clip.condition, color=clip.rgb, backdrop=clip.rgb))
-    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([same], [2.0]))
-    batch = clip_shards.read_batch(tmp_path, [(0, 0, [0, 1, 2])])
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([replace(same, shift_m=2.0)]))
+    read = clip_shards.read_clip(tmp_path, 0, 0, [0, 1, 2])
     flips = set()
     for seed in range(6):
-        varied = clip_shards.vary(batch, np.random.default_rng(seed))
-        assert float((varied.rgb - varied.color).abs().mean()) < 0.04
-        assert torch.equal(varied.semantics.flip(-1), batch.semantics) or torch.equal(varied.semantics, batch.semantics)
+        varied = clip_shards.vary(read, np.random.default_rng(seed))
+        assert float((varied.rgb - varied.condition.color).abs().mean()) < 0.04
+        assert torch.equal(varied.semantics.flip(-1), read.semantics) or torch.equal(varied.semantics, read.semantics)
         flips.add(varied.shift_m)
-        again = clip_shards.vary(batch, np.random.default_rng(seed))
+        again = clip_shards.vary(read, np.random.default_rng(seed))
         assert torch.equal(varied.rgb, again.rgb)
-    assert flips == {(2.0,), (-2.0,)}
+    assert flips == {2.0, -2.0}
 
 
 def test_city_clips_are_a_function_of_seed_and_number():
@@ -244,10 +247,8 @@ def test_city_clips_are_a_function_of_seed_and_number():
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=2, clips=2)
-    first, shifts = from_city.make_clips(rules, 5)
-    again, _ = from_city.make_clips(rules, 5)
-    other, _ = from_city.make_clips(rules, 6)
-    assert len(first) == len(shifts) == 2
+    first, again, other = (from_city.make_clips(rules, city) for city in (5, 5, 6))
+    assert [clip.shift_m for clip in first] == list(from_city.shifts_of(rules, 5)) and len(first) == 2
     for name in ("rgb", "depth", "semantics"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name)), name
     assert torch.equal(first[0].condition.color, again[0].condition.color)

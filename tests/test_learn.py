@@ -31,17 +31,17 @@ def weights(folder):
 def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, tmp_path, monkeypatch):
     config = tiny(clips, checkpoint_every=100)
     whole = learn.run(config, tmp_path / "whole")
-    losses = learn._losses
+    draw = learn.draw_clips
 
-    def stopped_by_the_user(spread, model, config, batch, step, *rest):
-        if step == 1:
+    def stopped_by_the_user(config, folder, step, count, frames, purpose, *rest):
+        if step == 1 and purpose == "batch":
             signal.raise_signal(signal.SIGINT)
-        return losses(spread, model, config, batch, step, *rest)
+        return draw(config, folder, step, count, frames, purpose, *rest)
 
-    monkeypatch.setattr(learn, "_losses", stopped_by_the_user)
+    monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
     with pytest.raises(KeyboardInterrupt):
         learn.run(config, tmp_path / "parts")
-    monkeypatch.setattr(learn, "_losses", losses)
+    monkeypatch.setattr(learn, "draw_clips", draw)
     saved = checkpoint.latest(tmp_path / "parts" / "steps")
     assert saved is not None and saved.step == 2  # the step that was under way was finished
     assert json.loads((tmp_path / "parts" / "run.json").read_text())["state"] == "interrupted"
@@ -106,11 +106,9 @@ def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
 
 def test_batches_depend_on_step_only(clips):
     config = tiny(clips)
-    first = learn.draw_batch(config, clips, 7, 2, 2, "batch")
-    again = learn.draw_batch(config, clips, 7, 2, 2, "batch")
-    other = learn.draw_batch(config, clips, 8, 2, 2, "batch")
-    assert torch.equal(first.rgb, again.rgb)
-    assert not torch.equal(first.rgb, other.rgb)
+    first, again, other = (learn.draw_clips(config, clips, step, 2, 2, "batch") for step in (7, 7, 8))
+    assert all(torch.equal(one.rgb, two.rgb) for one, two in zip(first, again, strict=True))
+    assert not torch.equal(first[0].rgb, other[0].rgb)
 
 
 def test_schedules(clips):
@@ -119,8 +117,8 @@ def test_schedules(clips):
     assert learn.learning_rate(config, 300) == pytest.approx(1e-3)
     assert learn.learning_rate(config, 750) == pytest.approx(5e-4)
     assert learn.learning_rate(config, 999) == pytest.approx(2e-5)
-    assert learn_clips.cities_at(config, 0) == 1
-    assert learn_clips.cities_at(config, 600) == 3
+    assert learn_clips.cities_in_use(config, 0) == 1
+    assert learn_clips.cities_in_use(config, 600) == 3
     assert [learn.frames_at(config, s) for s in (0, 499, 500)] == [2, 2, 4]
 
 
@@ -130,10 +128,10 @@ def test_clips_that_never_come_are_an_error(tmp_path):
 
 
 def test_perfect_samples_score_perfectly(clips):
-    batch = clip_shards.read_batch(clips, [(from_city.HELD_OUT, 0, range(WINDOW))])
-    depth = batch.depth[0].clamp(max=100.0)
-    sample = GeneratedClip(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
-    row, counts = learn_score.score_clip(batch, sample)
+    clip = clip_shards.read_clip(clips, from_city.HELD_OUT, 0, range(WINDOW))
+    depth = clip.depth.clamp(max=100.0)
+    sample = GeneratedClip(clip.rgb, depth, clip.semantics, torch.ones_like(depth), {})
+    row, counts = learn_score.score_clip(clip, sample)
     assert row["psnr"] == float("inf")
     assert row["abs_rel"] == pytest.approx(0.0, abs=1e-6)
     assert row["sharpness"] == pytest.approx(1.0)

@@ -16,7 +16,7 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
 from mudg.models.mdm import files
-from mudg.models.mdm.model import MDM
+from mudg.models.mdm.model import MDM, BatchPart, LossSettings
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import parallel as learn_parallel
@@ -139,25 +139,24 @@ def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
 
 def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
     config = tiny(clips, reference_dropout=0.5)
-    whole = learn_clips.draw_batch(config, clips, 7, 4, 2, "batch")
+    everything = learn_clips.draw_clips(config, clips, 7, 4, 2, "batch")
     for part in (slice(0, 1), slice(1, 3), slice(3, 4)):
-        own = learn_clips.draw_batch(config, clips, 7, 4, 2, "batch", part)
-        assert torch.equal(own.rgb, whole.rgb[part])
-        assert torch.equal(own.ids, whole.ids[part])
-        assert torch.equal(own.reference, whole.reference[part])
-        assert own.shift_m == whole.shift_m[part]
+        for own, clip in zip(learn_clips.draw_clips(config, clips, 7, 4, 2, "batch", part), everything[part], strict=True):
+            assert torch.equal(own.rgb, clip.rgb)
+            assert torch.equal(own.condition.semantics, clip.condition.semantics)
+            assert torch.equal(own.condition.reference, clip.condition.reference)
+            assert own.shift_m == clip.shift_m
 
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
     model = MDM(learn.model_config(tiny(clips)))
     learn.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
-    weights = learn_clips.class_weights(clips, 2, 0.5)
+    rules = LossSettings(learn_clips.class_weights(clips, 2, 0.5), refined_share=0.5)
 
     def loss(part, step):
-        batch = learn_clips.draw_batch(settings, clips, step, 4, 2, "batch", part)
-        first = part.start or 0
-        return float(learn._losses(model.loss, model, settings, batch, step, first, 4, weights, False).total.detach())
+        drawn = learn_clips.draw_clips(settings, clips, step, 4, 2, "batch", part)
+        return float(model(drawn, BatchPart(settings.seed, step, part.start or 0, 4), rules).total.detach())
 
     for step in range(3):
         parts = [loss(slice(n, n + 1), step) for n in range(4)]

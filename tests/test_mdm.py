@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from mudg.base.errors import InputError, IntegrityError, UsageError
-from mudg.base.types import Camera, Condition, View
+from mudg.base.types import Camera, Clip, Condition, View
 from mudg.core import noise
 from mudg.models import diffusion
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import codec, files, unet
 from mudg.models.mdm import model as mdm
-from mudg.models.mdm.codec import CodecConfig, semantic_shares
-from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig
 
 TINY = MDMConfig(
     widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
@@ -178,14 +178,12 @@ def test_loss_falls_when_a_clip_is_learnt(config):
         condition.depth[None] * 0.5 + 2,
         torch.randint(0, 19, (1, 3, 16, 24)),
     )
-    truth, encoded = model.encode_truth(rgb, depth, ids), model.encode_condition(condition)
-    shares = semantic_shares(ids)
+    clip = Clip(condition, rgb[0], depth[0], torch.ones_like(condition.valid), ids[0])
     optimizer = torch.optim.Adam(learn_part(model), lr=3e-3)
-    pixels = model.pixel_truth(rgb, depth, ids)
     totals = []
     for step in range(40):
         # the same draws at every fourth step: a falling loss cannot come from an easier draw
-        losses = model.loss(truth, encoded, torch.Generator().manual_seed(step % 4), shares=shares, pixels=pixels)
+        losses = model.loss([clip], BatchPart(0, step % 4, 0, 1), LossSettings())
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
@@ -197,11 +195,8 @@ def test_loss_has_gradients_everywhere():
     model = randomised(TINY)
     condition = some_condition()
     ids = torch.randint(0, 19, (1, 3, 16, 24), generator=torch.Generator().manual_seed(0))
-    losses = model.loss(
-        model.encode_truth(condition.color[None], condition.depth[None], ids), model.encode_condition(condition),
-        torch.Generator().manual_seed(0), shares=semantic_shares(ids),
-        pixels=model.pixel_truth(condition.color[None], condition.depth[None], ids),
-    )  # fmt: skip
+    clip = Clip(condition, condition.color, condition.depth, torch.ones_like(condition.valid), ids[0])
+    losses = model.loss([clip], BatchPart(0, 0, 0, 1), LossSettings())
     losses.total.backward()
     trained = [(n, p) for n, p in model.named_parameters() if not n.startswith("codec.")]
     dead = [n for n, p in trained if p.grad is None or not bool(p.grad.abs().sum() > 0)]

@@ -345,7 +345,7 @@ def test_a_training_step_moves_what_its_stage_says(stage, temporal):
     moving = choose_trainable(model, stage, temporal)
     model.net.train()
     before = {name: value.detach().clone() for name, value in model.named_parameters()}
-    losses = model.loss(truth, encoded, torch.Generator().manual_seed(4))
+    losses = model.velocity_loss(truth, encoded, torch.Generator().manual_seed(4))
     losses.total.backward()
     torch.optim.AdamW(moving, lr=1e-3).step()
     moved = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
@@ -372,12 +372,12 @@ def test_checkpointing_gives_the_same_gradients():
         moving = choose_trainable(model, 1)
         model.net.train()
         model.net.checkpointing = checkpointing
-        model.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+        model.velocity_loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
         gradients.append(torch.cat([p.grad.flatten() for p in moving]))
     assert error(gradients[1], gradients[0]) < 1e-5
     other = tiny_model()
     choose_trainable(other, 1)
-    other.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+    other.velocity_loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
     undropped = torch.cat([p.grad.flatten() for p in other.parameters() if p.requires_grad])
     assert error(undropped, gradients[0]) > 1e-2
 
@@ -392,7 +392,7 @@ def test_loss_is_the_velocity_error_and_repeats(model):
         return torch.zeros_like(x)
 
     original, model.predict = model.predict, stand_in
-    losses = model.loss(truth, encoded, torch.Generator().manual_seed(0))
+    losses = model.velocity_loss(truth, encoded, torch.Generator().manual_seed(0))
     model.predict = original
     x0 = torch.stack([truth[m][n] for n, m in enumerate(seen["names"])])
     alpha, sigma = model.schedule.at(seen["t"], 5)
@@ -400,7 +400,7 @@ def test_loss_is_the_velocity_error_and_repeats(model):
     eps = (seen["x"] - alpha * scale * x0) / sigma
     wanted = (alpha * eps - sigma * scale * x0).square().mean()
     assert float(losses.total.detach()) == pytest.approx(float(wanted), rel=1e-4)
-    one, two = (float(model.loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2))
+    one, two = (float(model.velocity_loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2))
     assert one == two
 
 
@@ -418,7 +418,7 @@ def test_shares_of_modalities_and_missing_context(model):
 
     original, model.predict = model.predict, stand_in
     tower, model.image_tokens = model.image_tokens, torch.nn.Identity()
-    model.loss(small, many, torch.Generator().manual_seed(0))
+    model.velocity_loss(small, many, torch.Generator().manual_seed(0))
     model.predict, model.image_tokens = original, tower
     share = lambda flags: float(torch.tensor(flags).float().mean())  # noqa: E731
     for name, wanted in (("rgb", 0.5), ("semantics", 0.25), ("depth", 0.25)):

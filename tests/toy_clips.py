@@ -42,7 +42,8 @@ def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, point
     for number in [*range(3), HELD_OUT]:
         made = [made_up_clip(number * 7 + k, width, height) for k in range(2)]
         made = [points_alone(clip) for clip in made[: 1 if number == HELD_OUT else 2]] if points else made
-        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0][: len(made)]))
+        made = [replace(clip, shift_m=shift) for clip, shift in zip(made, (2.0, 0.0), strict=False)]
+        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made))
     return folder
 
 

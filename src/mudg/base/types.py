@@ -7,7 +7,7 @@ facts can be read without it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,6 +18,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 Matrix = NDArray[np.float64]
@@ -83,6 +84,12 @@ def _check_tensor(value: Any, where: str, shape: tuple[int | None, ...]) -> None
         raise InputError(
             "a tensor has the wrong shape", where=where, expected=str(shape).replace("None", "N"), got=str(got)
         )
+
+
+def _moved(value: Any, device: torch.device) -> dict[str, Tensor]:
+    """The tensors among the fields of a dataclass, on a device."""
+    given = {f.name: getattr(value, f.name) for f in fields(value)}
+    return {name: tensor.to(device) for name, tensor in given.items() if hasattr(tensor, "device")}
 
 
 def _freeze(mapping: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -406,6 +413,10 @@ class Condition:
         if self.backdrop_semantics is not None:
             _check_tensor(self.backdrop_semantics, "condition.backdrop_semantics", (t, 1, h, w))
 
+    def to(self, device: torch.device) -> Condition:
+        """The same condition with its tensors on a device."""
+        return replace(self, **_moved(self, device))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clip:
@@ -413,8 +424,10 @@ class Clip:
 
     Args:
         rgb: f32[T, 3, H, W] in [0, 1].
-        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W].
+        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W]; elsewhere it only fills a gap.
         semantics: i64[T, H, W] train ids, 255 = unlabelled.
+        shift_m: lateral shift from the recorded path, metres, positive to the left.
+        point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring only.
     """
 
     condition: Condition
@@ -422,6 +435,8 @@ class Clip:
     depth: Tensor
     depth_valid: Tensor
     semantics: Tensor
+    shift_m: float = 0.0
+    point_color: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, _, h, w = self.condition.color.shape
@@ -429,6 +444,12 @@ class Clip:
         _check_tensor(self.depth, "clip.depth", (t, 1, h, w))
         _check_tensor(self.depth_valid, "clip.depth_valid", (t, 1, h, w))
         _check_tensor(self.semantics, "clip.semantics", (t, h, w))
+        if self.point_color is not None:
+            _check_tensor(self.point_color, "clip.point_color", (t, 3, h, w))
+
+    def to(self, device: torch.device) -> Clip:
+        """The same clip with its tensors on a device."""
+        return replace(self, condition=self.condition.to(device), **_moved(self, device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,6 +21,7 @@ import contextlib
 import importlib.util
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,12 +33,13 @@ from torch.nn import functional
 from mudg.base import checkpoint, log, seeds, store
 from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError, UsageError
+from mudg.base.types import Clip
+from mudg.core import losses
 from mudg.data.clips import from_log
 from mudg.data.clips.from_log import LogClipRules
-from mudg.data.clips.shards import Batch
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.codec import PatchCodec
-from mudg.models.mdm.model import MDM, Losses, MDMConfig, same_denoiser, with_refiner
+from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig, same_denoiser, with_refiner
 from mudg.models.published.files import is_published
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import (
@@ -52,9 +54,9 @@ from mudg.stages.learning import (
 from mudg.stages.learning import (
     score as learn_score,
 )
-from mudg.stages.learning.clips import class_weights, draw_batch
+from mudg.stages.learning.clips import class_weights, draw_clips
 from mudg.stages.learning.latents import cached_latents
-from mudg.stages.learning.models import Model, Part, kind_of
+from mudg.stages.learning.models import Model, kind_of
 from mudg.stages.learning.parallel import Interruption, Ranks, Spread, agreed, joined
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.state import TrainingState, mean_of, newest
@@ -240,17 +242,17 @@ def _train_codec(model: MDM, config: LearnConfig, run_dir: store.RunDir, folder:
         start = saved.step
     else:
         draw_weights(codec, config.seed, "codec weights")
-        first = [draw_batch(config, folder, n, 8, 1, "codec fit") for n in range(config.codec_fit_batches)]
-        codec.fit_colour(torch.cat([b.rgb.flatten(0, 1) for b in first]))
-        codec.fit_depth(torch.cat([b.depth.flatten(0, 1) for b in first]))
+        first = [c for n in range(config.codec_fit_batches) for c in draw_clips(config, folder, n, 8, 1, "codec fit")]
+        codec.fit_colour(torch.cat([clip.rgb for clip in first]))
+        codec.fit_depth(torch.cat([clip.depth for clip in first]))
     recent: list[dict[str, float]] = []
     with log.task("codec", config.codec_steps, start) as bar:
         for step in range(start, config.codec_steps):
             warm, left = min(1.0, (step + 1) / 50), 1 - step / config.codec_steps
             optimizer.param_groups[0]["lr"] = config.codec_lr * warm * min(1.0, left / 0.6)
-            batch = draw_batch(config, folder, step, config.codec_batch, 1, "codec batch")
+            clips = draw_clips(config, folder, step, config.codec_batch, 1, "codec batch")
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-                loss, terms = codec_loss(codec, batch, seeds.torch_generator(config.seed, step, "codec noise"))
+                loss, terms = codec_loss(codec, clips, seeds.torch_generator(config.seed, step, "codec noise"))
             terms, _ = agreed(_ALONE, terms, 1, step, "codec")
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -279,12 +281,14 @@ def _take_codec(model: MDM, out: Path, ranks: Ranks) -> None:
 _ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
-def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
     """Reconstruction loss of the decoder on latents with a little noise; modalities are left out at random.
 
     L1 + half squared error and L1 of gradients for colour, L1 for the depth code, cross-entropy for classes.
     """
-    rgb, depth, ids = batch.rgb.flatten(0, 1), batch.depth.flatten(0, 1), batch.semantics.flatten(0, 1)
+    rgb, depth, known, ids = (
+        torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+    )
     with torch.no_grad():
         latents = {
             "rgb": codec.encode_rgb(rgb),
@@ -298,10 +302,8 @@ def codec_loss(codec: PatchCodec, batch: Batch, generator: torch.Generator) -> t
         }
         target = codec.linear_depth_code(depth)
     out_rgb, out_depth, scores = codec.decode_raw(noisy)  # type: ignore[arg-type]
-    error = (out_rgb - (rgb * 2 - 1)) * keep[0]
-    gradient = (error[..., 1:] - error[..., :-1]).abs().mean() + (error[..., 1:, :] - error[..., :-1, :]).abs().mean()
-    part_rgb = error.abs().mean() + 0.5 * error.square().mean() + 0.25 * gradient
-    part_depth = ((out_depth - target) * keep[1] * batch.depth_known.flatten(0, 1)).abs().mean()
+    part_rgb = losses.image_error((out_rgb - (rgb * 2 - 1)) * keep[0], square=0.5, gradient=0.25)
+    part_depth = ((out_depth - target) * keep[1] * known).abs().mean()
     ids = torch.where(keep[2, :, 0] > 0, ids, torch.full_like(ids, 255))
     part_semantics = (
         functional.cross_entropy(scores, ids, ignore_index=255) if bool((ids < 255).any()) else scores.sum() * 0
@@ -389,6 +391,7 @@ def _train_network(
     out = run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
     weights = class_weights(folder, min(config.first_cities, 20), config.balance).to(ranks.device)
+    settings = LossSettings(weights, config.refined_share, config.reference_dropout)
     board = _Board(run_dir.path / "tensorboard") if config.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.parallel}
     kind = kind_of(model)
@@ -405,11 +408,13 @@ def _train_network(
             terms: dict[str, float] = {}
             state.optimizer.zero_grad(set_to_none=True)
             for part in parts:
-                batch = draw_batch(drawn, folder, step, count, frames, "batch", part).to(ranks.device)
+                clips = draw_clips(drawn, folder, step, count, frames, "batch", part)
+                clips = [clip.to(ranks.device) for clip in clips]
                 with spread.portion(last=part is parts[-1]):
-                    losses = _losses(spread, model, config, batch, step, part.start, count, weights, bf16)
-                    (losses.total / len(parts)).backward()
-                for name, value in {**losses.terms, "total": float(losses.total.detach())}.items():
+                    with torch.autocast(ranks.device.type, torch.bfloat16, enabled=bf16):
+                        loss = spread.network(clips, BatchPart(config.seed, step, part.start, count), settings)
+                    (loss.total / len(parts)).backward()
+                for name, value in {**loss.terms, "total": float(loss.total.detach())}.items():
                     terms[name] = terms.get(name, 0.0) + value
             terms, stop = agreed(ranks, terms, len(parts), step, "network", stop=interruption.asked)
             norm = learn_parallel.clip_gradients(state.trained, config.clip_norm)
@@ -438,16 +443,6 @@ def _train_network(
     if board is not None:
         board.close()
     return state.shown(ranks)
-
-
-def _losses(
-    objective: Any, model: Model, config: LearnConfig, batch: Batch, step: int, first: int, count: int, weights: Tensor,
-    bf16: bool,
-) -> Losses:  # fmt: skip
-    """Loss of clips `first` and following of the step's `count` clips."""
-    part = Part(batch, step, first, count)
-    with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=bf16):
-        return kind_of(model).loss(objective, model, config, part, weights)
 
 
 def _write_down(run_dir: store.RunDir, board: _Board | None, step: int, values: dict[str, float]) -> None:

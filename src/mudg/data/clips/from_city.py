@@ -11,9 +11,8 @@ of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of th
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +115,7 @@ def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
 
 def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     """Generate, record and fuse one city; `frames` long."""
-    config = dataclasses.replace(city_config(rules, city), n_frames=frames)
+    config = replace(city_config(rules, city), n_frames=frames)
     rng = seeds.numpy_rng(rules.seed, city, "log")
     world = CityWorld(config)
     truths: dict[str, list[CityTruth]] = {
@@ -147,8 +146,8 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     return CityLog(world, cloud, recorded)
 
 
-def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> tuple[list[Clip], tuple[float, ...]]:
-    """All clips of one city and their shifts in metres; `log` is the city's own from `make_log`, made here if not given."""
+def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> list[Clip]:
+    """All clips of one city; `log` is the city's own from `make_log`, made here if not given."""
     log = log or make_log(rules, city, rules.frames)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
     size = (rules.width, rules.height)
@@ -157,17 +156,16 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> t
     conditions = ConditionRules(*size, *fine, published=rules.published)
     tracks = log.world.tracks()
     clips = []
-    shifts = shifts_of(rules, city)
     sources: dict[int, Source] = {}
     known = _without_every_fourth(log.recorded, rng) if city < HELD_OUT and rng.random() < 0.5 else log.recorded
-    for shift_m in shifts:
+    for shift_m in shifts_of(rules, city):
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
         given, cache = (_thinned(log.recorded, rng), {}) if shift_m == 0.0 else (known, sources)
         given = log.recorded if rules.published else given  # for the reference only
         condition = build_condition(log.cloud, tracks, views, given, conditions, cache)
         truths = [log.world.render(view.resized(*size)) for view in views]
-        clips.append(clip_from_truth(condition, truths))
-    return clips, shifts
+        clips.append(replace(clip_from_truth(condition, truths), shift_m=shift_m))
+    return clips
 
 
 def _without_every_fourth(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
@@ -214,11 +212,11 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     torch.set_num_threads(1)
     native.set_threads(1)
     log = make_log(rules, city, rules.frames)
-    clips, shifts = make_clips(rules, city, log)
-    points = None
+    clips = make_clips(rules, city, log)
     if city >= HELD_OUT or rules.point_colors:
         plain = ConditionRules(rules.width, rules.height, warp=False)
         tracks = log.world.tracks()
         points = [build_condition(log.cloud, tracks, c.condition.views, (), plain).color for c in clips]
-    write_shard(folder, city, pack_clips(clips, shifts, points))
+        clips = [replace(clip, point_color=color) for clip, color in zip(clips, points)]
+    write_shard(folder, city, pack_clips(clips))
     return len(clips)

@@ -324,7 +324,7 @@ def write_log(source: LogSource, rules: LogClipRules, windows: Sequence[tuple[in
         log = OpenLog(source, rules)
         for number, window in missing:
             clip = make_clip(log, window, number)
-            write_shard(folder, number, pack_clips([clip], [0.0], gaps=True))
+            write_shard(folder, number, pack_clips([clip], gaps=True))
     return len(missing)
 
 

@@ -24,8 +24,8 @@ from torch.nn import functional
 
 from mudg.base import palette, seeds
 from mudg.base.errors import UsageError
-from mudg.base.types import Condition
-from mudg.core import noise
+from mudg.base.types import Clip, Condition
+from mudg.core import losses, noise
 from mudg.core.align import align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
 from mudg.models.diffusion import (
@@ -48,8 +48,9 @@ from mudg.models.mdm.codec import (
     Modality,
     PatchCodec,
     code_to_depth,
+    semantic_shares,
 )  # fmt: skip
-from mudg.models.mdm.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares
+from mudg.models.mdm.refine import ConditionPixels, PixelTruth, Refined, Refiner, shares
 from mudg.models.mdm.unet import TemporalAttention, UNet
 
 SKY = palette.ID["sky"]
@@ -119,6 +120,42 @@ class ConditionLatents:
 
 
 @dataclass(frozen=True)
+class BatchPart:
+    """Clips number `first` and following of the `count` clips of a training step. Whatever training draws for a clip depends on
+    (seed, step, its number), and not on how the step's batch is divided."""
+
+    seed: int
+    step: int
+    first: int
+    count: int
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """What a training run says about the loss.
+
+    class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
+    refined_share      share of each side of the image on which the refiner is trained at a step
+    reference_dropout  share of the clips that go without their reference; only of models that leave it out themselves
+    """
+
+    class_weights: Tensor | None = None
+    refined_share: float = 1.0
+    reference_dropout: float = 0.2
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Encoded truth of a batch: latents [B,T,C,h,w]; class shares [B,T,19,h,w]; depth_known f32[B,T,1,h,w], share of the cell with
+    valid depth; and all of it at pixel resolution."""
+
+    latents: dict[Modality, Tensor]
+    shares: Tensor
+    depth_known: Tensor
+    pixels: PixelTruth
+
+
+@dataclass(frozen=True)
 class Losses:
     """Loss of a batch: `total` scalar with gradient; `terms` the weighted parts as floats."""
 
@@ -172,26 +209,20 @@ class MDM(nn.Module):
         self.check_size(height, width)
 
     def encode_condition(self, condition: Condition | Sequence[Condition]) -> ConditionLatents:
-        """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`)."""
+        """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`).
+
+        A condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop, and
+        unknown classes.
+        """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
-        stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
+        color, depth, valid, reference = (
+            torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth", "valid", "reference")
+        )
         warped = torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch])
         backdrop = torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch])
-        unknown = torch.full(batch[0].valid.shape, 255, dtype=torch.uint8)
+        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
         ids = torch.stack([unknown if c.semantics is None else c.semantics for c in batch])
-        far_ids = torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch])
-        color, depth, valid, reference = (stack(name) for name in ("color", "depth", "valid", "reference"))
-        return self.encode_planes(color, depth, valid, warped, backdrop, reference, ids, far_ids)
-
-    def encode_planes(
-        self, color: Tensor, depth: Tensor, valid: Tensor, warped: Tensor, backdrop: Tensor, reference: Tensor, ids: Tensor,
-        backdrop_ids: Tensor,
-    ) -> ConditionLatents:  # fmt: skip
-        """As `encode_condition`, from stacked tensors.
-
-        color, backdrop f32[B,T,3,H,W]; depth f32[B,T,1,H,W] metres; valid, warped bool[B,T,1,H,W]; reference f32[B,3,H,W], used
-        only with `reference = "first_frame"`; ids, backdrop_ids u8[B,T,1,H,W], 255 = unknown.
-        """
+        backdrop_ids = torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch])
         self.check_size(*color.shape[-2:])
         valid, warped = valid.float(), warped.float()
         factor = self.codec.factor
@@ -231,71 +262,53 @@ class MDM(nn.Module):
 
     # training ---------------------------------------------------------------------------------------------------------
 
-    def encode_truth(self, rgb: Tensor, depth: Tensor, semantics: Tensor) -> dict[Modality, Tensor]:
-        """Latents of a clip's truth: rgb [B,T,3,H,W], depth [B,T,1,H,W] m, semantics i64[B,T,H,W]."""
-        return {
-            "rgb": self.codec.encode_rgb(rgb),
-            "depth": self.codec.encode_depth(depth),
-            "semantics": self.codec.encode_semantics(semantics),
-        }
-
-    def loss(
-        self,
-        truth: dict[Modality, Tensor],
-        encoded: ConditionLatents,
-        generator: torch.Generator,
-        *,
-        shares: Tensor | None = None,
-        class_weights: Tensor | None = None,
-        depth_known: Tensor | None = None,
-        pixels: PixelTruth | None = None,
-        window: tuple[slice, slice] | None = None,
-        first: int = 0,
-        whole: int = 0,
-    ) -> Losses:
-        """Denoising loss of a batch, steps and noise drawn from `generator`.
-
-        truth        latents of `encode_truth`
-        shares       class shares [B,T,19,h,w]; needed when semantics are coded as shares
-        class_weights  f32[19], weights of the classes in the cross-entropy; None = all 1
-        depth_known  f32[B,T,1,h,w] share of the cell with true depth; None = everywhere
-        pixels, window  truth at pixel resolution, and the rectangle of latent cells to train the refiner on (None = all);
-                     its terms are added, and their gradient reaches the denoiser
-        first, whole  these clips are number `first` and following of a batch of `whole` clips (0 = of just these); what is
-                     drawn for a clip does not depend on how that batch is divided
+    def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
+        """Denoising loss of clips of one size; all that is drawn comes from `part`.
 
         Squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a clip; cross-entropy for class
-        shares. Steps are stratified over the batch.
+        shares. Steps are stratified over the batch. Where depth is not valid it has no part.
+        With a refiner its terms are added, and their gradient reaches the denoiser.
         """
-        some = next(iter(truth.values()))
-        batch = len(some)
-        t = noise.stratified_steps(whole or batch, len(self.schedule), generator)[first : first + batch].to(some.device)
+        with torch.no_grad():
+            encoded = self.encode_condition([clip.condition for clip in clips])
+            truth = self.encode_truth(clips)
+        generator = seeds.torch_generator(part.seed, part.step, "noise")
+        steps = noise.stratified_steps(part.count, len(self.schedule), generator)
+        t = steps[part.first : part.first + len(clips)].to(truth.shares.device)
         weight = noise.loss_weight(self.schedule, t).view(-1, 1, 1, 1, 1)
-        total: Tensor | float = 0.0
-        terms: dict[str, float] = {}
-        eps = {m: self._clip_noise(truth[m], generator.initial_seed(), first, m) for m in MODALITIES}
-        stated, log_shares = self.predict({m: self.schedule.add_noise(truth[m], eps[m], t) for m in MODALITIES}, encoded, t)
-        for m in MODALITIES:
-            if m == "semantics":
-                if shares is None:
-                    raise UsageError("class shares are needed for the semantic loss", where="MDM.loss")
-                weighted = shares if class_weights is None else shares * class_weights.view(-1, 1, 1)
-                part = -(weighted * log_shares).sum(2).mean()
-            elif m == "depth":
-                error = functional.huber_loss(stated[m], truth[m], reduction="none", delta=0.2) * 5.0
-                known = torch.ones_like(error[:, :, :1]) if depth_known is None else depth_known
-                part = (weight * error * known).mean()
-            else:
-                part = (weight * (stated[m] - truth[m]).square()).mean()
-            terms[m] = float(part.detach())
-            total = total + LOSS_SHARES[m] * part
-        if self.refiner is not None and pixels is not None:
-            parts = self._refiner_terms(stated, encoded, pixels, window, class_weights)
-            terms |= {name: float(part.detach()) for name, part in parts.items()}
-            total = total + sum(parts.values())
-        if not isinstance(total, Tensor):
-            raise UsageError("nothing to train on", where="MDM.loss")
-        return Losses(total, terms)
+        eps = {m: self._clip_noise(truth.latents[m], generator.initial_seed(), part.first, m) for m in MODALITIES}
+        x = {m: self.schedule.add_noise(truth.latents[m], eps[m], t) for m in MODALITIES}
+        stated, log_shares = self.predict(x, encoded, t)
+        errors = {
+            "rgb": losses.latent_error(stated["rgb"], truth.latents["rgb"], weight),
+            "depth": losses.latent_depth_error(stated["depth"], truth.latents["depth"], weight, truth.depth_known),
+            "semantics": losses.share_cross_entropy(log_shares, truth.shares, settings.class_weights),
+        }
+        terms = {m: float(error.detach()) for m, error in errors.items()}
+        total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
+        if self.refiner is not None:
+            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings)
+            terms |= {name: float(error.detach()) for name, error in errors.items()}
+            total = total + sum(errors.values())
+        return Losses(total, terms)  # type: ignore[arg-type]
+
+    forward = loss
+    """What `DistributedDataParallel` calls, to exchange gradients behind it."""
+
+    def encode_truth(self, clips: Sequence[Clip]) -> Truth:
+        """What `loss` compares with."""
+        rgb, depth, valid, ids = (
+            torch.stack([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+        )
+        known = valid.float().flatten(0, 1)
+        latents: dict[Modality, Tensor] = {
+            "rgb": self.codec.encode_rgb(rgb), "depth": self.codec.encode_depth(depth),
+            "semantics": self.codec.encode_semantics(ids),
+        }  # fmt: skip
+        code = self.codec.linear_depth_code(depth)
+        pixels = PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), ids.flatten(0, 1), known)
+        cells = functional.avg_pool2d(known, self.codec.factor).unflatten(0, valid.shape[:2])
+        return Truth(latents, semantic_shares(ids), cells, pixels)
 
     def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
         """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""
@@ -307,33 +320,41 @@ class MDM(nn.Module):
         return torch.cat(draws).to(like.device)
 
     def _refiner_terms(
-        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, truth: PixelTruth, window: tuple[slice, slice] | None,
-        class_weights: Tensor | None,
-    ) -> dict[str, Tensor]:  # fmt: skip
-        frames = encoded.planes.shape[1]
-        rows, columns = window or (slice(0, encoded.planes.shape[-2]), slice(0, encoded.planes.shape[-1]))
-        latents: dict[Modality, Tensor] = {m: z[..., rows, columns].flatten(0, 1) for m, z in stated.items()}
-        factor = self.codec.factor
-        tall, wide = (slice(s.start * factor, s.stop * factor) for s in (rows, columns))
-        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
-        codec = self.config.codec
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, truth: PixelTruth, part: BatchPart, settings: LossSettings
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the pixel loss in a rectangle of the image; depth in the sky counts threefold."""
+        frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
+        cells = self._refined_window(part, settings.refined_share, h, w)
+        latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
+        factor, codec = self.codec.factor, self.config.codec
+        tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
+        made, truth = self.refine(latents, encoded.pixels.crop(tall, wide), frames), truth.crop(tall, wide)
         log_per_code = math.log(codec.far_m / codec.near_m) / 2
-        return refine_loss(made, truth.crop(tall, wide), class_weights, log_per_code=log_per_code)
+        counted = (1.0 + 2.0 * (truth.ids == SKY).unsqueeze(1)) * truth.depth_known
+        error = made.rgb - truth.rgb
+        return {
+            "pixel_rgb": losses.image_error(error, square=2.0, gradient=0.5),
+            "pixel_depth": losses.depth_code_error(made.depth_code, truth.depth_code, counted, log_per_code),
+            "pixel_semantics": 0.2 * losses.class_error(made.scores, truth.ids, settings.class_weights),
+            "pixel_error": 0.05 * losses.stated_error(made.log_error, error),
+        }
+
+    @staticmethod
+    def _refined_window(part: BatchPart, share: float, height: int, width: int) -> tuple[slice, slice]:
+        """Rows and columns of latent cells on which the refiner is trained at a step: a share of each side, anywhere."""
+        rng = seeds.numpy_rng(part.seed, part.step, "refined window")
+        spans = []
+        for cells in (height, width):
+            size = min(cells, max(8, round(cells * share / 8) * 8))
+            start = 2 * int(rng.integers((cells - size) // 2 + 1))
+            spans.append(slice(start, start + size))
+        return spans[0], spans[1]
 
     def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
         """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.refine`)."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
         return self.refiner(self.codec, latents, given, frames)
-
-    def pixel_truth(
-        self, rgb: Tensor, depth: Tensor, semantics: Tensor, depth_known: Tensor | None = None
-    ) -> PixelTruth:
-        """Truth for `loss`: rgb f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres, semantics i64[B,T,H,W], and where the
-        depth is true, bool[B,T,1,H,W] (None = everywhere)."""
-        code = self.codec.linear_depth_code(depth)
-        known = None if depth_known is None else depth_known.float().flatten(0, 1)
-        return PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), semantics.flatten(0, 1), known)
 
     def trained_part(self) -> nn.ModuleDict:
         """What training changes once the codec is fixed, by attribute name: the denoiser and, if there is one, the refiner."""

@@ -16,13 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import palette
 from mudg.models.mdm.codec import CLASSES, MODALITIES, ChannelNorm, DecoderBlock, Modality, PatchCodec
 
-UNKNOWN = 255
-SKY = palette.ID["sky"]
-MAX_LOG_RATIO = 2.0
-"""Depth painted farther than e^2 times the truth costs no more than that."""
 COPY_SCORE = 6.0
 """What a class given by the condition adds to its score when the gate is open."""
 
@@ -143,46 +138,13 @@ class Refiner(nn.Module):
 @dataclass(frozen=True)
 class PixelTruth:
     """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 = unlabelled);
-    depth_known f32[N,1,H,W]: 1 where the depth is true, 0 where it only fills a gap (None = true everywhere)."""
+    depth_known f32[N,1,H,W]: 1 where the depth is true, 0 where it only fills a gap."""
 
     rgb: Tensor
     depth_code: Tensor
     ids: Tensor
-    depth_known: Tensor | None = None
+    depth_known: Tensor
 
     def crop(self, rows: slice, columns: slice) -> PixelTruth:
         """A rectangle of pixels."""
-        known = None if self.depth_known is None else self.depth_known[..., rows, columns]
-        return PixelTruth(
-            self.rgb[..., rows, columns], self.depth_code[..., rows, columns], self.ids[..., rows, columns], known
-        )
-
-
-def refine_loss(
-    made: Refined, truth: PixelTruth, class_weights: Tensor | None = None, *, log_per_code: float = 1.0
-) -> dict[str, Tensor]:
-    """Weighted terms of the pixel loss, scalars with gradient.
-
-    pixel_rgb        L1 + 2 x squared error + half of the L1 of gradients
-    pixel_depth      5 x smooth L1 (beta 0.005) of made / true depth - 1, threefold in the sky. The codes are taken for logarithms
-                     of depth in steps of `log_per_code`. A surface painted too far away costs more than one too near, as in
-                     the measure it is scored by; the sky's share makes up for that
-    pixel_semantics  0.2 x cross-entropy, classes weighted, summed over labelled pixels and divided by the number of all
-    pixel_error      0.05 x negative log-likelihood of the colour's absolute error under the stated scale (Laplace); it moves
-                     the statement only, not the colour
-
-    Every term is a plain mean over pixels, so that the loss of a batch is the mean over its clips however it is divided.
-    """
-    error = made.rgb - truth.rgb
-    across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
-    rgb = error.abs().mean() + 2.0 * error.square().mean() + 0.5 * (across.abs().mean() + down.abs().mean())
-    ratio = torch.expm1(((made.depth_code - truth.depth_code) * log_per_code).clamp(max=MAX_LOG_RATIO))
-    off = functional.smooth_l1_loss(ratio, torch.zeros_like(ratio), beta=0.005, reduction="none")
-    off = off * (1.0 + 2.0 * (truth.ids == SKY).unsqueeze(1))
-    depth = 5.0 * (off if truth.depth_known is None else off * truth.depth_known).mean()
-    weight = None if class_weights is None else class_weights.to(made.scores.dtype)
-    semantics = functional.cross_entropy(made.scores, truth.ids, weight, ignore_index=UNKNOWN, reduction="none").mean()
-    size = error.detach().abs().mean(1, keepdim=True)
-    scale = made.log_error.clamp(-6.0, 1.0)
-    likely = (size * torch.exp(-scale) + scale).mean()
-    return {"pixel_rgb": rgb, "pixel_depth": depth, "pixel_semantics": 0.2 * semantics, "pixel_error": 0.05 * likely}
+        return PixelTruth(*(x[..., rows, columns] for x in (self.rgb, self.depth_code, self.ids, self.depth_known)))

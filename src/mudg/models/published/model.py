@@ -19,9 +19,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import seeds
-from mudg.base.errors import UsageError
-from mudg.base.types import Condition
+from mudg.base import palette, seeds
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Clip, Condition
 from mudg.core import noise
 from mudg.core.align import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
@@ -36,7 +36,7 @@ from mudg.models.diffusion import (
     sized_to_width,
 )  # fmt: skip
 from mudg.models.mdm.codec import MODALITIES, Modality
-from mudg.models.mdm.model import Losses
+from mudg.models.mdm.model import BatchPart, Losses, LossSettings
 from mudg.models.published.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, ImageTower, TowerConfig
 from mudg.models.published.kl_vae import Autoencoder, AutoencoderConfig
 from mudg.models.published.resampler import Resampler, ResamplerConfig
@@ -225,18 +225,10 @@ class PublishedMDM(nn.Module):
                     colour there (of every clip), frame 0 excepted
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
-        stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
-        return self.encode_planes(
-            stack("color"), stack("depth"), stack("valid"), stack("reference"), generator, known
-        )  # fmt: skip
-
-    def encode_planes(
-        self, color: Tensor, depth: Tensor, valid: Tensor, reference: Tensor, generator: torch.Generator | None = None,
-        known: Tensor | None = None,
-    ) -> PublishedLatents:  # fmt: skip
-        """As `encode_condition`, from stacked tensors: color f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres,
-        valid bool[B,T,1,H,W], reference f32[B,3,H,W] in [0,1]."""
-        color, depth, valid, reference = (x.to(self.device) for x in (color, depth, valid.float(), reference))
+        color, depth, valid, reference = (
+            torch.stack([getattr(c, name) for c in batch]).to(self.device) for name in ("color", "depth", "valid", "reference")
+        )
+        valid = valid.float()
         self.check_size(*color.shape[-2:])
         self.check_frames(color.shape[1])
         if self.config.missing_is_zero:
@@ -254,8 +246,7 @@ class PublishedMDM(nn.Module):
         images = torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])])
         with torch.no_grad():
             features = self.image(images)
-        seen = functional.avg_pool2d(seen.flatten(0, 1), self.codec.factor).unflatten(0, seen.shape[:2])
-        return PublishedLatents(planes, features[:-1], features[-1:], seen)
+        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
 
     def encode_truth(
         self, rgb: Tensor, depth: Tensor, semantics: Tensor, generator: torch.Generator | None = None
@@ -298,7 +289,44 @@ class PublishedMDM(nn.Module):
 
     # training ---------------------------------------------------------------------------------------------------------
 
-    def loss(
+    def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
+        """`velocity_loss` of clips of one size; all that is drawn comes from `part`, the autoencoder's posterior clip by clip.
+
+        Raises:
+            InputError: the clips' condition is not the published one.
+        """
+        encoded, truths = [], []
+        with torch.no_grad():
+            for number, clip in enumerate(clips, part.first):
+                if clip.condition.warped is not None and bool(clip.condition.warped.any()):
+                    raise InputError(
+                        "the training clips show warped images in their condition", where=f"step {part.step}",
+                        expected="points alone, as the published-type model is given",
+                        remedy="give another folder of clips; they are made anew",
+                    )  # fmt: skip
+                draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
+                encoded.append(self.encode_condition(clip.condition, draws))
+                truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
+            truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
+            classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)
+            known: dict[Modality, Tensor] = {
+                "depth": self._share_of_cells(torch.stack([clip.depth_valid for clip in clips])),
+                "semantics": self._share_of_cells(classes),
+            }
+        planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
+        return self.velocity_loss(
+            truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
+            dropout=ContextDropout.of(settings.reference_dropout), known=known, first=part.first, whole=part.count,
+        )  # fmt: skip
+
+    forward = loss
+    """What `DistributedDataParallel` calls, to exchange gradients behind it."""
+
+    def _share_of_cells(self, mask: Tensor) -> Tensor:
+        """Share f32[B,T,1,h,w] of each latent cell in which bool[B,T,1,H,W] is set."""
+        return functional.avg_pool2d(mask.float().flatten(0, 1), self.codec.factor).unflatten(0, mask.shape[:2])
+
+    def velocity_loss(
         self,
         truth: Mapping[Modality, Tensor],
         encoded: PublishedLatents,

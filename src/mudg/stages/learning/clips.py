@@ -14,10 +14,10 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.errors import InputError, ResourceError
+from mudg.base.types import Clip
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_log import LogClipRules, LogSource, LogWindow
-from mudg.data.clips.shards import Batch
 from mudg.data.scene import read_scene
 from mudg.models.diffusion import sized_to_area
 from mudg.models.mdm.codec import CLASSES
@@ -29,8 +29,8 @@ def held_out(config: LearnConfig) -> list[int]:
     return [from_city.HELD_OUT + n for n in range(config.held_out)]
 
 
-def cities_at(config: LearnConfig, step: int) -> int:
-    """How many cities training may draw from at `step`: `first_cities`, then linearly up to `cities` at half time.
+def cities_in_use(config: LearnConfig, step: int) -> int:
+    """How many cities training may draw from at `step`: `first_cities`, then linearly up to `cities` at `all_cities_at`.
 
     A function of the step alone, so that clips can still be in the making while training runs and the draw stays the
     same in every run.
@@ -174,41 +174,41 @@ def data_words(config: LearnConfig, rules: LogClipRules | None) -> str:
     )
 
 
-# a step's batch -------------------------------------------------------------------------------------------------------
+# a step's clips -------------------------------------------------------------------------------------------------------
 
 
-def draw_batch(
+def draw_clips(
     config: LearnConfig, folder: Path, step: int, count: int, frames: int, purpose: str, part: slice | None = None
-) -> Batch:
-    """The batch of a step: random shards, clips and runs of consecutive frames, varied (see `clip_shards.vary`).
+) -> list[Clip]:
+    """The clips of a step: random shards, clips and runs of consecutive frames, varied (see `clip_shards.vary`).
 
     What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of `count`, and not on which
-    `part` of that batch is asked for.
+    `part` of that batch is drawn here.
     """
     rng = seeds.numpy_rng(config.seed, step, purpose)
     picks = []
     for _ in range(count):
-        city = int(rng.integers(cities_at(config, step)))
+        city = int(rng.integers(cities_in_use(config, step)))
         await_shard(folder, city)
-        clip = int(rng.integers(clip_shards.clips_in(folder, city)))
+        number = int(rng.integers(clip_shards.clips_in(folder, city)))
         start = int(rng.integers(config.window - frames + 1))
-        picks.append((city, clip, range(start, start + frames)))
+        picks.append((city, number, range(start, start + frames)))
     clips = []
     for place in range(count)[part or slice(None)]:
-        batch = clip_shards.read_batch(folder, [picks[place]])
-        if batch.rgb.shape[-2:] != (config.height, config.width):
+        clip = clip_shards.read_clip(folder, *picks[place])
+        if clip.rgb.shape[-2:] != (config.height, config.width):
             raise InputError(
                 "training clips are of another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
-                expected=f"{config.width}x{config.height}", got=f"{batch.rgb.shape[-1]}x{batch.rgb.shape[-2]}",
+                expected=f"{config.width}x{config.height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
                 remedy="give another --clips",
             )  # fmt: skip
         own = seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}")
         if config.augment:
-            batch = clip_shards.vary(batch, own)
+            clip = clip_shards.vary(clip, own)
         if own.random() < config.reference_dropout:  # the sparse view itself stands in for the image
-            batch = replace(batch, reference=batch.color[:, 0])
-        clips.append(batch)
-    return clip_shards.joined(clips)
+            clip = replace(clip, condition=replace(clip.condition, reference=clip.condition.color[0]))
+        clips.append(clip)
+    return clips
 
 
 def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
@@ -219,7 +219,7 @@ def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
     counts = torch.zeros(256, dtype=torch.float64)
     for city in range(cities):
         await_shard(folder, city)
-        ids = clip_shards.read_batch(folder, [(city, 0, range(1))]).semantics
+        ids = clip_shards.read_clip(folder, city, 0, range(1)).semantics
         counts += torch.bincount(ids.flatten(), minlength=256)
     if not bool(counts[: CLASSES].any()):  # logs without labels
         return torch.ones(CLASSES)

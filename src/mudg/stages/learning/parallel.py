@@ -189,28 +189,16 @@ def _place(rank: int, size: int, device: str) -> Ranks:
 # the network over the processes ---------------------------------------------------------------------------------------
 
 
-class Objective(nn.Module):
-    """A model's loss as a module's forward, which is what gradient synchronisation hangs on."""
-
-    def __init__(self, model: nn.Module) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, *args: Any, **options: Any) -> Any:
-        """Whatever the model's `loss` takes and returns."""
-        return self.model.loss(*args, **options)  # type: ignore[operator]
-
-
 class Spread:
-    """A model in one of the layouts: call it as `model.loss`, in `portion` for each portion of a step."""
+    """A model in one of the layouts: call `network` as the model itself, in `portion` for each portion of a step."""
 
     def __init__(self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout) -> None:
-        self._objective: nn.Module = Objective(model)
+        self.network = model
         self._sharded: list[nn.Module] = []
         if ranks.size == 1:
             return
         if layout == "ddp":
-            self._objective = nn.parallel.DistributedDataParallel(self._objective, broadcast_buffers=False)
+            self.network = nn.parallel.DistributedDataParallel(model, broadcast_buffers=False)
             return
         from torch.distributed.device_mesh import init_device_mesh
         from torch.distributed.fsdp import fully_shard
@@ -223,17 +211,13 @@ class Spread:
             fully_shard(part, mesh=mesh)
             self._sharded.append(part)
 
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        """`model.loss` of the arguments."""
-        return self._objective(*args, **options)
-
     @contextlib.contextmanager
     def portion(self, last: bool) -> Iterator[None]:
         """Around loss and backward of one portion: gradients are exchanged after the last one only."""
         for part in self._sharded:
             part.set_requires_gradient_sync(last)  # type: ignore[operator]
-        holds = isinstance(self._objective, nn.parallel.DistributedDataParallel) and not last
-        with self._objective.no_sync() if holds else contextlib.nullcontext():  # type: ignore[operator]
+        holds = isinstance(self.network, nn.parallel.DistributedDataParallel) and not last
+        with self.network.no_sync() if holds else contextlib.nullcontext():  # type: ignore[operator]
             yield
 
 

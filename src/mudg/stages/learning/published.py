@@ -1,42 +1,25 @@
-"""Training the published-type model with `learn`: where it starts, its loss, and the folder it is written to.
+"""Training the published-type model with `learn`: where it starts, and the folder it is written to.
 
 Everything else (clips, layouts, checkpoints, averages) is as for the small model. What differs is listed in its row of
-`learn_models.KINDS`: clips show points alone, as the published network was trained, and the reference image is left out by
+`models.KINDS`: clips show points alone, as the published network was trained, and the reference image is left out by
 the model's own loss.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from mudg.base import palette, seeds
-from mudg.base.errors import InputError, UsageError
-from mudg.data.clips.shards import Batch
-from mudg.models.mdm.codec import MODALITIES, Modality
-from mudg.models.mdm.model import Losses
+from mudg.base.errors import UsageError
 from mudg.models.published import files as published_files
-from mudg.models.published.model import ContextDropout, PublishedLatents, PublishedMDM, WorkSplit
+from mudg.models.published.model import PublishedMDM, WorkSplit
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import score as learn_score
-
-Objective = Callable[..., Losses]
-
-
-@dataclass(frozen=True)
-class Part:
-    """Some clips of a step's batch: `batch` holds clips `first` and following of `count`."""
-
-    batch: Batch
-    step: int
-    first: int
-    count: int
 
 
 def starting(config: LearnConfig) -> PublishedMDM:
@@ -65,52 +48,6 @@ def starting(config: LearnConfig) -> PublishedMDM:
     model.config = replace(model.config, width=config.width, height=config.height)
     model.split = WorkSplit(frames_at_once=1)
     return model
-
-
-def loss(objective: Objective, model: PublishedMDM, config: LearnConfig, part: Part, weights: Tensor) -> Losses:
-    """Loss of some clips of a step; `weights` of classes have no part in it (classes are learned as colours).
-
-    The autoencoder's posterior is drawn clip by clip from seeds of their own.
-
-    Raises:
-        InputError: the clips' condition is not the published one.
-    """
-    del weights
-    batch = part.batch
-    if bool(batch.warped.any()):
-        raise InputError(
-            "the training clips show warped images in their condition", where=f"--clips, step {part.step}",
-            expected="points alone, as the published-type model is given", remedy="give another --clips; they are made anew",
-        )  # fmt: skip
-    encoded, truths = [], []
-    with torch.no_grad():
-        for n in range(len(batch.rgb)):
-            one, draws = (
-                slice(n, n + 1),
-                seeds.torch_generator(config.seed, part.step, f"posterior, clip {part.first + n}"),
-            )
-            given = (batch.color[one], batch.sparse_depth[one], batch.valid[one], batch.reference[one])
-            encoded.append(model.encode_planes(*given, draws))
-            truths.append(model.encode_truth(batch.rgb[one], batch.depth[one], batch.semantics[one], draws))
-        whole: dict[Modality, Tensor] = {m: torch.cat([truth[m] for truth in truths]) for m in MODALITIES}
-        known: dict[Modality, Tensor] = {
-            "depth": _cells(batch.depth_known, model.codec.factor),
-            "semantics": _cells((batch.semantics != palette.UNLABELLED).unsqueeze(2), model.codec.factor),
-        }
-    return objective(
-        whole, _joined(encoded), seeds.torch_generator(config.seed, part.step, "noise"),
-        dropout=ContextDropout.of(config.reference_dropout), known=known, first=part.first, whole=part.count,
-    )  # fmt: skip
-
-
-def _cells(mask: Tensor, factor: int) -> Tensor:
-    """Share f32[B,T,1,h,w] of each latent cell in which bool[B,T,1,H,W] is set."""
-    return functional.avg_pool2d(mask.float().flatten(0, 1), factor).unflatten(0, mask.shape[:2])
-
-
-def _joined(clips: list[PublishedLatents]) -> PublishedLatents:
-    planes, features, seen = (torch.cat([getattr(c, name) for c in clips]) for name in ("planes", "features", "seen"))
-    return PublishedLatents(planes, features, clips[0].grey, seen)
 
 
 def rebuilt(model: PublishedMDM, weights: Mapping[str, Tensor]) -> PublishedMDM:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,10 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from mudg.base import palette, store
-from mudg.base.types import Camera, Condition, View
+from mudg.base.types import Clip
 from mudg.core import metrics
 from mudg.core.flicker import flicker
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.shards import Batch
 from mudg.models.diffusion import GeneratedClip, SampleRequest
 from mudg.models.mdm.model import MDM
 from mudg.models.published.model import PublishedMDM
@@ -47,33 +46,31 @@ def score(
     bf16: bool,
     eta: float | None = None,
     sampler: str = "ddim",
-    prepare: Callable[[Batch], Batch] | None = None,
+    prepare: Callable[[Clip], Clip] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
 
-    `prepare` changes each batch of one clip before it is used, for example `without_classes`.
+    `prepare` changes each clip before it is used, for example `without_classes`.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": steps}. Keys as in
     `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
     """
     rows: dict[str, list[dict[str, float]]] = {}
     counts: dict[str, Tensor] = {}
-    shown: list[tuple[Batch, GeneratedClip]] = []
+    shown: list[tuple[Clip, GeneratedClip]] = []
     for city in cities:
-        for clip in range(clip_shards.clips_in(folder, city)):
+        for number in range(clip_shards.clips_in(folder, city)):
             frames = range(model.config.window)
-            batch = clip_shards.read_batch(folder, [(city, clip, frames)])
-            batch = batch if prepare is None else prepare(batch)
-            request = SampleRequest(steps, seed, city * 16 + clip, sampler, eta, bf16=bf16)
-            sample = model.sample(condition_of(batch), request)
-            shift = batch.shift_m[0]
-            name = "recorded" if shift == 0 else f"{abs(shift):.0f} m"
-            row, matrix = score_clip(batch, sample)
+            clip = clip_shards.read_clip(folder, city, number, frames)
+            clip = clip if prepare is None else prepare(clip)
+            sample = model.sample(clip.condition, SampleRequest(steps, seed, city * 16 + number, sampler, eta, bf16=bf16))
+            name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
+            row, matrix = score_clip(clip, sample)
             rows.setdefault(name, []).append(row)
             counts[name] = counts.get(name, torch.zeros_like(matrix)) + matrix
-            if len(shown) < 6 and (shift != 0 or clip == 0):
-                shown.append((batch, sample))
+            if len(shown) < 6 and (clip.shift_m != 0 or number == 0):
+                shown.append((clip, sample))
     if picture is not None and shown:
         save_grid(picture, shown)
     by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
@@ -82,51 +79,33 @@ def score(
     return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": steps}
 
 
-def without_classes(batch: Batch) -> Batch:
-    """The batch as of a log without labels: no class comes with the condition."""
-    unknown = torch.full_like(batch.ids, palette.UNLABELLED)
-    return dataclasses.replace(batch, ids=unknown, backdrop_ids=unknown)
+def without_classes(clip: Clip) -> Clip:
+    """The clip as of a log without labels: no class comes with the condition."""
+    return replace(clip, condition=replace(clip.condition, semantics=None, backdrop_semantics=None))
 
 
-def condition_of(batch: Batch, index: int = 0) -> Condition:
-    """The condition of one clip of a batch; its views are stand-ins (the model does not read poses)."""
-    frames, _, height, width = batch.color.shape[1:]
-    camera = Camera("clip", width, height, float(width), float(width), width / 2, height / 2)
-    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
-    return Condition(
-        views,
-        batch.color[index],
-        batch.sparse_depth[index],
-        batch.valid[index],
-        batch.reference[index],
-        batch.warped[index],
-        batch.backdrop[index],
-        batch.ids[index],
-        batch.backdrop_ids[index],
-    )
-
-
-def score_clip(batch: Batch, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
-    """Scores of one clip (batch of one) and its class confusion i64[19,20]."""
-    rgb, depth, ids = batch.rgb[0], batch.depth[0], batch.semantics[0]
-    depth = torch.where(
-        batch.depth_known[0], depth, torch.full_like(depth, clip_shards.FAR_M)
-    )  # far depth does not count
-    seen = batch.valid[0] | batch.warped[0]
+def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
+    """Scores of one clip and its class confusion i64[19,20]."""
+    rgb, ids, given, points = clip.rgb, clip.semantics, clip.condition, clip.point_color
+    depth = torch.where(clip.depth_valid, clip.depth, clip_shards.FAR_M)  # far depth does not count
+    seen = given.valid if given.warped is None else given.valid | given.warped
+    backdrop = given.color if given.backdrop is None else given.backdrop
+    poses = torch.from_numpy(np.stack([view.world_from_cam for view in given.views]))
+    cameras = [view.camera for view in given.views]
+    lens = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
-    nearest = metrics.depth_errors(flat(batch.sparse_depth[0]), flat(depth), flat(solid))
+    nearest = metrics.depth_errors(flat(given.depth), flat(depth), flat(solid))
     matrix = metrics.confusion(sample.semantics.flatten(0, 1), ids.flatten(0, 1))
     sky = (ids == SKY).unsqueeze(1)
     wrong = (sample.rgb - rgb).abs().mean(1, keepdim=True)
-    points = None if batch.point_color is None else batch.point_color[0]
-    one_image = rgb if points is None else torch.where(batch.valid[0], points, batch.backdrop[0])
+    one_image = rgb if points is None else torch.where(given.valid, points, backdrop)
     row = {
         "psnr": metrics.psnr(flat(sample.rgb), flat(rgb)),
         "psnr_seen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(seen)),
         "psnr_unseen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(~seen)),
-        "psnr_condition": metrics.psnr(flat(batch.color[0]), flat(rgb)),
+        "psnr_condition": metrics.psnr(flat(given.color), flat(rgb)),
         "psnr_points": math.nan if points is None else metrics.psnr(flat(points), flat(rgb)),
         "psnr_reference": math.nan if points is None else metrics.psnr(flat(one_image), flat(rgb)),
         "ssim": float(np.mean([metrics.ssim(a, b) for a, b in zip(sample.rgb, rgb)])),
@@ -135,7 +114,7 @@ def score_clip(batch: Batch, sample: GeneratedClip) -> tuple[dict[str, float], T
         "delta1": error.delta1,
         "abs_rel_nearest": nearest.abs_rel,
         "delta1_nearest": nearest.delta1,
-        "flicker": flicker(sample.rgb, rgb, depth, ids, batch.world_from_cam[0], batch.intrinsics[0]),
+        "flicker": flicker(sample.rgb, rgb, depth, ids, poses, lens),
         "sky_near": float((sample.depth[sky] < 80).float().mean()) if bool(sky.any()) else math.nan,
         "edges_agree": edges_agree(sample.depth, sample.semantics),
         "confidence_gap": _auc(sample.confidence.flatten(), wrong.flatten()),
@@ -220,19 +199,18 @@ def rgb_image(rgb: Tensor) -> NDArray[np.uint8]:
     return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
 
 
-def save_grid(path: Path, shown: Sequence[tuple[Batch, GeneratedClip]], frame: int = 4) -> None:
+def save_grid(path: Path, shown: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
     """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes; confidence."""
     rows = []
-    for batch, sample in shown:
+    for clip, sample in shown:
         t = min(frame, len(sample.confidence) - 1)
-        measured = torch.where(
-            batch.valid[0, t], batch.sparse_depth[0, t], torch.full_like(batch.sparse_depth[0, t], 100.0)
-        )
+        given = clip.condition
+        measured = torch.where(given.valid[t], given.depth[t], 100.0)
         trust = (sample.confidence[t, 0].clamp(0, 1) * 255).byte().numpy()
         cells = [
-            rgb_image(batch.color[0, t]), rgb_image(sample.rgb[t]), rgb_image(batch.rgb[0, t]), depth_image(measured),
-            depth_image(sample.depth[t]), depth_image(batch.depth[0, t]), class_image(sample.semantics[t]),
-            class_image(batch.semantics[0, t]), np.repeat(trust[..., None], 3, 2),
+            rgb_image(given.color[t]), rgb_image(sample.rgb[t]), rgb_image(clip.rgb[t]), depth_image(measured),
+            depth_image(sample.depth[t]), depth_image(clip.depth[t]), class_image(sample.semantics[t]),
+            class_image(clip.semantics[t]), np.repeat(trust[..., None], 3, 2),
         ]  # fmt: skip
         rows.append(np.concatenate(cells, 1))
     with store.atomic_path(path) as temporary:
