@@ -11,7 +11,7 @@ from mudg.base.types import Camera, Clip, Condition, View
 from mudg.core import noise
 from mudg.models import diffusion
 from mudg.models.diffusion import SampleRequest
-from mudg.models.mdm import codec, files, unet
+from mudg.models.mdm import codec, files, network
 from mudg.models.mdm import model as mdm
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig
@@ -155,9 +155,9 @@ def test_frames_and_clips_do_not_leak_across_the_batch():
 
 def test_training_and_inference_attention_agree():
     q, k, v = torch.randn(3, 2, 4, 10, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
-    trained = unet.attend(q, k, v)
+    trained = network.attend(q, k, v)
     with torch.no_grad():
-        fused = unet.attend(q, k, v)
+        fused = network.attend(q, k, v)
     assert torch.allclose(trained, fused, atol=1e-5)
 
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from mudg.models.mdm import refine
+from mudg.models.mdm import network
 from mudg.models.mdm.codec import CodecConfig, PatchCodec
-from mudg.models.mdm.refine import ConditionPixels, Refiner
+from mudg.models.mdm.network import ConditionPixels, Refiner
 
 
 def some(count=4, height=16, width=24, seed=0):
@@ -32,7 +32,7 @@ def test_open_gates_hand_the_condition_through():
     assert torch.allclose(made.rgb, given.color + torch.sigmoid(torch.tensor(-4.0)) * (given.backdrop - given.color), atol=1e-5)
     shown = given.ids.squeeze(1).long()
     gained = (made.scores - base).gather(1, shown.unsqueeze(1))
-    assert float(gained.min()) > refine.COPY_SCORE - 0.01
+    assert float(gained.min()) > network.COPY_SCORE - 0.01
 
 
 def test_shut_gates_leave_what_the_codec_makes():
@@ -48,7 +48,7 @@ def test_shut_gates_leave_what_the_codec_makes():
 
 def test_shares_of_known_classes():
     ids = torch.tensor([[3, 3, 255, 255], [3, 7, 255, 1]], dtype=torch.uint8).view(1, 1, 2, 4)
-    share = refine.shares(ids)
+    share = network.shares(ids)
     assert share.shape == (1, 19, 1, 2)
     assert share[0, 3, 0].tolist() == [0.75, 0.0]
     assert share[0, 7, 0].tolist() == [0.25, 0.0]

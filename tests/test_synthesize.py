@@ -194,15 +194,15 @@ def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
     scene, cloud = read_scene(root / "scene"), read_fused(root / "fused")
     view = trajectory.shifted(scene, "front", 1.0).views[2]
     rules = ConditionRules(96, 64)
-    look = synthesize.Renders(fitted)
+    renders = synthesize.Renders(fitted)
     plain = build_conditions(cloud, scene.tracks, [view], [], rules)[0]
-    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=look.at)[0]
+    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=renders.sparse)[0]
     assert bool(helped.valid[plain.valid].all())
     assert int(helped.valid.sum()) > int(plain.valid.sum())
     near = torch.from_numpy(ndimage.binary_dilation(plain.valid[0, 0].numpy(), iterations=rules.measured_reach_px))
     new = helped.valid[0, 0] & ~plain.valid[0, 0]
     assert not bool((new & near).any())
-    shown = look.at(view.resized(96, 64))
+    shown = renders.sparse(view.resized(96, 64))
     assert torch.equal(helped.depth[0, 0][new], shown.depth[new])
     assert torch.equal(helped.semantics[0, 0][new], shown.semantics[new])
     run = lambda name, **more: synthesize.run(  # noqa: E731

@@ -207,6 +207,16 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or None. The image may
+    have another size than the view's camera."""
+
+    view: View
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
     """One turn of a LiDAR, its points motion-compensated to ``time_s`` in the sensor's frame."""
 

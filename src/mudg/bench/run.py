@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from mudg.bench import poses as bench_poses
 from mudg.bench import shift as bench_shift
 from mudg.core import flicker
 from mudg.data.clips import from_city
-from mudg.data.clips.condition import ConditionRules, Source, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
 from mudg.data.clips.from_city import CityClipRules
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
@@ -64,9 +65,10 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
 
 
 def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    MDM.check_request(SampleRequest(1, sampler=config.sampler, eta=config.eta))
-    model = mdm_files.load(config.model)
     bf16 = choose_bf16(config.precision)
+    request = SampleRequest(1, config.seed, sampler=config.sampler, eta=config.eta, bf16=bf16)
+    MDM.check_request(request)
+    model = mdm_files.load(config.model)
     cities, rules = from_city.LISTS[config.cities][: config.count], CityClipRules(window=model.config.window)
     from_city.write_missing(rules, cities, out / "clips")
     result: dict[str, Any] = {"cities": list(cities), "model": mdm_files.digest(config.model), "bf16": bf16, "rows": []}
@@ -77,8 +79,8 @@ def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
                 picture = out / f"steps_{steps}_{'classes' if given else 'plain'}.png"
                 started = time.perf_counter()
                 scores = learn_score.score(
-                    model, cities, out / "clips", steps=steps, seed=config.seed, bf16=bf16, eta=config.eta,
-                    sampler=config.sampler, prepare=None if given else learn_score.without_classes, picture=picture,
+                    model, cities, out / "clips", replace(request, steps=steps),
+                    prepare=None if given else learn_score.without_classes, picture=picture,
                 )  # fmt: skip
                 seconds = (time.perf_counter() - started) / scores["clips"]
                 row = {"steps": steps, "given_classes": given, "seconds_per_clip": round(seconds, 2), "scores": scores}
@@ -104,7 +106,7 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     views = [from_city.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
     truths = [record.world.render(v.resized(rules.width, rules.height)) for v in views]
     sizes = (rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
-    sources: dict[int, Source] = {}
+    sources: dict[int, WarpSource] = {}
     frames: list[torch.Tensor] = []
     tail: dict[Any, torch.Tensor] = {}
     spans = windows(len(views), model.config.window, usual.overlap)

@@ -192,7 +192,6 @@ def ddim(
     eta: float = 1.0,
     draw: Callable[[], Tensor] | None = None,
     last: Literal["x0", "first_alpha"] = "x0",
-    on_step: Callable[[int, Tensor], None] | None = None,
 ) -> Tensor:
     """Denoising diffusion implicit sampling (Song et al., equation 12) over descending `step_indices`.
 
@@ -200,7 +199,6 @@ def ddim(
     eta          0 deterministic, 1 ancestral; needs `draw`, a function giving fresh noise of start's shape
     last         what the final step returns: "x0" the clean estimate itself; "first_alpha" one more step to alpha_bar[0],
                  which the published sampler does
-    on_step      called with (number of the step, estimate of x0) after each denoiser call
 
     With a dynamic rescale the estimate of x0 is multiplied by scale_previous / scale_t at each step, and the final
     result keeps the factor of the last step visited, as the published sampler does.
@@ -213,8 +211,6 @@ def ddim(
         final = number + 1 == len(step_indices)
         alpha, sigma = schedule.alpha[t], schedule.sigma[t]
         x0, eps = x0_and_eps(x, denoise(x, t), alpha, sigma, prediction)
-        if on_step is not None:
-            on_step(number, x0)
         previous = 0 if final else step_indices[number + 1]
         scale_previous = schedule.scale[t if final else previous]
         x0 = x0 * (scale_previous / schedule.scale[t])
@@ -236,7 +232,6 @@ def dpm_solver(
     step_indices: Sequence[int],
     *,
     prediction: Prediction = "x0",
-    on_step: Callable[[int, Tensor], None] | None = None,
 ) -> Tensor:
     """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order from two consecutive estimates of x0, deterministic.
 
@@ -252,8 +247,6 @@ def dpm_solver(
     x, before, step_before = start, None, math.inf
     for number, t in enumerate(step_indices):
         x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0]
-        if on_step is not None:
-            on_step(number, x0)
         if number + 1 == len(step_indices):
             return x0
         following = step_indices[number + 1]
@@ -271,7 +264,7 @@ def dpm_solver(
 
 SAMPLERS: dict[str, Callable[..., Tensor]] = {"ddim": ddim, "dpm_solver": dpm_solver}
 """Every sampler by name. Each costs one denoiser pass per step (two with classifier-free guidance). A new one is a function
-that takes the positional arguments, `prediction` and `on_step` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""
+that takes the positional arguments and `prediction` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""
 
 SAMPLER_SETTINGS: dict[str, tuple[str, ...]] = {"ddim": ("eta", "draw", "last"), "dpm_solver": ()}
 """Sampler -> its further settings. Any other is refused by `check_sampler`, never ignored."""

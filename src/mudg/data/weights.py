@@ -3,7 +3,7 @@
 The only place where a pickle is opened, and only with torch's restricted unpickler: tensors and plain containers. Of the objects
 that training frameworks leave in their files a short list is replaced by an inert stand-in; anything else is refused.
 
-`RULES` is the whole map, as text: each row says how a published name is called here, both ways. `{i}` stands for a number.
+`RULES` is the complete map, as text: each row says how a published name is called here, both ways. `{i}` stands for a number.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def clean_name(published: str) -> str | None:
 
 
 def published_names(clean: Iterable[str]) -> dict[str, str]:
-    """Our names -> published names. The whole collection of a model's names is needed: the number of what enlarges
+    """Our names -> published names. All names of a model are needed: the number of what enlarges
     depends on whether its stage has transformers.
 
     Raises:

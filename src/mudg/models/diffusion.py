@@ -121,15 +121,17 @@ def denoised(
     indices = noise.trailing_steps(len(schedule), request.steps)
     estimates: list[Tensor] = []
 
-    def watch(number: int, x0: Tensor) -> None:
-        if 2 * number >= len(indices) - 1:
-            estimates.append(x0)
+    def watched(x: Tensor, t: int) -> Tensor:
+        stated = denoise(x, t)
+        if 2 * indices.index(t) >= len(indices) - 1:
+            estimates.append(noise.x0_and_eps(x, stated, schedule.alpha[t], schedule.sigma[t], prediction)[0])
+        return stated
 
     settings |= request.sampler_settings()
     if "draw" in noise.SAMPLER_SETTINGS[request.sampler]:
         settings["draw"] = draw
     sampler = noise.SAMPLERS[request.sampler]
-    return sampler(denoise, draw(), schedule, indices, prediction=prediction, on_step=watch, **settings), estimates
+    return sampler(watched, draw(), schedule, indices, prediction=prediction, **settings), estimates
 
 
 # confidence -----------------------------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ def run(
     overwrite: bool = False,
     network: PublishedConfig | None = None,
 ) -> Path:
-    """Convert one checkpoint; returns `to`, which is whole or not there.
+    """Convert one checkpoint; returns `to`, which is complete or not there.
 
     Args:
         config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's files.
@@ -53,7 +53,7 @@ def run(
         network: sizes of the network the checkpoint should hold (None: the published ones).
 
     Raises:
-        UsageError: the folder exists, or the resolution cannot be told. InputError: not such a checkpoint; nothing is written.
+        UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is written.
         ResourceError: memory limit or disk.
     """
     checkpoint, to = Path(checkpoint), Path(to)
@@ -68,7 +68,7 @@ def run(
         peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
         bar.advance()
     memory = f"; peak memory {peak / processes.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
-    log.info(f"convert: {to} is whole{memory}")
+    log.info(f"convert: {to} is complete{memory}")
     return to
 
 
@@ -97,7 +97,7 @@ def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Callabl
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
-    """Height and width that the checkpoint was trained at: as configured, else told by the file's name."""
+    """Height and width that the checkpoint was trained at: as configured, else from the file's name."""
     if config.resolution != "auto":
         height, width = config.resolution.split("x")
         return int(height), int(width)

@@ -37,6 +37,7 @@ from mudg.base.types import Clip
 from mudg.core import losses
 from mudg.data.clips import from_log
 from mudg.data.clips.from_log import LogClipRules
+from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.codec import PatchCodec
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig, same_denoiser, with_refiner
@@ -162,7 +163,7 @@ def _finish(
     if isinstance(made, MDM) and made.refiner is not None and config.balance:
         made.refiner.take_back(class_weights(clips, min(config.first_cities, 20), config.balance))
     shards = learn_clips.scored_shards(config)
-    scores = learn_score.score(made, shards, clips, steps=config.score_steps, seed=config.seed, bf16=bf16)
+    scores = learn_score.score(made, shards, clips, SampleRequest(config.score_steps, config.seed, bf16=bf16))
     store.write_json(directory.path / "metrics.json", scores)
     facts: dict[str, Any] = {"recipe": to_dict(asked), "held_out": scores}
     if config.start:
@@ -471,8 +472,8 @@ class _Board:
 def _look(shown: Model, config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool) -> None:
     """Score a model on a few held-out clips and draw a grid of what it makes."""
     scores = learn_score.score(
-        shown, learn_clips.scored_shards(config)[: config.watched], folder, steps=config.sample_steps, seed=config.seed,
-        bf16=bf16, picture=run_dir.path / "samples" / f"{step:07d}.png",
+        shown, learn_clips.scored_shards(config)[: config.watched], folder, SampleRequest(config.sample_steps, config.seed, bf16=bf16),
+        picture=run_dir.path / "samples" / f"{step:07d}.png",
     )  # fmt: skip
     run_dir.log(step=step, held_out=scores["average"])
     log.info(f"step {step}\n{learn_score.table(scores)}")

@@ -29,10 +29,10 @@ from torch.nn import functional
 from mudg.base import log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
-from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
+from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.clips.condition import ConditionRules, Recorded, Source, Sparse, build_conditions
+from mudg.data.clips.condition import ConditionRules, Sparse, WarpSource, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
@@ -184,11 +184,11 @@ def windows(frames: int, window: int, overlap: int) -> list[range]:
     return [range(start, start + window) for start in starts]
 
 
-def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Recorded]:
+def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
     frames = scene.frames if config.held_out_images else scene.frames_in("train")
     classes = lambda frame: read_trusted_classes(scene, frame, config.label_confidence) if config.given_classes else None  # noqa: E731
-    return [Recorded(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
+    return [Photo(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
 
 
 def without_classes(cloud: FusedCloud) -> FusedCloud:
@@ -267,7 +267,7 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
 
 
 class Renders:
-    """What a fitted scene shows at a view, in the words of a condition; the last views are kept."""
+    """What a fitted scene shows at a view, in the form that conditions are made of."""
 
     def __init__(self, folder: Path) -> None:
         self._model = load_model(folder)
@@ -277,7 +277,7 @@ class Renders:
         """Colour, depth (NaN in the sky and where nothing is) and classes."""
         return render_view(self._model, view, self._raster)
 
-    def at(self, view: View) -> Sparse:
+    def sparse(self, view: View) -> Sparse:
         """Everything that is covered and not sky."""
         seen = self.observation(view)
         depth = torch.full(seen.rgb.shape[-2:], torch.nan) if seen.depth is None else seen.depth[0]
@@ -290,7 +290,7 @@ class ViewMaker:
     """Conditions, samples and observations of one scene at one size."""
 
     def __init__(
-        self, model: loading.DiffusionModel, scene: Scene, cloud: FusedCloud, recorded: Sequence[Recorded], rules: ConditionRules,
+        self, model: loading.DiffusionModel, scene: Scene, cloud: FusedCloud, recorded: Sequence[Photo], rules: ConditionRules,
         config: SynthesizeConfig, renders: Renders | None = None,
     ) -> None:  # fmt: skip
         if not recorded:
@@ -298,7 +298,7 @@ class ViewMaker:
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
         self._rules, self._full_size = rules, config.full_size
         self._renders = renders
-        self._sources: dict[int, Source] = {}
+        self._sources: dict[int, WarpSource] = {}
         self._request = loading.request_of(config, choose_bf16(config.precision))
 
     def sized(self, view: View) -> View:
@@ -311,7 +311,7 @@ class ViewMaker:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
         condition, fine = build_conditions(
             self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources,
-            None if self._renders is None else self._renders.at,
+            None if self._renders is None else self._renders.sparse,
         )  # fmt: skip
         sample = self._model.sample(condition, replace(self._request, index=number, known=known))
         sky = (sample.semantics == SKY).unsqueeze(1) & ~condition.valid
@@ -331,7 +331,7 @@ class ViewMaker:
         return sample, condition, observations
 
 
-def taken_there(view: View, recorded: Sequence[Recorded]) -> bool:
+def taken_there(view: View, recorded: Sequence[Photo]) -> bool:
     """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
 
     The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a

@@ -31,7 +31,7 @@ from torch.nn import functional
 
 from mudg.base import palette
 from mudg.base.errors import InputError
-from mudg.base.types import Condition, FusedCloud, Track, View
+from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 
 
@@ -71,15 +71,6 @@ class ConditionRules:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
-    """A recorded image: `rgb` u8[H,W,3] of `view`, any size; `semantics` u8[H,W] train ids (255 = unknown) or None."""
-
-    view: View
-    rgb: NDArray[np.uint8]
-    semantics: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Sparse:
     """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects),
     semantics u8[H,W] (255 = unknown)."""
@@ -96,7 +87,7 @@ Beyond = Callable[[View], Sparse]
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class DrawnCloud:
     """A fused cloud ready to be drawn, and what is known `beyond` it."""
 
     cloud: FusedCloud
@@ -104,7 +95,7 @@ class Points:
     rules: ConditionRules
     beyond: Beyond | None
 
-    def at(self, view: View) -> Sparse:
+    def project(self, view: View) -> Sparse:
         """The points seen at a view, and what is known beyond them."""
         sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
         return sparse if self.beyond is None else fill_beyond(sparse, self.beyond(view), self.rules.measured_reach_px)
@@ -197,7 +188,7 @@ def inside(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
 
 
 def warp(
-    view: View, depth: Tensor, source: Source, surface: Tensor, hidden_share: float
+    view: View, depth: Tensor, source: WarpSource, surface: Tensor, hidden_share: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours and classes that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
 
@@ -211,7 +202,7 @@ def warp(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class WarpSource:
     """A recorded image made ready for warping: rgb f32[3,h,w] in [0,1], depth f32[h,w] m (filled), moving bool[h,w],
     semantics u8[h,w] (255 = unknown)."""
 
@@ -226,16 +217,16 @@ def build_condition(
     cloud: FusedCloud,
     tracks: Sequence[Track],
     views: Sequence[View],
-    recorded: Sequence[Recorded],
+    recorded: Sequence[Photo],
     rules: ConditionRules,
-    sources: dict[int, Source] | None = None,
+    sources: dict[int, WarpSource] | None = None,
     beyond: Beyond | None = None,
 ) -> Condition:
     """The model's condition for `views` (any path, any size; resized to the rules' size).
 
     cloud      fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time
     recorded   images of any cameras; the ones nearest in time to a view are warped into it; may be empty
-    sources    cache of prepared images (index into `recorded` -> Source); pass the same dict again for further views
+    sources    cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views
     beyond     what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
                within `rules.measured_reach_px` as if it were points (not with `published`)
     Returns colour and depth filled everywhere (zeros with `published`), `valid` where a point was seen and kept,
@@ -250,9 +241,9 @@ def build_conditions(
     cloud: FusedCloud,
     tracks: Sequence[Track],
     views: Sequence[View],
-    recorded: Sequence[Recorded],
+    recorded: Sequence[Photo],
     rules: ConditionRules,
-    sources: dict[int, Source] | None = None,
+    sources: dict[int, WarpSource] | None = None,
     beyond: Beyond | None = None,
 ) -> tuple[Condition, Condition]:
     """As `build_condition`, and the same condition on the fine grid (the same object if there is no finer one)."""
@@ -266,7 +257,7 @@ def build_conditions(
     sources = {} if sources is None else sources
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
-    points = Points(cloud, tracks, rules, beyond)
+    points = DrawnCloud(cloud, tracks, rules, beyond)
     looks = [_look(points, view, recorded, rules, sources) for view in fine_views]
     color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*looks))
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
@@ -277,7 +268,7 @@ def build_conditions(
     def reduced(x: Tensor) -> Tensor:
         return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
 
-    own = [points.at(view) for view in small]
+    own = [points.project(view) for view in small]
     own_depth = torch.stack([_filled(sparse, rules)[1] for sparse in own])[:, None]
     own_valid = torch.stack([sparse.valid for sparse in own])[:, None]
     small_size = (rules.height, rules.width)
@@ -288,21 +279,21 @@ def build_conditions(
 
 
 def _look(
-    points: Points,
+    points: DrawnCloud,
     view: View,
-    recorded: Sequence[Recorded],
+    recorded: Sequence[Photo],
     rules: ConditionRules,
-    sources: dict[int, Source],
+    sources: dict[int, WarpSource],
 ) -> tuple[Tensor, ...]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
     the backdrop u8[1,H,W] of one view, at its size."""
 
-    def source(number: int) -> Source:
+    def source(number: int) -> WarpSource:
         if number not in sources:
             sources[number] = _prepare_source(points, recorded[number], view, rules)
         return sources[number]
 
-    sparse = points.at(view)
+    sparse = points.project(view)
     colour, depth, moving, ids = _filled(sparse, rules)
     found = torch.zeros_like(sparse.valid)
     if not (rules.warp and recorded):
@@ -350,7 +341,7 @@ def _published_condition(
     return Condition(tuple(views), color, depth, valid, reference)
 
 
-def _reference(view: View, recorded: Sequence[Recorded], rules: ConditionRules) -> Tensor:
+def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> Tensor:
     own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
     if not own:
         return torch.zeros(3, rules.height, rules.width)
@@ -365,7 +356,7 @@ def _tensor(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
 
 
-def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionRules) -> list[int]:
+def _order_of_images(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
     """The images to try for a view: nearest in time first (steps of 20 ms), the same camera before others, then by distance."""
 
     def rank(number: int) -> tuple[float, bool, float]:
@@ -380,19 +371,19 @@ def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionR
     return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
 
 
-def _prepare_source(points: Points, recorded: Recorded, target: View, rules: ConditionRules) -> Source:
+def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: ConditionRules) -> WarpSource:
     """A recorded image brought to about as many pixels as the target view, with its depth."""
     camera = recorded.view.camera
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
-    _, depth, moving, _ = _filled(points.at(view), rules)
-    return Source(
+    _, depth, moving, _ = _filled(points.project(view), rules)
+    return WarpSource(
         view, _tensor(resize_image(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
     )
 
 
-def _ids_at(recorded: Recorded, width: int, height: int) -> Tensor:
+def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
     """The image's classes u8[height,width], each from the pixel in its middle; 255 without labels."""
     if recorded.semantics is None:
         return torch.full((height, width), palette.UNLABELLED, dtype=torch.uint8)

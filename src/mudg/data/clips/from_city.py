@@ -21,11 +21,11 @@ import torch
 from mudg import native
 from mudg.base import geometry, seeds
 from mudg.base.log import progress
-from mudg.base.types import Clip, Condition, FusedCloud, View
-from mudg.core.fusion import FusionRules, Shot, SweepShots, fuse_sweeps
+from mudg.base.types import Clip, Condition, FusedCloud, Photo, View
+from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
-from mudg.data.clips.condition import ConditionRules, Recorded, Source, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
 from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 
 HELD_OUT = 1_000_000
@@ -73,7 +73,7 @@ class CityLog:
 
     world: CityWorld
     cloud: FusedCloud
-    recorded: tuple[Recorded, ...]
+    recorded: tuple[Photo, ...]
 
 
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
@@ -133,13 +133,13 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
         sweep = world.lidar_sweep(index)
         error = geometry.yaw_matrix(float(rng.normal(0, jitter_rad)), rng.normal(0, jitter_m, 3))
         shots = [
-            Shot(world.frame_views(n)[index], truths[n][index].rgb_u8, truths[n][index].semantics)
+            Photo(world.frame_views(n)[index], truths[n][index].rgb_u8, truths[n][index].semantics)
             for n in config.cameras
         ]
         sweeps.append(SweepShots(sweep.time_s, sweep.world_from_lidar @ error, sweep.points, shots))
     cloud, _ = fuse_sweeps(sweeps, world.tracks(), FusionRules(min_object_points=40))
     recorded = tuple(
-        Recorded(view, truth.rgb_u8, truth.semantics)
+        Photo(view, truth.rgb_u8, truth.semantics)
         for name in config.cameras
         for view, truth in zip(world.frame_views(name), truths[name])
     )
@@ -156,7 +156,7 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> l
     conditions = ConditionRules(*size, *fine, published=rules.published)
     tracks = log.world.tracks()
     clips = []
-    sources: dict[int, Source] = {}
+    sources: dict[int, WarpSource] = {}
     known = _without_every_fourth(log.recorded, rng) if city < HELD_OUT and rng.random() < 0.5 else log.recorded
     for shift_m in shifts_of(rules, city):
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
@@ -168,7 +168,7 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> l
     return clips
 
 
-def _without_every_fourth(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
+def _without_every_fourth(recorded: Sequence[Photo], rng: np.random.Generator) -> tuple[Photo, ...]:
     """As in a log whose every fourth moment is held out."""
     times = sorted({r.view.time_s for r in recorded})
     held_out = set(times[int(rng.integers(4)) :: 4])
@@ -184,7 +184,7 @@ def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
     return View(view.camera, moved, view.time_s)
 
 
-def _thinned(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
+def _thinned(recorded: Sequence[Photo], rng: np.random.Generator) -> tuple[Photo, ...]:
     """Every second to fourth moment's images only."""
     gap = int(rng.integers(2, 5))
     times = sorted({r.view.time_s for r in recorded})

@@ -28,12 +28,11 @@ from torch import Tensor
 
 from mudg.base import geometry, palette, seeds, store
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Clip, Condition, Frame, FusedCloud, PointCloud, Scene, Sweep, View
+from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointCloud, Scene, Sweep, View
 from mudg.core.project import project_points
 from mudg.data.clips.condition import (
     ConditionRules,
-    Recorded,
-    Source,
+    WarpSource,
     build_condition,
     nearest_valid,
     remove_shine_through,
@@ -146,22 +145,22 @@ class OpenLog:
         times = np.array([f.view.time_s for f in self._frames])
         apart = np.diff(times) > ConditionRules(1, 1).same_time_s
         self.moment: list[int] = np.concatenate([[0], np.cumsum(apart)]).tolist()
-        self._read: dict[int, Recorded] = {}
+        self._read: dict[int, Photo] = {}
 
     def frame(self, frame_id: str) -> Frame:
         """The frame with this id."""
         return self._frames[self.place[frame_id]]
 
-    def images(self, first: int, last: int) -> dict[int, Recorded]:
+    def images(self, first: int, last: int) -> dict[int, Photo]:
         """The recorded images of the moments `first` to `last`, by place in time; others are forgotten."""
         wanted = [n for n, moment in enumerate(self.moment) if first <= moment <= last]
         self._read = {n: self._read[n] if n in self._read else self._recorded(n) for n in wanted}
         return self._read
 
-    def _recorded(self, number: int) -> Recorded:
+    def _recorded(self, number: int) -> Photo:
         frame = self._frames[number]
         classes = read_trusted_classes(self.scene, frame, self.rules.label_confidence)
-        return Recorded(frame.view, read_image(self.scene, frame), classes)
+        return Photo(frame.view, read_image(self.scene, frame), classes)
 
 
 def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
@@ -176,7 +175,7 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
         return _published_clip(log, window, cloud, places)
     margin = gap + conditions.images_per_view  # at a log's end all images come from one side
     images = log.images(log.moment[places[0]] - margin, log.moment[places[-1]] + margin)
-    sources: dict[int, Source] = {}
+    sources: dict[int, WarpSource] = {}
     parts = []
     for place in places:
         far = [n for n in images if abs(log.moment[n] - log.moment[place]) >= gap]
@@ -244,7 +243,7 @@ def _in_one(parts: Sequence[Condition]) -> Condition:
     return Condition(views, color, depth, valid, parts[0].reference, **optional)
 
 
-def _truth(scene: Scene, frame: Frame, recorded: Recorded, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _truth(scene: Scene, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """rgb f32[3,H,W], depth f32[1,H,W] metres, where it is known bool[1,H,W], classes i64[H,W], all at the size of `view`."""
     width, height = view.camera.width, view.camera.height
     rgb = torch.from_numpy(resize_image(recorded.rgb, width, height).copy()).permute(2, 0, 1).float() / 255

@@ -1,8 +1,8 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
 Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to do,
-`encode_condition`, `loss` and `sample`. The network is in `models.mdm.unet`, the step from latents to pixels in
-`models.mdm.refine`, reading and writing in `models.mdm.files`. `MDMConfig` is all that distinguishes one model from another.
+`encode_condition`, `loss` and `sample`. The network and the step from latents to pixels are in
+`models.mdm.network`, reading and writing in `models.mdm.files`.
 
 The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition | backdrop | masks of
 what was seen | classes of the condition]. It states the clean latents of all modalities at once, and may copy the condition's own.
@@ -27,7 +27,7 @@ from mudg.base.errors import UsageError
 from mudg.base.types import Clip, Condition
 from mudg.core import losses, noise
 from mudg.core.align import align_depth
-from mudg.core.noise import Schedule, ScheduleConfig
+from mudg.core.noise import Schedule
 from mudg.models.diffusion import (
     GeneratedClip,
     SampleRequest,
@@ -43,61 +43,24 @@ from mudg.models.diffusion import (
 from mudg.models.mdm.codec import (
     CLASSES,
     MODALITIES,
-    CodecConfig,
     Decoded,
     Modality,
     PatchCodec,
     code_to_depth,
     semantic_shares,
 )  # fmt: skip
-from mudg.models.mdm.refine import ConditionPixels, PixelTruth, Refined, Refiner, shares
-from mudg.models.mdm.unet import TemporalAttention, UNet
+from mudg.models.mdm.network import (
+    ConditionPixels,
+    MDMConfig,
+    PixelTruth,
+    Refined,
+    Refiner,
+    TemporalAttention,
+    UNet,
+    shares,
+)  # fmt: skip
 
 SKY = palette.ID["sky"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class MDMConfig:
-    """Everything that fixes a model's function except its weights. What `LearnConfig` states has its default there alone."""
-
-    codec: CodecConfig = CodecConfig()
-    schedule: ScheduleConfig = ScheduleConfig()
-    patch: int
-    """Latent cells per side of one network cell."""
-    widths: tuple[int, ...]
-    blocks: tuple[int, ...]
-    spatial_attention: tuple[bool, ...]
-    temporal_attention: tuple[bool, ...]
-    head_width: int = 32
-    embed_width: int = 192
-    refine_widths: tuple[int, ...]
-    """Channels of the refiner (see `models.mdm.refine`) at the latent resolution and at half of it; empty = no refiner."""
-    refine_blocks: tuple[int, ...]
-    window: int
-    """Frames per clip the model was made for; other numbers work, only this one is tested."""
-    area_px: int
-    """Pixels per frame that the model was trained at."""
-    shared_noise: float = 0.3
-    """Share of the noise variance common to all frames, in training and sampling."""
-
-    def __post_init__(self) -> None:
-        levels = {len(self.widths), len(self.blocks), len(self.spatial_attention), len(self.temporal_attention)}
-        if len(levels) != 1:
-            raise UsageError(
-                "widths, blocks and attention switches must have one entry per level", got=f"{sorted(levels)}"
-            )
-        attended = zip(self.widths, self.spatial_attention, self.temporal_attention)
-        if any((spatial or temporal) and width % self.head_width for width, spatial, temporal in attended):
-            raise UsageError("a width is no multiple of the attention head width", got=f"{self.widths}")
-        if (len(self.refine_widths), len(self.refine_blocks)) not in ((0, 0), (2, 2)):
-            raise UsageError(
-                "refine_widths and refine_blocks have two entries each, or none", got=str(self.refine_widths)
-            )
-
-    @property
-    def pixel_multiple(self) -> int:
-        """Image sides must be multiples of this many pixels."""
-        return 2 * self.patch * 2 ** (len(self.widths) - 1)
 
 
 # model ----------------------------------------------------------------------------------------------------------------
@@ -351,7 +314,7 @@ class MDM(nn.Module):
         return spans[0], spans[1]
 
     def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
-        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.refine`)."""
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`)."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
         return self.refiner(self.codec, latents, given, frames)

@@ -74,7 +74,7 @@ class CellAttention(nn.Module):
         return x + self.out(mixed.transpose(1, 2).unflatten(2, x.shape[2:]))
 
 
-class Middle(nn.Module):
+class CoderMiddle(nn.Module):
     """block - attention - block."""
 
     def __init__(self, width: int) -> None:
@@ -109,7 +109,7 @@ class Encoder(nn.Module):
             shrink = nn.Conv2d(outside, outside, 3, stride=2) if level < top else None
             self.down.append(Level(inside, outside, config.blocks, shrink))
             inside = outside
-        self.middle = Middle(inside)
+        self.middle = CoderMiddle(inside)
         self.norm = nn.GroupNorm(GROUPS, inside, eps=1e-6)
         self.leave = nn.Conv2d(inside, 2 * config.latent_channels, 3, padding=1)
 
@@ -130,7 +130,7 @@ class Decoder(nn.Module):
         super().__init__()
         inside = config.multipliers[-1] * config.width
         self.enter = nn.Conv2d(config.latent_channels, inside, 3, padding=1)
-        self.middle = Middle(inside)
+        self.middle = CoderMiddle(inside)
         levels = []
         for level in reversed(range(len(config.multipliers))):
             outside = config.multipliers[level] * config.width

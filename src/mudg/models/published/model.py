@@ -71,7 +71,7 @@ class PublishedConfig:
     width: int = 1024
     height: int = 576
     fps: int = 10
-    """Frame rate that the model is told; the published one was never told another."""
+    """Frame rate given to the network; the published one never saw another."""
     missing_is_zero: bool = True
     """Give the network black and 0 m where nothing was seen, as in the published training, whatever the condition holds there."""
 

@@ -64,7 +64,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         return mdm_files.load(config.model)
     if config.steps < FEW_STEPS:
         log.warn(
-            f"synthesize: the published model was made for 50 denoising steps, asked for {config.steps} (--steps 50)"
+            f"synthesize: the published model was made for 50 denoising steps, --steps says {config.steps} (recommended: --steps 50)"
         )
     on_gpu = torch.cuda.is_available()
     bf16 = (config.precision != "float32") if on_gpu else choose_bf16(config.precision)

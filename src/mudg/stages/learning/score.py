@@ -40,12 +40,8 @@ def score(
     model: MDM | PublishedMDM,
     cities: Sequence[int],
     folder: Path,
+    request: SampleRequest,
     *,
-    steps: int,
-    seed: int,
-    bf16: bool,
-    eta: float | None = None,
-    sampler: str = "ddim",
     prepare: Callable[[Clip], Clip] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
@@ -53,7 +49,7 @@ def score(
 
     `prepare` changes each clip before it is used, for example `without_classes`.
 
-    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": steps}. Keys as in
+    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}. Keys as in
     `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
     """
     rows: dict[str, list[dict[str, float]]] = {}
@@ -64,7 +60,7 @@ def score(
             frames = range(model.config.window)
             clip = clip_shards.read_clip(folder, city, number, frames)
             clip = clip if prepare is None else prepare(clip)
-            sample = model.sample(clip.condition, SampleRequest(steps, seed, city * 16 + number, sampler, eta, bf16=bf16))
+            sample = model.sample(clip.condition, replace(request, index=city * 16 + number))
             name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
             row, matrix = score_clip(clip, sample)
             rows.setdefault(name, []).append(row)
@@ -76,7 +72,7 @@ def score(
     by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
     shifted = [n for n in rows if n != "recorded"] or list(rows)
     pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))  # type: ignore[arg-type]
-    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": steps}
+    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": request.steps}
 
 
 def without_classes(clip: Clip) -> Clip:
