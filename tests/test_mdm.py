@@ -105,7 +105,7 @@ def test_published_reference_replaces_frame_zero_of_the_colour_only():
 def test_a_grown_model_starts_as_the_same_denoiser():
     """Further inputs and outputs begin at zero: without given classes, nothing changes."""
     small, condition = randomised(PLAIN), some_condition()
-    big = mdm.grown(small, TINY)
+    big = mdm.extended(small, TINY)
     condition = replace(condition, semantics=None, backdrop_semantics=None)
     x = {
         m: torch.randn(1, 3, c, 8, 12, generator=torch.Generator().manual_seed(1))
@@ -117,7 +117,7 @@ def test_a_grown_model_starts_as_the_same_denoiser():
     for name in before:
         assert torch.allclose(before[name], after[name], atol=1e-5), name
     with pytest.raises(UsageError, match="another kind"):
-        mdm.grown(small, replace(TINY, widths=(16, 32)))
+        mdm.extended(small, replace(TINY, widths=(16, 32)))
 
 
 def test_given_classes_are_copied_where_they_are_known():

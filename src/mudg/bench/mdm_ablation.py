@@ -30,7 +30,9 @@ from mudg.models.mdm import model as mdm
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig
 from mudg.stages import learn
 from mudg.stages.config import BenchConfig, LearnConfig
+from mudg.stages.config.learn import LearnCompute, LearnData, LearnOptimizer
 from mudg.stages.learning import score as learn_score
+from mudg.stages.learning.models import draw_weights
 from mudg.stages.learning.precision import choose_bf16
 
 WIDTH, HEIGHT = 96, 64
@@ -86,7 +88,7 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     for name, variant in VARIANTS.items():
         model = _trained(name, variant, training, bf16)
         rows[name] = learn_score.score(
-            model, cities, folder, steps=4, seed=config.seed, bf16=bf16, prepare=variant.prepare,
+            model, cities, folder, {"steps": 4, "seed": config.seed, "bf16": bf16}, prepare=variant.prepare,
             picture=out / f"{name.replace(' ', '_')}.png",
         )["average"]  # fmt: skip
         log.info(f"{name}: PSNR {rows[name]['psnr']:.2f} dB, AbsRel {rows[name]['abs_rel']:.3f}, mIoU {rows[name]['miou']:.3f}")
@@ -95,8 +97,12 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
 
 def _learn_config(config: BenchConfig, folder: Path) -> LearnConfig:
     return LearnConfig(
-        seed=config.seed, cities=config.ablation_cities, first_cities=config.ablation_cities, clips=str(folder), workers=0,
-        width=WIDTH, height=HEIGHT, steps=config.ablation_steps, lr=1e-3, full_window_share=0.2, refined_share=1.0, reference_dropout=0.0,
+        seed=config.seed, steps=config.ablation_steps,
+        data=LearnData(
+            cities=config.ablation_cities, first_cities=config.ablation_cities, clips=str(folder), width=WIDTH, height=HEIGHT,
+            reference_dropout=0.0,
+        ),
+        optimizer=LearnOptimizer(full_window_share=0.2), compute=LearnCompute(workers=0),
     )  # fmt: skip
 
 
@@ -105,18 +111,18 @@ def _trained(name: str, variant: Variant, config: LearnConfig, bf16: bool) -> MD
     model = MDM(variant.config)
     model.codec.load_state_dict(mdm.load("embedded").codec.state_dict())
     model.codec.requires_grad_(False)
-    learn.draw_weights(model.net, config.seed, "ablation weights")
+    draw_weights(model.net, config.seed, "ablation weights")
     if model.refiner is not None:
-        learn.draw_weights(model.refiner, config.seed, "ablation refiner weights")
+        draw_weights(model.refiner, config.seed, "ablation refiner weights")
         model.refiner.reset()
     trained = [p for n, p in model.named_parameters() if not n.startswith("codec.")]
-    optimizer = torch.optim.AdamW(trained, lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01)
+    optimizer = torch.optim.AdamW(trained, lr=config.optimizer.lr, betas=(0.9, 0.99), weight_decay=0.01)
     with log.task(name, config.steps) as bar:
         for step in range(config.steps):
             optimizer.param_groups[0]["lr"] = learn.learning_rate(config, step)
             frames = learn.frames_at(config, step)
-            count = max(1, config.batch_frames // frames)
-            clips = learn.draw_clips(config, Path(config.clips), step, count, frames, "ablation batch")
+            count = max(1, config.optimizer.batch_frames // frames)
+            clips = learn.draw_clips(config, Path(config.data.clips), step, count, frames, "ablation batch")
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
                 losses = model(
                     [variant.prepare(clip) for clip in clips], BatchPart(config.seed, step, 0, count), LossSettings(refined_share=1.0)

@@ -77,10 +77,9 @@ def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
             for steps in config.steps:
                 picture = out / f"steps_{steps}_{'classes' if given else 'plain'}.png"
                 started = time.perf_counter()
-                scores = learn_score.score(
-                    model, cities, out / "clips", steps=steps, seed=config.seed, bf16=bf16, eta=config.eta,
-                    sampler=config.sampler, prepare=None if given else learn_score.without_classes, picture=picture,
-                )  # fmt: skip
+                sampling = {"steps": steps, "seed": config.seed, "bf16": bf16, "eta": config.eta, "sampler": config.sampler}
+                prepare = None if given else learn_score.without_classes
+                scores = learn_score.score(model, cities, out / "clips", sampling, prepare=prepare, picture=picture)
                 seconds = (time.perf_counter() - started) / scores["clips"]
                 row = {"steps": steps, "given_classes": given, "seconds_per_clip": round(seconds, 2), "scores": scores}
                 result["rows"].append(row)

@@ -738,12 +738,12 @@ def load(path: Path | str = "embedded") -> MDM:
 
 
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in what `grown` can add, and in the size they were trained at."""
+    """Whether two networks differ at most in what `extended` can add, and in the size they were trained at."""
     plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": (), "area_px": 0}
     return dataclasses.replace(one, **plain) == dataclasses.replace(other, **plain)
 
 
-def grown(before: MDM, config: MDMConfig) -> MDM:
+def extended(before: MDM, config: MDMConfig) -> MDM:
     """A model of `config` with the weights of `before`, whose inputs and outputs are the first of its own.
 
     Weights of further inputs and outputs are 0, so that the denoiser starts as the same function; a refiner is taken over

@@ -39,18 +39,16 @@ def score(
     model: MDM | PublishedMDM,
     cities: Sequence[int],
     folder: Path,
+    sampling: Mapping[str, Any],
     *,
-    steps: int,
-    seed: int,
-    bf16: bool,
-    eta: float = 1.0,
-    sampler: str = "ddim",
     prepare: Callable[[Clip], Clip] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
 
-    `prepare` changes each clip before it is used, for example `without_classes`.
+    Args:
+        sampling: what `model.sample` takes besides the condition and the index; `steps` at least.
+        prepare: changes each clip before it is used, for example `without_classes`.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": steps}. Keys as in
     `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
@@ -63,9 +61,7 @@ def score(
             frames = range(model.config.window)
             clip = clip_shards.read_clip(folder, city, number, frames)
             clip = clip if prepare is None else prepare(clip)
-            sample = model.sample(
-                clip.condition, steps=steps, seed=seed, index=city * 16 + number, sampler=sampler, eta=eta, bf16=bf16
-            )
+            sample = model.sample(clip.condition, index=city * 16 + number, **sampling)
             name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
             row, matrix = score_clip(clip, sample)
             rows.setdefault(name, []).append(row)
@@ -77,7 +73,7 @@ def score(
     by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
     shifted = [n for n in rows if n != "recorded"] or list(rows)
     pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))  # type: ignore[arg-type]
-    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": steps}
+    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": sampling["steps"]}
 
 
 def without_classes(clip: Clip) -> Clip:
@@ -267,9 +263,10 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
 
     `data` says what it was trained on; empty = generated cities.
     """
+    clips, rules = config.data, config.optimizer
     data = data or (
-        f"generated cities only (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of\n"
-        f"{config.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
+        f"generated cities only (numbers 0 to {clips.cities - 1} of run seed {config.seed}), {clips.clips_per_city} clips of\n"
+        f"{clips.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
         "other model, was used."
     )
     confidence = (
@@ -278,18 +275,18 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
         else "falls with the error of the colour that the refiner expects, and where depth contradicts measurements nearby."
     )
     count = sum(p.numel() for p in model.parameters()) / 1e6
-    samples = config.steps * config.batch_frames
+    samples = config.steps * rules.batch_frames
     continued = f", continued from an earlier model ({config.start})" if config.start else ""
     return f"""# Small multi-modal diffusion model
 
 Turns a projected, coloured LiDAR cloud (with recorded images and, where there are any, classes warped along) into dense
-colour, depth and semantic frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million
+colour, depth and semantic frames, {clips.window} at a time, at {clips.width}x{clips.height} pixels. {count:.1f} million
 parameters, stored in float16. All three modalities come from one pass.
 
 **Training data**: {data}
 
 **Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`{continued}: {config.steps}
-steps of {config.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {config.average_decay}, x0
+steps of {rules.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {rules.average_decay}, x0
 prediction with the loss weight 1 + SNR clipped to [1, 5].
 
 **Held-out score** ({scores["clips"]} clips of cities from number 1000000 on, {scores["steps"]} denoising steps, against exact
