@@ -26,17 +26,17 @@ def run_until(step, config, folder, stopper):
 
     def stop_then(config, folder, drawn_step, count, frames, purpose, *rest):
         if rank == stopper and purpose == "batch" and drawn_step == step - 1:
-            Interruption.asked = property(lambda self: True)
+            Interruption.requested = property(lambda self: True)
         return draw(config, folder, drawn_step, count, frames, purpose, *rest)
 
-    asked = Interruption.asked
+    asked = Interruption.requested
     learn.draw_clips = stop_then
     try:
         learn.run(config, folder)
     except KeyboardInterrupt:
         return True
     finally:
-        learn.draw_clips, Interruption.asked = draw, asked
+        learn.draw_clips, Interruption.requested = draw, asked
     return False
 
 

@@ -2,11 +2,10 @@
 
 import json
 import signal
-from dataclasses import replace
 
 import pytest
 import torch
-from toy_clips import WINDOW, tiny, write_clips
+from toy_clips import WINDOW, tiny, with_settings, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
@@ -46,7 +45,7 @@ def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, tmp_
     assert saved is not None and saved.step == 2  # the step that was under way was finished
     assert json.loads((tmp_path / "parts" / "run.json").read_text())["state"] == "interrupted"
     assert not (tmp_path / "parts" / "model").exists()
-    parts = learn.run(replace(config, log_every=1), tmp_path / "parts")  # how often is written down may change
+    parts = learn.run(with_settings(config, log_every=1), tmp_path / "parts")  # how often is written down may change
     first, second = weights(whole), weights(parts)
     assert all(torch.equal(first[name], second[name]) for name in first)
     scores = [json.loads((p.parent / "metrics.json").read_text()) for p in (whole, parts)]
@@ -55,7 +54,7 @@ def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, tmp_
 
 def test_outputs_and_reuse(clips, tmp_path):
     out = tmp_path / "run"
-    model_folder = learn.run(tiny(clips, sample_every=4), out)
+    model_folder = learn.run(tiny(clips, score_every=4), out)
     assert (out / "samples" / "0000004.png").stat().st_size > 1000
     assert (out / "loss.png").is_file()
     content = json.loads((model_folder / "model.json").read_text())
@@ -63,7 +62,7 @@ def test_outputs_and_reuse(clips, tmp_path):
     assert content["facts"]["held_out"]["clips"] == 2
     assert "held-out" in (model_folder / "MODEL_CARD.md").read_text().lower()
     before = (model_folder / "model.json").stat().st_mtime_ns
-    assert learn.run(tiny(clips, sample_every=4), out) == model_folder
+    assert learn.run(tiny(clips, score_every=4), out) == model_folder
     assert (model_folder / "model.json").stat().st_mtime_ns == before
     with pytest.raises(UsageError):
         learn.run(tiny(clips, steps=5), out)
@@ -83,8 +82,8 @@ def test_training_continues_from_a_model(clips, tmp_path):
 
 
 def test_class_weights_lift_rare_classes(clips):
-    assert torch.equal(learn.class_weights(clips, 2, 0.0), torch.ones(19))
-    weight = learn.class_weights(clips, 2, 0.5)
+    assert torch.equal(learn_clips.class_weights(clips, 2, 0.0), torch.ones(19))
+    weight = learn_clips.class_weights(clips, 2, 0.5)
     assert float(weight[13]) > float(weight[0])
 
 

@@ -19,6 +19,7 @@ from mudg.models.mdm import files
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import models as learn_models
 from mudg.stages.learning import parallel as learn_parallel
 from mudg.stages.learning.parallel import Ranks
 from mudg.stages.learning.state import RowFiles, TrainingState
@@ -93,13 +94,13 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
 def torchrun(clips, out, **changes):
     """The command that trains on two processes started by torch's launcher."""
     flags = {
-        "clips": clips, "out": out, "cities": 3, "first-cities": 2, "held-out": 1, "workers": 0, "width": WIDTH,
-        "height": HEIGHT, "window": WINDOW, "codec-steps": 2, "codec-batch": 2, "codec-fit-batches": 1, "steps": 2,
-        "batch-frames": 8, "sample-steps": 1, "score-steps": 1, "log-every": 1, "parallel": "fsdp", **changes,
+        "out": out, "steps": 2, "data.clips": clips, "data.cities": 3, "data.first-cities": 2, "data.held-out": 1,
+        "data.width": WIDTH, "data.height": HEIGHT, "data.window": WINDOW, "network.widths": "16 32", "network.blocks": "1 1",
+        "network.spatial-attention": "False True", "network.temporal-attention": "False True", "network.refine-widths": "8 16",
+        "network.refine-blocks": "1 1", "codec.steps": 2, "codec.batch": 2, "codec.fit-batches": 1, "optimizer.batch-frames": 8,
+        "score.steps": 1, "compute.workers": 0, "compute.log-every": 1, "compute.parallel": "fsdp", **changes,
     }  # fmt: skip
-    words = [word for name, value in flags.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    words += ["--widths", "16", "32", "--blocks", "1", "1", "--refine-widths", "8", "16", "--refine-blocks", "1", "1"]
-    words += ["--spatial-attention", "False", "True", "--temporal-attention", "False", "True"]
+    words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
     return [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mudg", "learn", *words,
     ]  # fmt: skip
@@ -117,7 +118,7 @@ def test_torchrun_trains(clips, tmp_path):
 def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
     """The terminal sends the signal to all processes, and the launcher sends it on once more."""
     out = tmp_path / "out"
-    command = torchrun(clips, out, steps=5000, checkpoint_every=5000)
+    command = torchrun(clips, out, **{"steps": 5000, "compute.checkpoint-every": 5000})
     process = subprocess.Popen(command, env=environment(), start_new_session=True, stderr=subprocess.PIPE, text=True)
     try:
         deadline = time.monotonic() + 500
@@ -149,8 +150,8 @@ def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
 
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
-    model = MDM(learn.model_config(tiny(clips)))
-    learn.draw_weights(model.net, 0, "weights")
+    model = MDM(learn_models.model_config(tiny(clips)))
+    learn_models.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
     rules = LossSettings(learn_clips.class_weights(clips, 2, 0.5), refined_share=0.5)
 
@@ -199,8 +200,8 @@ def test_rows_of_any_cut_are_put_together(tmp_path):
 
 def test_a_term_that_is_not_finite_is_named():
     with pytest.raises(NumericsError, match=r"depth term of the network(.|\n)*step 4"):
-        learn_parallel.agreed(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
-    assert learn_parallel.agreed(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)
+        learn_parallel.agreed_terms(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
+    assert learn_parallel.agreed_terms(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)
 
 
 def test_blocks_are_what_repeats():

@@ -29,6 +29,7 @@ from mudg.models.published.model import PAPER_DROPOUT, RELEASED_DROPOUT, Context
 from mudg.stages import convert, fuse, learn, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import models as learn_models
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     config = published_settings(
         one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
     )
-    begun, fresh = learn.starting_model(config)
+    begun, fresh = learn_models.starting_model(config)
     first, start = (published_files.load(folder).state_dict() for folder in (converted, one))
     assert not fresh
     assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
@@ -102,7 +103,7 @@ def test_settings_of_the_frozen_layers_agree_with_the_published_stages():
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     """With dropout inside the network on; terms too, and they have the same names in every part."""
     settings = published_settings(converted, clips)
-    model, _ = learn.starting_model(settings)
+    model, _ = learn_models.starting_model(settings)
     model.trained_part().train()
 
     @torch.no_grad()
@@ -124,7 +125,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     settings = published_settings(converted, clips)
-    model, _ = learn.starting_model(settings)
+    model, _ = learn_models.starting_model(settings)
     drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 4, 4, "batch")]
     nothing = [
         replace(clip, depth_valid=torch.zeros_like(clip.depth_valid), semantics=torch.full_like(clip.semantics, 255))
@@ -194,12 +195,10 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
     for wrong in ({"window": 8}, {"full_window_share": 0.5}):
-        with pytest.raises(UsageError, match=r"exactly the length(.|\n)*--window 4 --full-window-share 1"):
+        with pytest.raises(UsageError, match=r"exactly the length(.|\n)*--data.window 4 --optimizer.full-window-share 1"):
             learn.run(published_settings(converted, clips, **wrong), tmp_path / "run")
     with pytest.raises(UsageError, match="multiples of 4"):
         learn.run(published_settings(converted, clips, width=50), tmp_path / "run")
-    with pytest.raises(UsageError, match="cannot be kept"):
-        learn.run(published_settings(converted, clips, cache_latents=True), tmp_path / "run")
     with pytest.raises(UsageError, match="cannot be described"):
         learn.run(published_settings(converted, clips, widths=(16, 32, 64)), tmp_path / "run")
     with pytest.raises(UsageError, match="without a refiner"):

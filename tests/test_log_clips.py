@@ -20,6 +20,7 @@ from mudg.data.scene import SceneWriter, read_image, read_label, read_points, re
 from mudg.models.mdm.model import MDM
 from mudg.stages import fuse, learn
 from mudg.stages.config import FuseConfig
+from mudg.stages.learning import models as learn_models
 
 RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
 FRAMES = 16
@@ -121,7 +122,7 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
     clip_shards.write_shard(
         tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], gaps=True)
     )
-    model = MDM(learn.model_config(tiny(tmp_path, width=64, height=32, window=3)))
+    model = MDM(learn_models.model_config(tiny(tmp_path, width=64, height=32, window=3)))
     clip = clip_shards.read_clip(tmp_path, 0, 0, range(3))
     assert not bool(clip.depth_valid.all())
 
@@ -146,7 +147,7 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     for name, folder in (("scene", log[1].scene), ("fuse", log[1].fused)):
         (run / name).symlink_to(folder)
     config = tiny(
-        "", start=str(first), scenes=(str(run),), steps=2, sample_every=1, log_every=1, stride=2, held_out_every=4, window=4,
+        "", start=str(first), scenes=(str(run),), steps=2, score_every=1, log_every=1, stride=2, held_out_every=4, window=4,
         width=64, height=32,
     )  # fmt: skip
     made = learn.run(config, tmp_path / "tuned")
@@ -158,7 +159,7 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     assert scores["clips"] >= 1 and scores["average"]["psnr"] > 5
     assert (made.parent / "samples" / "0000001.png").is_file() and (made.parent / "loss.png").is_file()
     facts = json.loads((made / "model.json").read_text())["facts"]
-    assert facts["recipe"]["scenes"] == [str(run)]
+    assert facts["recipe"]["data"]["scenes"] == [str(run)]
     with pytest.raises(UsageError, match="other logs or settings"):
         from_log.claim(made.parent / "clips", RULES, [log[1]])
     with pytest.raises(InputError, match="no scene with a fused cloud"):

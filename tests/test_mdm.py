@@ -80,15 +80,15 @@ def test_sample_shapes_ranges_and_determinism():
 
 def test_a_model_with_a_new_refiner_has_the_same_denoiser_and_codec():
     small = randomised(PLAIN)
-    big = mdm.with_refiner(small, TINY)
+    big = mdm.extended(small, TINY)
     state = big.state_dict()
     assert all(torch.equal(value, state[name]) for name, value in small.state_dict().items())
     assert any(name.startswith("refiner.") for name in state)
     refined = randomised(TINY)
-    again = mdm.with_refiner(refined, replace(TINY, area_px=100)).state_dict()
+    again = mdm.extended(refined, replace(TINY, area_px=100)).state_dict()
     assert all(torch.equal(value, again[name]) for name, value in refined.state_dict().items())
     with pytest.raises(UsageError, match="another kind"):
-        mdm.with_refiner(small, replace(TINY, widths=(16, 32)))
+        mdm.extended(small, replace(TINY, widths=(16, 32)))
 
 
 def test_given_classes_are_copied_where_they_are_known():

@@ -5,8 +5,8 @@
       marigold-depth-v1-0/     model_index.json, scheduler, vae, and of unet the description alone
       CLIP-ViT-H-14-.../       config.json, and model.safetensors or pytorch_model.bin
 
-The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the descriptions stand for, by
-name and shape, all of them before the first is written. The published code takes what the pickle of the denoising U-Net or of
+The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the descriptions stand
+for, by name and shape, all of them before the first is written. The published code takes what the pickle of the denoising U-Net or of
 the linear layer lacks from Marigold or leaves it random; here that is an error.
 """
 

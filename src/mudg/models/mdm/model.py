@@ -418,7 +418,7 @@ def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
     return without(one) == without(other)
 
 
-def with_refiner(before: MDM, config: MDMConfig) -> MDM:
+def extended(before: MDM, config: MDMConfig) -> MDM:
     """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape. For
     continuing the training of an earlier, plainer model.
 

@@ -1,4 +1,4 @@
-"""The models that `learn` can train, and what is particular to each.
+"""The models that `learn` can train, what is particular to each, and with which weights a training starts.
 
 The loop (draws, layouts, checkpoints, averages) uses three methods that both models have: `loss(clips, part, settings)`,
 also as `forward`; `trained_part()`, the modules that change; `temporal_parameters(which)`, those that a later stage may freeze.
@@ -7,16 +7,19 @@ All else is a row of `KINDS`. A new kind of model is a class with these methods 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
+from mudg.base import log, seeds
 from mudg.base.errors import UsageError
 from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.model import MDM
+from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import published as learn_published
@@ -65,3 +68,92 @@ def kind_of(model: nn.Module) -> ModelKind:
         raise UsageError("this kind of model cannot be trained here", got=type(model).__name__,
                          expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
     return KINDS[type(model)]
+
+
+# start ----------------------------------------------------------------------------------------------------------------
+
+
+def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
+    """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
+
+    With `start` the network is that of the earlier model, grown by a refiner and given classes where the settings ask for
+    them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
+    size and length than before.
+
+    Raises:
+        UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
+    """
+    wanted = model_config(config)
+    if not config.start:
+        return MDM(wanted), {"codec", "refiner"}
+    if is_published(config.start):
+        if not _network_is_default(config):
+            raise UsageError("the network of a published-type model cannot be described", where="--start",
+                             remedy="leave out widths, blocks, attention, patch and refiner")  # fmt: skip
+        return learn_published.starting(config), set()
+    before = mdm_files.load(config.start)
+    if before.config.window != config.data.window:
+        log.info(f"learn: clips of {config.data.window} frames; the model to continue from had {before.config.window}")
+    now = {"window": config.data.window, "area_px": wanted.area_px}
+    resized = MDM(replace(before.config, **now))
+    resized.load_state_dict(before.state_dict())
+    if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
+        log.info("learn: the network is that of the model to continue from")
+        wanted = resized.config
+    if wanted == resized.config:
+        return resized, set()
+    grows_refiner = bool(wanted.refine_widths) and before.refiner is None
+    return extended(resized, wanted), {"refiner"} if grows_refiner else set()
+
+
+def _network_is_default(config: LearnConfig) -> bool:
+    """Whether the settings leave the network as it is by default."""
+    default = LearnConfig(data=config.data)
+    return model_config(config) == model_config(default)
+
+
+def model_config(config: LearnConfig) -> MDMConfig:
+    """The network that a learn configuration asks for."""
+    shape = asdict(config.network)
+    shape["refine_blocks"] = shape["refine_blocks"] if shape["refine_widths"] else ()
+    return MDMConfig(**shape, window=config.data.window, area_px=config.data.width * config.data.height)
+
+
+def freeze(model: Model, what: str) -> int:
+    """Let a part of the network keep its weights (see `LearnConfig.frozen`); returns the number of parameters it has.
+
+    Raises:
+        UsageError: nothing would be frozen: the network has no such layers.
+    """
+    if what == "nothing":
+        return 0
+    if what == "denoiser":
+        names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
+        if not isinstance(model, MDM) or model.refiner is None:
+            raise UsageError("without a refiner nothing would be left to train", where="--frozen", got=what)
+    else:
+        names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
+    count = 0
+    for name, parameter in model.trained_part().named_parameters():
+        if name in names:
+            parameter.requires_grad_(False)
+            count += parameter.numel()
+    if not count:
+        raise UsageError(
+            "there is nothing to freeze", where="--frozen", got=what, expected="a network with such layers"
+        )
+    log.info(f"learn: {what.replace('_', ' ')} keep their weights ({count:,} parameters)")
+    return count
+
+
+def draw_weights(net: nn.Module, seed: int, purpose: str) -> None:
+    """Draw all weights that are not zero at the start from the run's seed (the constructor's own draw is not used)."""
+    generator = seeds.torch_generator(seed, 0, purpose)
+    with torch.no_grad():
+        for name, value in net.named_parameters():
+            if value.ndim >= 2 and bool(value.any()):
+                fan_in = math.prod(value.shape[1:])
+                gain = 2.0 if "conv1" in name else 1.0
+                value.copy_(torch.randn(value.shape, generator=generator) * math.sqrt(gain / fan_in))
+            elif value.ndim == 1 and name.endswith("bias"):
+                value.zero_()

@@ -43,7 +43,7 @@ Layout = Literal["ddp", "fsdp"]
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among its like: number `rank` of `size`, computing on `device`."""
+    """This process among those of the run: number `rank` of `size`, computing on `device`."""
 
     rank: int
     size: int
@@ -66,7 +66,7 @@ class Ranks:
         dist.all_reduce(kept)
         return kept.tolist()
 
-    def told(self, value: Any) -> Any:
+    def broadcast(self, value: Any) -> Any:
         """The leader's `value` (anything JSON can say), in every process."""
         if self.size == 1:
             return value
@@ -92,9 +92,9 @@ class Ranks:
                 answer = {"value": work()}
             except MudgError as error:
                 fields = (error.what, error.where, error.expected, error.got, error.remedy)
-                self.told({"error": type(error).__name__, "fields": fields})
+                self.broadcast({"error": type(error).__name__, "fields": fields})
                 raise
-        answer = self.told(answer)
+        answer = self.broadcast(answer)
         if "error" in answer:
             what, where, expected, got, remedy = answer["fields"]
             raise _ERRORS.get(answer["error"], MudgError)(what, where=where, expected=expected, got=got, remedy=remedy)
@@ -127,9 +127,9 @@ class Ranks:
         size, rest = divmod(clips, self.size * parts)
         if rest or not size:
             raise UsageError(
-                "a step's clips cannot be divided evenly", where="--batch-frames, --accumulate",
+                "a step's clips cannot be divided evenly", where="--optimizer.batch-frames, --compute.accumulate",
                 expected=f"a multiple of {self.size} processes x {parts} portions", got=f"{clips} clips",
-                remedy="make --batch-frames a multiple of window x processes x accumulate",
+                remedy="make --optimizer.batch-frames a multiple of window x processes x accumulate",
             )  # fmt: skip
         first = self.rank * parts * size
         return [slice(first + n * size, first + (n + 1) * size) for n in range(parts)]
@@ -143,7 +143,7 @@ _ERRORS: dict[str, type[MudgError]] = {
 
 
 @contextlib.contextmanager
-def joined(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
+def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
     """This process's place among those that `torchrun` started; alone if it was not started by it.
 
     A process group that exists already is used and left open. Only the leader's messages are shown.
@@ -153,7 +153,7 @@ def joined(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         UsageError: the launcher's variables are not numbers.
     """
     if device == "cuda" and not torch.cuda.is_available():
-        raise ResourceError("no CUDA device here", where="--device cuda", remedy="leave the flag out")
+        raise ResourceError("no CUDA device here", where="--compute.device cuda", remedy="leave the flag out")
     if dist.is_available() and dist.is_initialized():
         yield _place(dist.get_rank(), dist.get_world_size(), device)
         return
@@ -291,7 +291,7 @@ def rows_of(value: Tensor) -> Rows:
     return Rows(tuple(value.shape), start)
 
 
-def whole(piece: Tensor, like: Tensor) -> Tensor:
+def gathered(piece: Tensor, like: Tensor) -> Tensor:
     """The whole tensor on the CPU, in every process, of which `piece` is this process's part, cut as `like` is."""
     if not _is_sharded(like):
         return piece.detach().cpu()
@@ -341,8 +341,8 @@ class Interruption:
             log.info("stopping after this step; once more to stop at once")
 
     @property
-    def asked(self) -> bool:
-        """Whether this process was asked to stop."""
+    def requested(self) -> bool:
+        """Whether this process was told to stop."""
         return self._number != 0
 
     def end(self, number: int = 0, frame: types.FrameType | None = None) -> None:
@@ -353,7 +353,7 @@ class Interruption:
         raise KeyboardInterrupt
 
 
-def agreed(
+def agreed_terms(
     ranks: Ranks, terms: Mapping[str, float], portions: int, step: int, what: str, *, stop: bool = False
 ) -> tuple[dict[str, float], bool]:
     """Mean of the loss terms over processes and portions, and whether anyone was asked to stop.

@@ -31,21 +31,18 @@ def starting(config: LearnConfig) -> PublishedMDM:
     """
     model = published_files.load(Path(config.start), dtype=torch.float32)
     frames = model.config.window
-    if config.window != frames or config.full_window_share < 1:
+    if config.data.window != frames or config.optimizer.full_window_share < 1:
         raise UsageError(
             "a published-type model is trained on clips of exactly the length that its image tokens are made for",
-            where="--window, --full-window-share", expected=f"{frames} frames in all steps",
-            got=f"{config.window} frames in {config.full_window_share:.0%} of the steps",
-            remedy=f"--window {frames} --full-window-share 1",
+            where="--data.window, --optimizer.full-window-share", expected=f"{frames} frames in all steps",
+            got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
+            remedy=f"--data.window {frames} --optimizer.full-window-share 1",
         )  # fmt: skip
-    model.check_size(config.height, config.width)
-    if config.cache_latents and model.config.codec.posterior == "sample":
-        raise UsageError("latents of this model are drawn anew at every step, so they cannot be kept",
-                         where="--cache-latents", remedy="leave the flag out")  # fmt: skip
+    model.check_size(config.data.height, config.data.width)
     with torch.no_grad():  # out of the mapped files: training writes in place
         for value in (*model.parameters(), *model.buffers()):
             value.data = value.data.clone()
-    model.config = replace(model.config, width=config.width, height=config.height)
+    model.config = replace(model.config, width=config.data.width, height=config.data.height)
     model.split = WorkSplit(frames_at_once=1)
     return model
 
@@ -78,21 +75,22 @@ def save(model: PublishedMDM, folder: Path, text: str, facts: Mapping[str, Any])
 
 def card(model: PublishedMDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
     """Text of the model card; `data` says what it was trained on (empty = generated cities)."""
+    clips, rules = config.data, config.optimizer
     data = data or (
-        f"generated cities (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of\n"
-        f"{config.window} frames each, most of them beside the recorded path."
+        f"generated cities (numbers 0 to {clips.cities - 1} of run seed {config.seed}), {clips.clips_per_city} clips of\n"
+        f"{clips.window} frames each, most of them beside the recorded path."
     )
     frozen = "all layers" if config.frozen == "nothing" else f"all layers but the {config.frozen.replace('_', ' ')}"
     return f"""# Published-type multi-modal diffusion model, trained further
 
 Continued from {config.start}, which has training data of its own. {model.config.window} frames at
-{config.width}x{config.height} pixels.
+{clips.width}x{clips.height} pixels.
 
 **Training data**: {data}
 
 **Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`: {config.steps} steps of
-{config.batch_frames // config.window} clips, {frozen} of the denoising network and the image-token resampler, AdamW, rate
-{config.lr:g}, moving average {config.average_decay}, v prediction, reference left out in {config.reference_dropout:.0%} of the clips.
+{rules.batch_frames // clips.window} clips, {frozen} of the denoising network and the image-token resampler, AdamW, rate
+{rules.lr:g}, moving average {rules.average_decay}, v prediction, reference left out in {clips.reference_dropout:.0%} of the clips.
 
 **Held-out score** ({scores["clips"]} clips, {scores["steps"]} denoising steps):
 

@@ -47,7 +47,9 @@ def score(
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
 
-    `prepare` changes each clip before it is used, for example `without_classes`.
+    Args:
+        sampling: what `model.sample` takes besides the condition and the index; `steps` at least.
+        prepare: changes each clip before it is used, for example `without_classes`.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}. Keys as in
     `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
@@ -258,9 +260,10 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
 
     `data` says what it was trained on; empty = generated cities.
     """
+    clips, rules = config.data, config.optimizer
     data = data or (
-        f"generated cities only (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of\n"
-        f"{config.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
+        f"generated cities only (numbers 0 to {clips.cities - 1} of run seed {config.seed}), {clips.clips_per_city} clips of\n"
+        f"{clips.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
         "other model, was used."
     )
     confidence = (
@@ -269,18 +272,18 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
         else "falls with the error of the colour that the refiner expects, and where depth contradicts measurements nearby."
     )
     count = sum(p.numel() for p in model.parameters()) / 1e6
-    samples = config.steps * config.batch_frames
+    samples = config.steps * rules.batch_frames
     continued = f", continued from an earlier model ({config.start})" if config.start else ""
     return f"""# Small multi-modal diffusion model
 
 Turns a projected, coloured LiDAR cloud (with recorded images and, where there are any, classes warped along) into dense
-colour, depth and semantic frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million
+colour, depth and semantic frames, {clips.window} at a time, at {clips.width}x{clips.height} pixels. {count:.1f} million
 parameters, stored in float16. All three modalities come from one pass.
 
 **Training data**: {data}
 
 **Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`{continued}: {config.steps}
-steps of {config.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {config.average_decay}, x0
+steps of {rules.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {rules.average_decay}, x0
 prediction with the loss weight 1 + SNR clipped to [1, 5].
 
 **Held-out score** ({scores["clips"]} clips of cities from number 1000000 on, {scores["steps"]} denoising steps, against exact

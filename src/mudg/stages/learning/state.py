@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import InputError, IntegrityError
-from mudg.stages.learning.parallel import Ranks, local, rows_of, whole
+from mudg.stages.learning.parallel import Ranks, gathered, local, rows_of
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -53,18 +53,18 @@ class TrainingState:
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.values()), [local(current[k]) for k in self.average], 1.0 - keep)
 
-    def shown(self, ranks: Ranks) -> dict[str, Tensor]:
+    def export_weights(self, ranks: Ranks) -> dict[str, Tensor]:
         """The weights to use: the average, or the weights themselves; whole, on the CPU, in the leader (others get none).
 
-        All processes must ask together.
+        All processes must call this together.
         """
         current = self.trained.state_dict()
         pieces = self.average or {name: local(value) for name, value in current.items()}
         found = {}
         for name, value in current.items():
-            put_together = whole(pieces[name], value)
+            tensor = gathered(pieces[name], value)
             if ranks.leads:
-                found[name] = put_together
+                found[name] = tensor
         return found
 
     def _moments(self) -> dict[str, dict[str, Tensor]]:
@@ -97,6 +97,15 @@ class TrainingState:
             ranks.all_do(write_own)
         ranks.wait()
 
+    def resume(self, folder: Path, ranks: Ranks) -> bool:
+        """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this together."""
+        saved = newest(folder, ranks)
+        if saved is None:
+            return False
+        ranks.all_do(lambda: self.load(saved.path))
+        self.step = saved.step
+        return True
+
     def load(self, saved: Path) -> None:
         """Take weights, moments and average from a checkpoint written by `save` under any layout. Does not set `step`.
 
@@ -104,10 +113,7 @@ class TrainingState:
             IntegrityError: tensors or rows are missing, or of another shape.
         """
         weights = self.trained.state_dict()
-        files = RowFiles(saved, "net")
-        with torch.no_grad():
-            for name, value in weights.items():
-                files.read_into(name, value)
+        load_weights(self.trained, saved)
         if self.average is not None:
             files = RowFiles(saved, "average")
             for name, value in self.average.items():
@@ -211,14 +217,22 @@ class RowFiles:
         return self._files[path]
 
 
+def load_weights(trained: nn.ModuleDict, saved: Path) -> None:
+    """Take the weights alone from a checkpoint."""
+    files = RowFiles(saved, "net")
+    with torch.no_grad():
+        for name, value in trained.state_dict().items():
+            files.read_into(name, value)
+
+
 def newest(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
     """The newest checkpoint that verifies, the same for all; only the leader hashes the files."""
 
-    def look() -> dict[str, Any] | None:
+    def find() -> dict[str, Any] | None:
         found = checkpoint.latest(folder)
         return None if found is None else {"step": found.step, "path": str(found.path), "state": dict(found.state)}
 
-    found = ranks.leader_does(look)
+    found = ranks.leader_does(find)
     return None if found is None else checkpoint.Checkpoint(int(found["step"]), Path(found["path"]), found["state"])
 
 
