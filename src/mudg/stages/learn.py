@@ -100,12 +100,12 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: store.
     making: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
     if config.data.scenes:
         sources = [from_log.log_source(text) for text in config.data.scenes]
-        rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple, kind.points_alone)
+        rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple, model.points_alone)
         counts = ranks.leader_does(lambda: learn_clips.make_log_clips(given, rules, folder))
         config = learn_clips.for_logs(config, rules, *counts)
         about_data = learn_clips.describe_logs(config, rules)
     elif ranks.leads:
-        making = learn_clips.MakingClips(config, folder, kind.points_alone)
+        making = learn_clips.MakingClips(config, folder, model.points_alone)
     with making:
         if "codec" in fresh and isinstance(model, MDM):
             ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16))

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from mudg.base import log, seeds
 from mudg.base.errors import UsageError
 from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.models.mdm.model import MDM, MDMConfig, extended, same_denoiser
+from mudg.models.published.files import is_published
 from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import published as learn_published
@@ -36,14 +37,12 @@ class ModelKind:
     card    (model, settings, scores, sentence on the training data) -> text of the model card
     rebuilt (model, weights of its trained part) -> a model with these, ready for use
     drops_reference  the model's own loss leaves references out: clips come with theirs
-    points_alone     the condition is the published system's: points, and 0 where nothing was seen
     """
 
     save: Callable[[Any, Path, str, Mapping[str, Any]], None]
     card: Callable[[Any, LearnConfig, Mapping[str, Any], str], str]
     rebuilt: Callable[[Any, Mapping[str, Tensor]], Any]
     drops_reference: bool = False
-    points_alone: bool = False
 
 
 def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
@@ -56,9 +55,7 @@ def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
 
 KINDS: dict[type[nn.Module], ModelKind] = {
     MDM: ModelKind(mdm_files.save, learn_score.model_card, mdm_rebuilt),
-    PublishedMDM: ModelKind(
-        learn_published.save, learn_published.card, learn_published.rebuilt, drops_reference=True, points_alone=True
-    ),
+    PublishedMDM: ModelKind(learn_published.save, learn_published.card, learn_published.rebuilt, drops_reference=True),
 }
 
 
@@ -76,9 +73,8 @@ def kind_of(model: nn.Module) -> ModelKind:
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
 
-    With `start` the network is that of the earlier model, grown by a refiner and given classes where the settings ask for
-    them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
-    size and length than before.
+    With `start` the network is that of the earlier model, extended by a refiner where the settings ask for one. If the settings do
+    not describe that network but are the defaults, it is taken as it is. Clips may be of another size and length than before.
 
     Raises:
         UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.

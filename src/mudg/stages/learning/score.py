@@ -48,7 +48,7 @@ def score(
     """Generate all clips of some cities and compare with the truth.
 
     Args:
-        sampling: what `model.sample` takes besides the condition and the index; `steps` at least.
+        request: how clips are sampled; the index is put in for each.
         prepare: changes each clip before it is used, for example `without_classes`.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}. Keys as in
