@@ -127,11 +127,11 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
 def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tuple[int, int]:
     """Make the missing clips of all logs; returns how many there are to train on and to score."""
     sources = [from_log.log_source(text) for text in config.data.scenes]
-    rows, counts = from_log.plan(sources, rules, from_city.HELD_OUT)
-    from_log.claim(folder, rules, sources)
+    rows = from_log.plan_shards(sources, rules, from_city.HELD_OUT)
+    from_log.claim_folder(folder, rules, sources)
     jobs: list[tuple[LogSource, LogClipRules, list[tuple[int, LogWindow]], Path]] = []
     for source in dict.fromkeys(sources):
-        windows = [(n, w) for n, of, w in rows if of == source]
+        windows = [(number, window) for number, owner, window in rows if owner == source]
         jobs.append((source, rules, windows, folder))
     with log.task("clips of logs", len(jobs)) as bar:
         if config.compute.workers < 2 or len(jobs) == 1:
@@ -144,7 +144,8 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
                 for future in [pool.submit(from_log.write_log, *job) for job in jobs]:
                     future.result()
                     bar.advance()
-    return counts.train, counts.held_out
+    scored = sum(window.held_out for _, _, window in rows)
+    return len(rows) - scored, scored
 
 
 def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) -> LearnConfig:
