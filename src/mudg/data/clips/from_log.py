@@ -1,6 +1,6 @@
 """Training clips from recorded logs: a scene, its fused cloud, and whatever labels it has.
 
-A clip is a window of consecutive frames of one camera, looked at from where they were recorded:
+A clip is a window of consecutive frames of one camera, seen from where they were recorded:
 
 * **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured (and the depth labels of
   the scene, where there are such); classes where labels exist and are trusted;
@@ -58,7 +58,7 @@ class LogClipRules:
     frame_step: int = 1
     """Take every n-th frame only."""
     cameras: tuple[str, ...] = ()
-    """Cameras to look through (empty = all of the scene)."""
+    """Cameras to take clips from (empty = all of the scene)."""
     held_out_every: int = 5
     """Every n-th window is for scoring (0 = none)."""
     farthest: int = 4

@@ -44,7 +44,7 @@ def cities_in_use(config: LearnConfig, step: int) -> int:
 
 
 def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.CityClipRules:
-    """What the generator is asked for; `points_alone`: the published system's condition."""
+    """Rules for the generator; `points_alone`: the published system's condition."""
     data = config.data
     return from_city.CityClipRules(
         data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone
@@ -169,7 +169,7 @@ def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
     given = "the projected points and the first image" if rules.published else "images taken at other times"
     return (
         f"{config.data.cities} clips of {config.data.window} frames of {len(config.data.scenes)} recorded "
-        f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, looked at from where they were\n"
+        f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where they were\n"
         f"recorded, with {given} as condition. Depth was learned where a sweep measured it. The model this\n"
         f"one continues from has training data of its own. `held-out` below means every {config.data.held_out_every}. window of these logs."
     )
