@@ -122,8 +122,8 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: store.
         made = kind.rebuilt(model, weights)
         if isinstance(made, MDM) and made.refiner is not None and config.loss.class_balance:
             made.refiner.take_back(_class_weights(config, folder))
-        sampling = {"steps": config.score.steps, "seed": config.seed, "bf16": bf16}
-        scores = learn_score.score(made, learn_clips.scored_shards(config), folder, sampling)
+        request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
+        scores = learn_score.score(made, learn_clips.scored_shards(config), folder, request)
         store.write_json(out / "metrics.json", scores)
         facts: dict[str, Any] = {"recipe": to_dict(given), "held_out": scores}
         if config.start:
