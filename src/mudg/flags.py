@@ -166,8 +166,8 @@ class Score(Output):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(Output):
-    """Flags of ``mudg run``."""
+class RunOwn(Output):
+    """Flags of ``mudg run`` without the settings of the steps."""
 
     source: Positional[str]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
@@ -179,12 +179,18 @@ class Run(Output):
     """Cameras to move sideways (not given: the first one)."""
     shifts_m: tuple[float, ...] = ()
     """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(RunOwn):
+    """Flags of ``mudg run``."""
+
     settings: Annotated[stage_config.RunConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Output):
-    """Flags of ``mudg demo``."""
+class DemoOwn(Output):
+    """Flags of ``mudg demo`` without the settings of the steps."""
 
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("mudg_demo")
     """Folder to write. Repeat the same command to continue an interrupted demo."""
@@ -194,6 +200,12 @@ class Demo(Output):
     """Seed of the city and of every random draw in the chain (not given: city 3, draws 0, or what --config says)."""
     shifts_m: tuple[float, ...] = ()
     """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(DemoOwn):
+    """Flags of ``mudg demo``."""
+
     settings: Annotated[stage_config.RunConfig, arg(name="")]
 
 
@@ -219,6 +231,9 @@ FLAGS: dict[str, type[Common]] = {
     "convert": Convert, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
 }  # fmt: skip
 
+CHAINS: dict[str, type[Common]] = {"demo": DemoOwn, "run": RunOwn}
+"""Commands that run several steps: what their --help lists. Some 200 settings of the steps are listed by --help-all."""
+
 
 def parse(verb: str, words: Sequence[str], description: str) -> Common:
     """Turn the words after ``mudg VERB`` into that verb's flags.
@@ -227,6 +242,10 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
         UsageError: unknown or invalid setting. InputError: --config cannot be read.
         SystemExit: --help (0), or a flag that does not exist or fit (2); it has been said already.
     """
+    if verb in CHAINS and {"-h", "--help"} & set(words):
+        return _own_help(verb, description)
+    if verb in CHAINS:
+        words = ["--help" if word == "--help-all" else word for word in words]
     flags = FLAGS[verb]
     kind = get_type_hints(flags).get("settings")
     default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(kind, words))
@@ -240,6 +259,16 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
             "a flag's value is not valid", where=f"--{field}", expected=first["msg"], got=repr(first.get("input"))[:120],
             remedy=f"see mudg {verb} --help",
         ) from error  # fmt: skip
+
+
+def _own_help(verb: str, description: str) -> Common:
+    """Print the flags of a chain itself, and where those of its steps are listed."""
+    note = (
+        f"Every setting of a step is a flag, too, with the step's name before it: --fit.iterations 3000, --ingest.resolution 960.\n"
+        f"They are listed by mudg {verb} --help-all, and without that name by mudg fit --help and so on."
+    )
+    _explain(CHAINS[verb], {})
+    return tyro.cli(CHAINS[verb], args=["--help"], prog=f"mudg {verb}", description=f"{description}\n\n{note}")
 
 
 def _settings(kind: type[Any], words: Sequence[str]) -> Any:
