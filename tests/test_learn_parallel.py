@@ -22,7 +22,7 @@ from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
 from mudg.stages.learning import parallel as learn_parallel
 from mudg.stages.learning.parallel import Ranks
-from mudg.stages.learning.state import RowFiles, TrainingState
+from mudg.stages.learning.state import TrainingState, read_rows
 
 SAME = 2e-6
 """Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows it)."""
@@ -187,15 +187,15 @@ def test_rows_of_any_cut_are_put_together(tmp_path):
         store.atomic_write(tmp_path / f"net.{rank:04d}.safetensors", save({"w": value[start:stop].contiguous()}))
         store.write_json(tmp_path / f"net.{rank:04d}.json", {"w": {"shape": [10, 3], "start": start}})
     got = torch.zeros(10, 3)
-    RowFiles(tmp_path, "net").read_into("w", got)
+    read_rows(tmp_path, "net", {"w": got})
     assert torch.equal(got, value)
     with pytest.raises(IntegrityError, match="does not fit"):
-        RowFiles(tmp_path, "net").read_into("w", torch.zeros(9, 3))
+        read_rows(tmp_path, "net", {"w": torch.zeros(9, 3)})
     with pytest.raises(IntegrityError, match="does not fit"):
-        RowFiles(tmp_path, "net").read_into("v", got)
+        read_rows(tmp_path, "net", {"v": got})
     (tmp_path / "net.0001.json").unlink()
     with pytest.raises(IntegrityError, match="rows"):
-        RowFiles(tmp_path, "net").read_into("w", got)
+        read_rows(tmp_path, "net", {"w": got})
 
 
 def test_a_term_that_is_not_finite_is_named():

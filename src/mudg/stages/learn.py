@@ -173,7 +173,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     )  # fmt: skip
     average = None
     if rules.average_decay:
-        average = {k: parallel.local(v).detach().clone() for k, v in trained.state_dict().items()}
+        average = {name: value.detach().clone() for name, value in trained.state_dict().items()}
     state = TrainingState(trained, optimizer, average)
     if state.resume(out, ranks):
         log.info(f"learn: continues at step {state.step}")

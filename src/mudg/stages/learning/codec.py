@@ -18,7 +18,7 @@ from mudg.stages.config import LearnConfig
 from mudg.stages.learning.clips import draw_clips
 from mudg.stages.learning.models import draw_weights
 from mudg.stages.learning.parallel import Ranks, agreed_terms
-from mudg.stages.learning.state import TrainingState, load_weights, mean_of, newest
+from mudg.stages.learning.state import TrainingState, mean_of, newest, read_rows
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 LEARNING_RATE = 2e-3
@@ -65,7 +65,7 @@ def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
     if saved is None:
         raise ResourceError("the trained codec is not where the leader wrote it", where=str(out / "codec"),
                             remedy="give an --out on a file system that all processes see")  # fmt: skip
-    load_weights(nn.ModuleDict({"codec": codec}), saved.path)
+    read_rows(saved.path, "net", nn.ModuleDict({"codec": codec}).state_dict())
 
 
 def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:

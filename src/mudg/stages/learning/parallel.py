@@ -254,12 +254,8 @@ def _stored_plainly(part: nn.Module) -> None:
             value.data = value.data.contiguous()
 
 
-def local(value: Tensor) -> Tensor:
-    """This process's piece of a sharded tensor; any other tensor as it is. Shares memory."""
-    return value.to_local() if _is_sharded(value) else value  # type: ignore[attr-defined]
-
-
-def _is_sharded(value: Tensor) -> bool:
+def is_sharded(value: Tensor) -> bool:
+    """Whether this process holds a piece of the tensor only."""
     if not dist.is_available() or not dist.is_initialized():
         return False
     from torch.distributed.tensor import DTensor
@@ -267,18 +263,20 @@ def _is_sharded(value: Tensor) -> bool:
     return isinstance(value, DTensor)
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Which rows of a whole tensor a piece holds: `start` to `start + len(piece)` of `shape`."""
-
-    shape: tuple[int, ...]
-    start: int
+def local(value: Tensor) -> Tensor:
+    """This process's piece of a sharded tensor; any other tensor as it is. Shares memory."""
+    return value.to_local() if is_sharded(value) else value  # type: ignore[attr-defined]
 
 
-def rows_of(value: Tensor) -> Rows:
-    """The rows that this process holds of `value`."""
-    if not _is_sharded(value):
-        return Rows(tuple(value.shape), 0)
+def gathered(value: Tensor) -> Tensor:
+    """The whole of a tensor, sharded or not, on the CPU of every process. All processes must call this together."""
+    return (value.full_tensor() if is_sharded(value) else value).detach().cpu()  # type: ignore[attr-defined]
+
+
+def first_row(value: Tensor) -> int:
+    """Which row of the whole tensor `local(value)` begins with."""
+    if not is_sharded(value):
+        return 0
     from torch.distributed.tensor.placement_types import Shard
 
     (placement,) = value.placements  # type: ignore[attr-defined]
@@ -287,25 +285,13 @@ def rows_of(value: Tensor) -> Rows:
             "a tensor is cut in a way that checkpoints do not know", expected="Shard(0)", got=str(placement)
         )
     per_rank = -(-value.shape[0] // value.device_mesh.size())  # type: ignore[attr-defined]
-    start = min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]
-    return Rows(tuple(value.shape), start)
-
-
-def gathered(piece: Tensor, like: Tensor) -> Tensor:
-    """The whole tensor on the CPU, in every process, of which `piece` is this process's part, cut as `like` is."""
-    if not _is_sharded(like):
-        return piece.detach().cpu()
-    from torch.distributed.tensor import DTensor
-
-    mesh, cut = like.device_mesh, like.placements  # type: ignore[attr-defined]
-    shape, stride = like.shape, like.stride()
-    return DTensor.from_local(piece, mesh, cut, run_check=False, shape=shape, stride=stride).full_tensor().cpu()
+    return min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]
 
 
 def clip_gradients(part: nn.Module, limit: float) -> float:
     """Norm of all gradients over all processes; they are scaled down to `limit` if that is not 0."""
     norm = torch.nn.utils.clip_grad_norm_(part.parameters(), limit or float("inf"))
-    return float(norm.full_tensor() if _is_sharded(norm) else norm)  # type: ignore[attr-defined]
+    return float(gathered(norm))
 
 
 # a step's end ---------------------------------------------------------------------------------------------------------
