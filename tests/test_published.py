@@ -395,7 +395,7 @@ def test_loss_is_the_velocity_error_and_repeats(model):
     losses = model.velocity_loss(truth, encoded, torch.Generator().manual_seed(0))
     model.predict = original
     x0 = torch.stack([truth[m][n] for n, m in enumerate(seen["names"])])
-    alpha, sigma = model.schedule.at(seen["t"], 5)
+    alpha, sigma = model.schedule.alpha_sigma(seen["t"], 5)
     scale = model.schedule.scale[seen["t"]].view(-1, 1, 1, 1, 1)
     eps = (seen["x"] - alpha * scale * x0) / sigma
     wanted = (alpha * eps - sigma * scale * x0).square().mean()

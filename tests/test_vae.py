@@ -48,7 +48,7 @@ def test_depth_survives_the_codec_exactly():
 def test_colour_basis_keeps_smooth_images_and_whitens():
     codec = PatchCodec(CodecConfig()).eval()
     images = smooth_images(40)
-    codec.fit_colour(images)
+    codec.fit_color(images)
     z = codec.encode_rgb(images)
     assert z.shape == (40, 4, 8, 12)
     deviation = z.std((0, 2, 3))
@@ -61,7 +61,7 @@ def test_colour_basis_keeps_smooth_images_and_whitens():
 
 def test_colour_latent_is_blind_to_nothing_constant():
     codec = PatchCodec(CodecConfig()).eval()
-    codec.fit_colour(smooth_images(40))
+    codec.fit_color(smooth_images(40))
     flat = torch.tensor([0.2, 0.5, 0.8]).view(1, 3, 1, 1).expand(1, 3, 16, 24)
     with torch.no_grad():
         back = decoded(codec, rgb=codec.encode_rgb(flat)).rgb

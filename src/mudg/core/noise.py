@@ -26,9 +26,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mudg.base.errors import NumericsError, UsageError
+from mudg.base.errors import UsageError
 
-Prediction = Literal["x0", "v", "eps"]
+Prediction = Literal["x0", "v"]
+"""What a network states: the clean data, or the velocity."""
 
 RESCALE_STEPS = 400
 """Number of steps over which the dynamic rescale falls from 1 to its base value."""
@@ -79,7 +80,7 @@ class Schedule:
     def __len__(self) -> int:
         return self.config.steps
 
-    def at(self, t: Tensor, ndim: int) -> tuple[Tensor, Tensor]:
+    def alpha_sigma(self, t: Tensor, ndim: int) -> tuple[Tensor, Tensor]:
         """alpha and sigma of steps `t` i64[B], shaped [B,1,...] with `ndim` axes for broadcasting."""
         shape = (-1,) + (1,) * (ndim - 1)
         where = t.to(self.alpha.device)
@@ -92,13 +93,13 @@ class Schedule:
 
     def add_noise(self, x0: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """x_t of `x0` [B,...] with `noise` of the same shape at steps `t` i64[B]; applies the dynamic rescale."""
-        alpha, sigma = self.at(t, x0.ndim)
+        alpha, sigma = self.alpha_sigma(t, x0.ndim)
         scale = self.scale[t.cpu()].view(alpha.shape).to(x0.device)
         return alpha * scale * x0 + sigma * noise
 
     def velocity(self, x0: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """v-target of training at steps `t`; `x0` is multiplied by the dynamic rescale first."""
-        alpha, sigma = self.at(t, x0.ndim)
+        alpha, sigma = self.alpha_sigma(t, x0.ndim)
         scale = self.scale[t.cpu()].view(alpha.shape).to(x0.device)
         return alpha * noise - sigma * scale * x0
 
@@ -107,23 +108,13 @@ def x0_and_eps(x: Tensor, output: Tensor, alpha: Tensor, sigma: Tensor, predicti
     """Clean data and noise implied by a network output at one noise level.
 
     `x`, `output` [B,...]; `alpha`, `sigma` broadcastable. With `prediction="x0"` the noise is (x - alpha x0) / sigma, with
-    sigma floored at 1e-4; with "eps" the data is (x - sigma eps) / alpha, which is undefined at zero terminal SNR.
+    sigma floored at 1e-4.
     """
     if prediction == "v":
         return alpha * x - sigma * output, alpha * output + sigma * x
     if prediction == "x0":
         return output, (x - alpha * output) / sigma.clamp(min=1e-4)
-    if prediction == "eps":
-        if bool((alpha <= 0).any()):
-            raise NumericsError(
-                "noise prediction cannot recover the data where no signal is left",
-                where="noise.x0_and_eps",
-                expected="alpha > 0",
-                got="alpha = 0",
-                remedy="predict v or x0, or switch zero_terminal_snr off",
-            )
-        return (x - sigma * output) / alpha, output
-    raise UsageError("unknown prediction type", expected="x0, v or eps", got=str(prediction))
+    raise UsageError("unknown prediction type", expected="x0 or v", got=str(prediction))
 
 
 def loss_weight(schedule: Schedule, t: Tensor, clip: float = 5.0, floor: float = 1.0) -> Tensor:

@@ -103,7 +103,7 @@ class DecoderBlock(nn.Module):
 class PatchCodec(nn.Module):
     """Codec of the embedded model: linear 2x2 patches, 4 channels for colour and depth, class shares for semantics.
 
-    The colour basis is fitted once by `fit_colour`; the decoder is trained by the `learn` verb on the three latents
+    The colour basis is fitted once by `fit_color`; the decoder is trained by the `learn` verb on the three latents
     together, so that edges agree between modalities; a missing modality is fed as zeros (it is trained with such
     omissions). Depth keeps all four patch values, so its linear part loses nothing.
     """
@@ -138,7 +138,7 @@ class PatchCodec(nn.Module):
     # linear parts -----------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def fit_colour(self, rgb: Tensor) -> None:
+    def fit_color(self, rgb: Tensor) -> None:
         """Fit the colour basis (principal components of 2x2 patches) on images f32[N,3,H,W] in [0,1].
 
         The two detail channels are scaled down by a further 1.5, so that they do not take a quarter of the loss.

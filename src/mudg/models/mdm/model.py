@@ -108,7 +108,7 @@ class LossSettings:
 
 
 @dataclass(frozen=True)
-class Truth:
+class EncodedTruth:
     """Encoded truth of a batch: latents [B,T,C,h,w]; class shares [B,T,19,h,w]; depth_known f32[B,T,1,h,w], share of the cell with
     valid depth; and all of it at pixel resolution."""
 
@@ -178,9 +178,7 @@ class MDM(nn.Module):
         unknown classes.
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
-        color, depth, valid, reference = (
-            torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth", "valid", "reference")
-        )
+        color, depth, valid = (torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth", "valid"))
         warped = torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch])
         backdrop = torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch])
         unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
@@ -258,7 +256,7 @@ class MDM(nn.Module):
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
 
-    def encode_truth(self, clips: Sequence[Clip]) -> Truth:
+    def encode_truth(self, clips: Sequence[Clip]) -> EncodedTruth:
         """What `loss` compares with."""
         rgb, depth, valid, ids = (
             torch.stack([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
@@ -271,7 +269,7 @@ class MDM(nn.Module):
         code = self.codec.linear_depth_code(depth)
         pixels = PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), ids.flatten(0, 1), known)
         cells = functional.avg_pool2d(known, self.codec.factor).unflatten(0, valid.shape[:2])
-        return Truth(latents, semantic_shares(ids), cells, pixels)
+        return EncodedTruth(latents, semantic_shares(ids), cells, pixels)
 
     def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
         """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""

@@ -33,7 +33,7 @@ def train_codec(codec: PatchCodec, config: LearnConfig, run_dir: store.RunDir, f
     if not state.resume(out, ALONE):
         draw_weights(codec, config.seed, "codec weights")
         batches = [draw_clips(config, folder, n, FIT_IMAGES, 1, "codec fit") for n in range(config.codec.fit_batches)]
-        codec.fit_colour(torch.cat([clip.rgb for batch in batches for clip in batch]))
+        codec.fit_color(torch.cat([clip.rgb for batch in batches for clip in batch]))
         codec.fit_depth(torch.cat([clip.depth for batch in batches for clip in batch]))
     recent: list[dict[str, float]] = []
     with log.task("codec", steps, state.step) as bar:
