@@ -164,7 +164,8 @@ def test_the_recipes_of_the_shipped_models_are_settings_files(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new"), [({"lr": 1e-4}, "optimizer.lr"), ({"cities": 3}, "data.cities"), ({"cache_latents": True}, "removed")]
+    ("old", "new"),
+    [({"lr": 1e-4}, "optimizer.lr"), ({"cities": 3}, "data.cities"), ({"cache_latents": True}, "removed")],
 )
 def test_settings_by_their_old_names_are_refused_with_the_new_ones(old, new, tmp_path):
     (tmp_path / "old.yaml").write_text(yaml.safe_dump(old))

@@ -142,7 +142,9 @@ def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
     config = tiny(clips, reference_dropout=0.5)
     everything = learn_clips.draw_clips(config, clips, 7, 4, 2, "batch")
     for part in (slice(0, 1), slice(1, 3), slice(3, 4)):
-        for own, clip in zip(learn_clips.draw_clips(config, clips, 7, 4, 2, "batch", part), everything[part], strict=True):
+        for own, clip in zip(
+            learn_clips.draw_clips(config, clips, 7, 4, 2, "batch", part), everything[part], strict=True
+        ):
             assert torch.equal(own.rgb, clip.rgb)
             assert torch.equal(own.condition.semantics, clip.condition.semantics)
             assert torch.equal(own.condition.reference, clip.condition.reference)

@@ -195,7 +195,9 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
     for wrong in ({"window": 8}, {"full_window_share": 0.5}):
-        with pytest.raises(UsageError, match=r"exactly the length(.|\n)*--data.window 4 --optimizer.full-window-share 1"):
+        with pytest.raises(
+            UsageError, match=r"exactly the length(.|\n)*--data.window 4 --optimizer.full-window-share 1"
+        ):
             learn.run(published_settings(converted, clips, **wrong), tmp_path / "run")
     with pytest.raises(UsageError, match="multiples of 4"):
         learn.run(published_settings(converted, clips, width=50), tmp_path / "run")

@@ -119,9 +119,7 @@ def test_a_view_never_sees_its_own_image(log, tmp_path):
 def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
     opened = from_log.OpenLog(measured[1], replace(RULES, width=64, height=32))
     window = from_log.log_windows(opened.scene, RULES)[0]
-    clip_shards.write_shard(
-        tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], gaps=True)
-    )
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], gaps=True))
     model = MDM(learn_models.model_config(tiny(tmp_path, width=64, height=32, window=3)))
     clip = clip_shards.read_clip(tmp_path, 0, 0, range(3))
     assert not bool(clip.depth_valid.all())
@@ -129,7 +127,9 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
     def term(depth, known):
         filled = replace(clip, depth=torch.where(known, clip.depth, depth))
         truth = model.encode_truth([filled]).pixels
-        return float(losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0))
+        return float(
+            losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0)
+        )
 
     assert term(torch.tensor(3.0), clip.depth_valid) == term(torch.tensor(90.0), clip.depth_valid)
     assert term(torch.tensor(3.0), ~clip.depth_valid) != term(torch.tensor(90.0), ~clip.depth_valid)

@@ -19,6 +19,7 @@ import contextlib
 import importlib.util
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -192,8 +193,8 @@ def _train_network(
     settings = LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)
     board = _tensorboard(run_dir.path / "tensorboard") if config.compute.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.compute.parallel}
-    kind = kind_of(model)
-    drawn = replace(config, data=replace(config.data, reference_dropout=0.0)) if kind.drops_reference else config
+    drops = kind_of(model).drops_reference
+    drawn = replace(config, data=replace(config.data, reference_dropout=0.0)) if drops else config
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
     with log.task("network", config.steps, begun) as bar, Interruption() as interruption:
@@ -234,7 +235,7 @@ def _train_network(
                 saved_at = done
             if done % config.score.every == 0 or last:
                 made = state.export_weights(ranks)
-                ranks.leader_does(lambda: _score_watched(kind.rebuilt(model, made), config, run_dir, folder, done, bf16))  # noqa: B023
+                ranks.leader_does(partial(_score_watched, model, made, config, run_dir, folder, done, bf16))
             if stop and not last:
                 log.info(f"learn: stopped after step {saved_at}, which is saved")
                 interruption.end()
@@ -258,11 +259,20 @@ def _tensorboard(folder: Path) -> Any:
     return SummaryWriter(str(folder))
 
 
-def _score_watched(model: Model, config: LearnConfig, run_dir: store.RunDir, folder: Path, step: int, bf16: bool) -> None:
-    """Score a model on a few held-out clips and draw a grid of what it makes."""
+def _score_watched(
+    model: Model,
+    weights: dict[str, Tensor],
+    config: LearnConfig,
+    run_dir: store.RunDir,
+    folder: Path,
+    step: int,
+    bf16: bool,
+) -> None:
+    """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
+    made = kind_of(model).rebuilt(model, weights)
     shards = learn_clips.scored_shards(config)[: config.score.watched]
     request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
     picture = run_dir.path / "samples" / f"{step:07d}.png"
-    scores = learn_score.score(model, shards, folder, request, picture=picture)
+    scores = learn_score.score(made, shards, folder, request, picture=picture)
     run_dir.log(step=step, held_out=scores["average"])
     log.info(f"step {step}\n{learn_score.table(scores)}")

@@ -410,4 +410,6 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
     unknown = np.uint8(palette.UNLABELLED)
     ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
     table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
-    return ProjectedPoints(seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()])
+    return ProjectedPoints(
+        seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()]
+    )

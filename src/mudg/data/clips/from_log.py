@@ -198,7 +198,9 @@ def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int)
     return _stacked(parts), images
 
 
-def _published_condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int) -> tuple[Condition, dict[int, Photo]]:
+def _published_condition(
+    log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int
+) -> tuple[Condition, dict[int, Photo]]:
     """What the published model is given; no image but the reference, the first frame's own, has a part in it."""
     del gap
     rules = log.rules
@@ -283,7 +285,9 @@ def _measured(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np
 # files ----------------------------------------------------------------------------------------------------------------
 
 
-def plan_shards(sources: Sequence[LogSource], rules: LogClipRules, first_held_out: int) -> list[tuple[int, LogSource, LogWindow]]:
+def plan_shards(
+    sources: Sequence[LogSource], rules: LogClipRules, first_held_out: int
+) -> list[tuple[int, LogSource, LogWindow]]:
     """What shards there will be, one clip each: (number, log, window); numbers from 0 to train on, from `first_held_out` to score.
 
     Raises:

@@ -161,7 +161,9 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
         return (middle + contrast * (x - middle)).clamp(0, 1)
 
     rgb = curve(clip.rgb, 1.0)
-    varied: dict[str, Tensor] = {name: curve(getattr(given, name), error) for name in ("color", "backdrop", "reference")}
+    varied: dict[str, Tensor] = {
+        name: curve(getattr(given, name), error) for name in ("color", "backdrop", "reference")
+    }
     varied["semantics"], varied["backdrop_semantics"] = _worse_ids(given.semantics, given.backdrop_semantics, rng)
     if rng.random() >= 0.5:
         return replace(clip, rgb=rgb, condition=replace(given, **varied))

@@ -222,9 +222,9 @@ def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
         await_shard(folder, city)
         ids = clip_shards.read_clip(folder, city, 0, range(1)).semantics
         counts += torch.bincount(ids.flatten(), minlength=256)
-    if not bool(counts[: CLASSES].any()):  # logs without labels
+    if not bool(counts[:CLASSES].any()):  # logs without labels
         return torch.ones(CLASSES)
-    share = counts[: CLASSES] / counts[: CLASSES].sum().clamp(min=1)
+    share = counts[:CLASSES] / counts[:CLASSES].sum().clamp(min=1)
     floor = max(float(share[share > 0].min()) if bool((share > 0).any()) else 1.0, 1e-3)
     weight = share.clamp(min=floor) ** -balance
     return (weight / (weight * share).sum().clamp(min=1e-9)).float()

@@ -92,7 +92,9 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
     parts = {
         "rgb": losses.image_error((made_rgb - (rgb * 2 - 1)) * keep[0], square=0.5, gradient=0.25),
         "depth": ((made_depth - target) * keep[1] * known).abs().mean(),
-        "semantics": functional.cross_entropy(scores, ids, ignore_index=palette.UNLABELLED) if labelled else scores.sum() * 0,
+        "semantics": functional.cross_entropy(scores, ids, ignore_index=palette.UNLABELLED)
+        if labelled
+        else scores.sum() * 0,
     }
     loss = parts["rgb"] + parts["depth"] + 0.1 * parts["semantics"]
     return loss, {name: float(part.detach()) for name, part in parts.items()}

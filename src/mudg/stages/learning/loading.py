@@ -38,7 +38,9 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
     if published:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
     if config.memory_budget_gb:
-        raise UsageError("only the work of a published-type model is cut", where="--memory-budget-gb", remedy="leave it out")
+        raise UsageError(
+            "only the work of a published-type model is cut", where="--memory-budget-gb", remedy="leave it out"
+        )
     mdm_files.load(config.model)  # fails now rather than in every process
     return config
 
@@ -78,7 +80,9 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
 
 def _fitting(model: PublishedMDM, budget_gb: float, bytes_per_value: int, guided: bool) -> WorkSplit:
     """How the model's work is cut to fit a memory budget in GB."""
-    split, peak_bytes = memory_plan.choose(memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=guided)
+    split, peak_bytes = memory_plan.choose(
+        memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=guided
+    )
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(
             "the model does not fit into the memory budget however its work is cut", where="--memory-budget-gb",
