@@ -250,7 +250,7 @@ RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
         only(lambda r: kitti_frame(r, label_number=11)), "class that does not exist", r"instances\[0\]"),
     ("nuscenes", "Windows path"): (nuscenes("sample_data", backslashes), "backslash", "sample_data.json: record"),
     ("nuplan", "Windows path"): (
-        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"), "leads out of", "image at"),
+        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"), "backslash", "image at"),
     ("nuplan", "width and length swapped"): (nuplan("UPDATE lidar_box SET width = length, length = width"), "swapped", "lidar_box"),
     ("dgp", "Windows path"): (
         dgp("scene_abc.json", lambda r: [

@@ -59,7 +59,7 @@ def test_moving_instances_are_those_of_the_generator():
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     judged = set(city_logs.moving_instances(world))
     still = {
-        number for number, mover in enumerate(world.movers, start=1) if np.ptp(mover.keys[:, :2], axis=0).max() == 0
+        number for number, posed in enumerate(world.objects, start=1) if np.ptp(posed.keys[:, :2], axis=0).max() == 0
     }
     assert judged
     assert not judged & still

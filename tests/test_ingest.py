@@ -152,7 +152,7 @@ def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -
     with pytest.raises(UsageError, match="another configuration") as caught:
         ingest.run(config, root, out)
     assert "input 'source' changed" in caught.value.got
-    listed = files_of("kitti", root, ImportOptions(sequence="0003")).whole
+    listed = files_of("kitti", root, ImportOptions(sequence="0003")).files
     assert {path.relative_to(root).as_posix() for path in listed} == {
         "image_02/0003", "velodyne/0003", "label_02/0003.txt", "calib/0003.txt", "oxts/0003.txt",
     }  # fmt: skip
@@ -168,7 +168,7 @@ def test_of_large_releases_the_tables_and_the_names_of_files_count(tmp_path: Pat
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("[]")
     found = files_of("nuscenes", tmp_path, ImportOptions())
-    assert [path.name for path in found.whole] == ["sample_data.json", "scene.json"]
+    assert [path.name for path in found.files] == ["sample_data.json", "scene.json"]
     assert [path.name for path in found.entries] == ["CAM_FRONT", "LIDAR_TOP"]
     before = ingest.source_digest(tmp_path, "nuscenes", IngestConfig())
     assert ingest.source_digest(tmp_path, "nuscenes", IngestConfig()) == before

@@ -74,7 +74,7 @@ def test_windows_to_score_share_no_moment_with_those_to_train_on(log):
     with pytest.raises(InputError, match="too short"):
         from_log.log_windows(scene, LogClipRules(48, 24, window=30))
     with pytest.raises(InputError, match="too short to hold out"):
-        from_log.plan([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
+        from_log.plan_shards([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
 
 
 def test_truth_is_what_was_recorded(measured):
@@ -161,6 +161,6 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     facts = json.loads((made / "model.json").read_text())["facts"]
     assert facts["recipe"]["data"]["scenes"] == [str(run)]
     with pytest.raises(UsageError, match="other logs or settings"):
-        from_log.claim(made.parent / "clips", RULES, [log[1]])
+        from_log.claim_folder(made.parent / "clips", RULES, [log[1]])
     with pytest.raises(InputError, match="no scene with a fused cloud"):
         learn.run(tiny("", start=str(first), scenes=(str(tmp_path),)), tmp_path / "none")

@@ -318,7 +318,7 @@ def test_point_times_follow_columns_or_azimuth(tmp_path: Path) -> None:
 
 
 def test_intrinsics_get_half_a_pixel() -> None:
-    camera = camera_from_intrinsics("front", 1600, 900, [[1266.4, 0, 816.3], [0, 1266.5, 491.5], [0, 0, 1]], "here")
+    camera = camera_from_intrinsics("front", (1600, 900), [[1266.4, 0, 816.3], [0, 1266.5, 491.5], [0, 0, 1]], "here")
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1266.4, 1266.5, 816.8, 492.0)
 
 

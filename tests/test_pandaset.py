@@ -298,7 +298,7 @@ def times_scaled(factor: float) -> Callable[[Path], None]:
         (points_table(lambda t: t.update(t=t["t"] * 1000)), "do not belong to their frame"),
         (points_table(lambda t: t.update(d=t["d"] + 2)), "LiDAR that does not exist"),
         (points_table(lambda t: t["z"].__setitem__(3, np.nan)), "not finite"),
-        (points_table(lambda t: t.update(x=["a"] * 40)), "not of numbers"),
+        (points_table(lambda t: t.update(x=["a"] * 40)), "does not hold numbers"),
         (box_table("dimensions.y", 0.0), "size makes no sense"),
         (box_table("dimensions.y", -3.0), "size makes no sense"),
         (box_table("dimensions.y", 4500.0), "size makes no sense"),

@@ -26,7 +26,6 @@ from mudg.stages.config import FitConfig
 from mudg.stages.fitting import start as fit_start
 from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.start import mirrored_points
-from mudg.stages.ingest import add_frame_copy, add_rest
 
 SIZE, FRAMES = (60, 40), 6
 EVERYTHING = {
@@ -49,9 +48,9 @@ def walker_cloud() -> PointCloud:
 
 def with_tracks(scene: Scene, tracks: tuple[Track, ...], out: Path) -> Scene:
     with SceneWriter(out, scene.id, scene.source) as writer:
-        add_rest(writer, replace(scene, tracks=tracks))
+        writer.copy_all_but_frames(replace(scene, tracks=tracks))
         for frame in scene.frames:
-            add_frame_copy(writer, scene, frame)
+            writer.copy_frame(scene, frame)
         return writer.finish()
 
 

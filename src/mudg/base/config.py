@@ -17,14 +17,15 @@ from typing import Any, TypeVar
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mudg.base.errors import InputError, UsageError
+from mudg.base.records import first_problem
 
 Config = TypeVar("Config")
 
 STRICT = ConfigDict(extra="forbid", defer_build=True)
 """Pass as ``@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)``.
 
-Validators are built at the first use: a command builds those of its own verb only. A default that is itself a configuration
-is therefore a ``default_factory``."""
+Validators are built at their first use: a command builds only those of its own verb. A default that is itself a
+configuration is therefore a ``default_factory``."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -62,18 +63,11 @@ def load(
 
 
 def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> Config:
-    """Validate plain values into ``config_type``; UsageError names the first wrong field."""
+    """Validate plain values as a ``config_type``; UsageError names the first wrong field."""
     try:
         return TypeAdapter(config_type).validate_python(dict(values))
     except ValidationError as error:
-        first = error.errors()[0]
-        path = ".".join(str(part) for part in first["loc"])
-        raise UsageError(
-            "a configuration value is not valid",
-            where=f"{where}: {path}",
-            expected=first["msg"],
-            got=repr(first.get("input"))[:120],
-        ) from error
+        raise first_problem(error, f"{where}: ", UsageError) from error
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -106,12 +100,9 @@ def _merge(
             raise _moved_error(f"{path}{name}", moved[name], where, path)
         if known and name not in known:
             near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
-            raise UsageError(
-                f"unknown configuration key {path}{name}",
-                where=where,
-                expected="one of " + ", ".join(known),
-                remedy=f"did you mean {path}{near[0]}?" if near else "remove it",
-            )
+            what, expected = f"unknown configuration key {path}{name}", "one of " + ", ".join(known)
+            remedy = f"did you mean {path}{near[0]}?" if near else "remove it"
+            raise UsageError(what, where=where, expected=expected, remedy=remedy)
         if is_group and is_mapping and isinstance(base.get(name), Mapping):
             merged[name] = _merge(base[name], value, where, group, f"{path}{name}.")
         else:

@@ -29,7 +29,7 @@ CAM_FROM_EGO_AXES.setflags(write=False)
 
 
 def rigid_problem(transform: ArrayLike, tolerance: float = 1e-4) -> str | None:
-    """Say in words why ``transform`` is not a rigid 4x4 motion, or return None if it is one."""
+    """Say why ``transform`` is not a rigid 4x4 motion within ``tolerance``, or return None if it is one."""
     matrix = np.asarray(transform)
     if matrix.shape != (4, 4):
         return f"shape {matrix.shape} instead of (4, 4)"
@@ -49,7 +49,7 @@ def rigid_problem(transform: ArrayLike, tolerance: float = 1e-4) -> str | None:
 
 
 def all_rigid(transforms: Matrix, tolerance: float = 1e-4) -> bool:
-    """Whether every one of f64[N, 4, 4] is rigid: ``rigid_problem`` for many at once, without the words."""
+    """Whether every one of f64[N, 4, 4] is rigid: ``rigid_problem`` for many at once, without the reason."""
     rotation = transforms[:, :3, :3]
     if not np.isfinite(transforms).all() or (np.abs(transforms[:, 3] - [0, 0, 0, 1]) > tolerance).any():
         return False
@@ -63,7 +63,7 @@ def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
 
 
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
-    """4x4 matrix from a 3x3 rotation and a translation of 3 metres-components."""
+    """f64[4, 4] from a rotation [3, 3] and a translation [3] in metres."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = translation
@@ -71,7 +71,7 @@ def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Ma
 
 
 def invert(transform: Matrix) -> Matrix:
-    """Inverse of rigid motions ``[..., 4, 4]``."""
+    """Inverse of rigid motions f64[..., 4, 4]."""
     rotation_t = np.swapaxes(transform[..., :3, :3], -1, -2)
     inverse = np.zeros_like(transform, dtype=np.float64)
     inverse[..., :3, :3] = rotation_t
@@ -90,7 +90,7 @@ def transform_points(a_from_b: Matrix, xyz_b: NDArray[Floating]) -> NDArray[Floa
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
-    """Rotation ``[3, 3]`` (or a rigid ``[4, 4]``) to a unit quaternion (w, x, y, z) with w >= 0."""
+    """Unit quaternion f64[4] (w, x, y, z) with w >= 0 of a rotation [3, 3] or a rigid motion [4, 4]."""
     r = np.asarray(rotation, np.float64)[:3, :3]
     four_squares = np.array(
         [1 + r[0, 0] + r[1, 1] + r[2, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2],
@@ -109,7 +109,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Matrix:
-    """Quaternion (w, x, y, z), normalised here, to a 3x3 rotation. A zero quaternion raises InputError."""
+    """Rotation f64[3, 3] of a quaternion (w, x, y, z), which is normalised here. InputError if it is zero or not finite."""
     q = np.asarray(quaternion, np.float64)
     norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or norm < 1e-12:
@@ -123,7 +123,7 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Matrix:
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, u: float) -> Matrix:
-    """Spherical interpolation of unit quaternions along the shorter arc; u = 0 gives q0, u = 1 gives +-q1."""
+    """Spherical interpolation f64[4] of quaternions along the shorter arc; u = 0 gives q0, u = 1 gives q1 or -q1."""
     a = np.asarray(q0, np.float64) / np.linalg.norm(q0)
     b = np.asarray(q1, np.float64) / np.linalg.norm(q1)
     cosine = float(a @ b)
@@ -137,13 +137,13 @@ def slerp(q0: ArrayLike, q1: ArrayLike, u: float) -> Matrix:
 
 
 def interpolate_pose(a_from_b0: Matrix, a_from_b1: Matrix, u: float) -> Matrix:
-    """Pose at fraction ``u`` in [0, 1] between two rigid poses: slerp of rotation, straight line of translation."""
+    """Pose f64[4, 4] at fraction ``u`` in [0, 1] between two rigid poses: slerp of rotation, linear in translation."""
     rotation = matrix_from_quaternion(slerp(quaternion_from_matrix(a_from_b0), quaternion_from_matrix(a_from_b1), u))
     return from_rotation_translation(rotation, (1 - u) * a_from_b0[:3, 3] + u * a_from_b1[:3, 3])
 
 
 def pose_at(times_s: NDArray[np.float64], poses: Matrix, time_s: float, tolerance_s: float = 1e-6) -> Matrix | None:
-    """Interpolate sorted pose keys at ``time_s``; None outside the span (never extrapolated), exact at the keys."""
+    """Interpolate pose keys f64[T, 4, 4] at ``time_s``; exact at the keys, None outside their span (never extrapolated)."""
     if len(times_s) == 0 or time_s < times_s[0] - tolerance_s or time_s > times_s[-1] + tolerance_s:
         return None
     after = int(np.searchsorted(times_s, time_s))
@@ -156,7 +156,7 @@ def pose_at(times_s: NDArray[np.float64], poses: Matrix, time_s: float, toleranc
 
 
 def yaw_matrix(yaw_rad: float, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
-    """4x4 rotation about z (counter-clockwise seen from above) followed by a translation in metres."""
+    """f64[4, 4]: a rotation about z (counter-clockwise seen from above), then a translation in metres."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return from_rotation_translation([[c, -s, 0], [s, c, 0], [0, 0, 1]], translation)
 

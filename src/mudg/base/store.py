@@ -399,7 +399,9 @@ class RunDir:
             state = read_json(state_file)
             # A run that failed before it made anything (a mistyped flag) is in nobody's way.
             other = state.get("key") != key
-            if other and (state.get("state") == "complete" or any(entry.name not in _OWN_FILES for entry in path.iterdir())):
+            if other and (
+                state.get("state") == "complete" or any(entry.name not in _OWN_FILES for entry in path.iterdir())
+            ):
                 cls._refuse_other(path, verb, config, inputs, state)
             if state.get("state") == "complete":
                 cls._verify_finished(path)

@@ -275,8 +275,8 @@ def make_log(job: LogJob) -> dict[str, Any]:
         films = [path.name for path in paths]
     facts = city_logs.facts(job.seed, job.rules)
     return {
-        "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.movers,
-        "mover_share": round(facts.mover_share, 4), "words": facts.words, "films": films, "values": found,
+        "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
+        "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": found,
         "seconds": _seconds(out),
     }  # fmt: skip
 

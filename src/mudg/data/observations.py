@@ -8,7 +8,7 @@ data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,42 +21,10 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, ObservationKind, View
+from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 1
-
-
-def camera_record(camera: Camera) -> dict[str, Any]:
-    """A camera as JSON values."""
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
-        "readout_s": camera.readout_s,
-    }
-
-
-def camera_from_record(record: Any, where: str) -> Camera:
-    """Inverse of ``camera_record``; InputError names ``where`` and the field."""
-    try:
-        return Camera(
-            name=str(record["name"]),
-            width=int(record["width"]),
-            height=int(record["height"]),
-            fx=float(record["fx"]),
-            fy=float(record["fy"]),
-            cx=float(record["cx"]),
-            cy=float(record["cy"]),
-            distortion=tuple(float(x) for x in record.get("distortion", ())),
-            readout_s=float(record.get("readout_s", 0.0)),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError("a camera record is incomplete or malformed", where=where, got=repr(error)) from error
 
 
 class ObservationWriter:
@@ -67,10 +35,7 @@ class ObservationWriter:
     """
 
     def __init__(self, out: Path, trajectory: str, source: str, kind: ObservationKind = "virtual") -> None:
-        self._out = Path(out)
-        self._trajectory = trajectory
-        self._source = source
-        self._kind = kind
+        self._out, self._trajectory, self._source, self._kind = Path(out), trajectory, source, kind
         self._records: list[dict[str, Any]] = []
         self.done = 0
         while (self._out / "data" / f"{self.done:06d}.safetensors").is_file():
@@ -104,7 +69,7 @@ class ObservationWriter:
     def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
         self._records.append(
             {
-                "camera": camera_record(view.camera),
+                "camera": {"name": view.camera.name, **camera_to_json(view.camera)},
                 "world_from_cam": view.world_from_cam.tolist(),
                 "time_s": view.time_s,
                 "depth": has_depth,
@@ -116,16 +81,8 @@ class ObservationWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None:
-            store.write_json(
-                self._out / _INDEX,
-                {
-                    "schema": _SCHEMA,
-                    "trajectory": self._trajectory,
-                    "source": self._source,
-                    "kind": self._kind,
-                    "observations": self._records,
-                },
-            )
+            head = {"schema": _SCHEMA, "trajectory": self._trajectory, "source": self._source, "kind": self._kind}
+            store.write_json(self._out / _INDEX, {**head, "observations": self._records})
 
 
 def _numpy(tensor: torch.Tensor, dtype: type[np.generic]) -> NDArray[Any]:
@@ -162,9 +119,8 @@ class ObservationSet:
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
-                raise InputError(
-                    "an observation file does not fit its view", where=f"{path}: {name}", expected=str(shape), got=got
-                )
+                raise InputError("an observation file does not fit its view", where=f"{path}: {name}",
+                    expected=str(shape), got=got)  # fmt: skip
         return Observation(
             view=view,
             rgb=torch.from_numpy(self.rgb_u8(index).copy()).permute(2, 0, 1).float() / 255,
@@ -183,12 +139,8 @@ def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
         with Image.open(io.BytesIO(content)) as image:
             if image.size != (camera.width, camera.height):
-                raise InputError(
-                    "an image has another size than its camera",
-                    where=str(path),
-                    expected=f"{camera.width}x{camera.height}",
-                    got=f"{image.size[0]}x{image.size[1]}",
-                )
+                raise InputError("an image has another size than its camera", where=str(path),
+                    expected=f"{camera.width}x{camera.height}", got=f"{image.size[0]}x{image.size[1]}")  # fmt: skip
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
@@ -206,13 +158,12 @@ def read_observations(path: Path) -> ObservationSet:
     content = store.read_json(index)
     try:
         if content["schema"] != _SCHEMA:
-            raise InputError(
-                "unknown schema version", where=str(index), expected=str(_SCHEMA), got=str(content["schema"])
-            )
+            raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
+                got=str(content["schema"]))  # fmt: skip
         records = content["observations"]
         views = tuple(
             View(
-                camera_from_record(r["camera"], f"{index}: observations[{i}].camera"),
+                _camera(r["camera"], f"{index}: observations[{i}].camera"),
                 np.asarray(r["world_from_cam"], np.float64),
                 float(r["time_s"]),
             )
@@ -229,6 +180,10 @@ def read_observations(path: Path) -> ObservationSet:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
+
+
+def _camera(record: Any, where: str) -> Camera:
+    return parse_camera(str(record["name"]), {key: value for key, value in record.items() if key != "name"}, where)
 
 
 def list_observation_sets(path: Path) -> dict[str, Path]:

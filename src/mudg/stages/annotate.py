@@ -32,7 +32,6 @@ from mudg.models.labels.labellers import labeller
 from mudg.report.annotate_page import write_page
 from mudg.stages import batch
 from mudg.stages.config import AnnotateConfig
-from mudg.stages.ingest import add_frame_copy, add_rest
 from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import find_ego
 from mudg.stages.labelling.points import NearbyReturns
@@ -72,7 +71,7 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
             loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, inputs, aside))
         )
         with SceneWriter(folder.path, loaded.id, source) as writer:
-            add_rest(writer, loaded)
+            writer.copy_all_but_frames(loaded)
             _add_frames(config, loaded, missing, aside, writer)
             writer.finish()
     made = read_scene(folder.path)
@@ -195,7 +194,7 @@ def _add_frames(
     lacking = {frame.id for frame in missing}
     for frame in scene.frames:
         if frame.id not in lacking:
-            add_frame_copy(writer, scene, frame)
+            writer.copy_frame(scene, frame)
             continue
         arrays = store.read_safetensors(aside_file(aside, frame.id))
         for name in ("semantics", "depth"):  # a confidence tells that a label was made: none beside one that was given
@@ -203,4 +202,4 @@ def _add_frames(
                 arrays.pop(f"{name}_confidence", None)
         if config.ego:
             arrays["ego"] = ego[frame.view.camera.name]
-        add_frame_copy(writer, scene, frame, arrays)
+        writer.copy_frame(scene, frame, arrays)

@@ -7,7 +7,7 @@ import functools
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,12 @@ from typing import Any
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Frame, Scene
+from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS, files_of
 from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
-from mudg.data.scene import SceneWriter, alignment, read_label, read_points, read_scene
+from mudg.data.scene import SceneWriter, alignment, read_scene
 from mudg.data.scene import check as scene_check
-from mudg.data.scene.files import open_files
 from mudg.report import contact_sheet
 from mudg.stages import batch
 from mudg.stages.config import IngestConfig
@@ -88,7 +87,9 @@ def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -
     else:
         scene = _make(kind, config, source, folder.path)
         if kind not in (CITY, _SCENE):
-            scene_check.check_records(scene, _say)
+            for finding in scene_check.check_records(scene):
+                if finding.level == "warning":
+                    log.warn(f"ingest: {finding.where}: {finding.message}")
     held_out = sum(split == "test" for split in scene.split.values())
     log.info(
         f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "
@@ -107,17 +108,12 @@ def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -
     return folder.path
 
 
-def _say(level: scene_check.Level, where: str, words: str) -> None:
-    if level == "warning":
-        log.warn(f"ingest: {where}: {words}")
-
-
 def _alignment(scene: Scene) -> dict[str, Any]:
     """How the images fit the LiDAR, for the summary; a doubtful camera is said aloud."""
     found = alignment.camera_alignment(scene)
     for name, one in found.items():
-        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.words(name, one)}")
-    return {"alignment": {name: alignment.record(one) for name, one in found.items()}}
+        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.describe(name, one)}")
+    return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +255,7 @@ def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
     named = [path for path in (options.poses, options.boxes) if path is not None and path.exists()]
     total = hashlib.sha256()
     base = source if source.is_dir() else source.parent
-    for path in (*files.whole, *named):
+    for path in (*files.files, *named):
         for name in _walk(path):
             state = name.stat() if name.exists() else name.lstat()  # a link may lead nowhere
             place = Path(os.path.relpath(name, base)).as_posix()
@@ -300,29 +296,11 @@ def _refuse(config: IngestConfig, names: Sequence[str], what: str, remedy: str) 
 
 
 def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
-    """Check a scene by reading everything, and write it anew; held-out frames are kept as the scene has them."""
+    """Copy a scene, every file checked; held-out frames are kept as the scene has them."""
     _refuse(config, _OF_A_LOG, "a scene is taken as it is", "leave it out")
     scene = read_scene(source)
     with SceneWriter(out, scene.id, scene.source) as writer:
-        add_rest(writer, scene)
+        writer.copy_all_but_frames(scene)
         for frame in log.progress(scene.frames, len(scene.frames), "copying frames"):
-            add_frame_copy(writer, scene, frame)
+            writer.copy_frame(scene, frame)
         return writer.finish()
-
-
-def add_rest(writer: SceneWriter, scene: Scene) -> None:
-    """Copy everything of a scene but its frames: cameras, sweeps, tracks, ego path, split."""
-    for camera in scene.cameras.values():
-        writer.add_camera(camera)
-    for sweep in log.progress(scene.sweeps, len(scene.sweeps), "copying sweeps"):
-        writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, read_points(scene, sweep))
-    for track in scene.tracks:
-        writer.add_track(track)
-    writer.set_ego(scene.ego)
-    writer.set_split(scene.split)
-
-
-def add_frame_copy(writer: SceneWriter, scene: Scene, frame: Frame, labels: Mapping[str, Any] | None = None) -> None:
-    """Copy a frame, its image's bytes as they are and its labels; ``labels`` (name -> array) fill in what it lacks."""
-    own = {name: read_label(scene, frame, name) for name in frame.labels}
-    writer.add_frame(frame.id, frame.view, open_files(scene.root).read(frame.image.path), {**(labels or {}), **own})

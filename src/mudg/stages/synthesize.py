@@ -32,7 +32,7 @@ from mudg.base.errors import UsageError
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.clips.condition import ConditionRules, Sparse, WarpSource, build_conditions
+from mudg.data.clips.condition import ConditionRules, ProjectedPoints, WarpSource, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
@@ -277,13 +277,13 @@ class Renders:
         """Colour, depth (NaN in the sky and where nothing is) and classes."""
         return render_view(self._model, view, self._raster)
 
-    def sparse(self, view: View) -> Sparse:
+    def sparse(self, view: View) -> ProjectedPoints:
         """Everything that is covered and not sky."""
         seen = self.observation(view)
         depth = torch.full(seen.rgb.shape[-2:], torch.nan) if seen.depth is None else seen.depth[0]
         ids = torch.full(depth.shape, palette.UNLABELLED) if seen.semantics is None else seen.semantics
         valid = torch.isfinite(depth)
-        return Sparse(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
+        return ProjectedPoints(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
 
 
 class ViewMaker:

@@ -13,7 +13,7 @@
 Steps 2 to 6 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
 only, zero where nothing is known, the reference image in frame 0 being put in by the model.
 
-The generated cities as training data are in `city_clips`.
+Training clips are made of these in `from_city.py` and `from_log.py`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ConditionRules:
     point_px: float = 1.0
     """Side of the square a point covers, in pixels."""
     same_time_s: float = 0.06
-    """Recorded images nearer in time than this may also colour moving things."""
+    """Recorded images nearer in time than this may also colour dynamic objects."""
     images_per_view: int = 4
     """How many recorded images are tried per view, nearest in time (then in place) first."""
     hidden_share: float = 0.08
@@ -71,7 +71,7 @@ class ConditionRules:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sparse:
+class ProjectedPoints:
     """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects),
     semantics u8[H,W] (255 = unknown)."""
 
@@ -82,7 +82,7 @@ class Sparse:
     semantics: Tensor
 
 
-Beyond = Callable[[View], Sparse]
+Beyond = Callable[[View], ProjectedPoints]
 """What is known of a view from elsewhere than its points; `valid` where anything is."""
 
 
@@ -95,18 +95,18 @@ class DrawnCloud:
     rules: ConditionRules
     beyond: Beyond | None
 
-    def project(self, view: View) -> Sparse:
+    def project(self, view: View) -> ProjectedPoints:
         """The points seen at a view, and what is known beyond them."""
         sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
         return sparse if self.beyond is None else fill_beyond(sparse, self.beyond(view), self.rules.measured_reach_px)
 
 
-def fill_beyond(measured: Sparse, other: Sparse, reach_px: int) -> Sparse:
+def fill_beyond(measured: ProjectedPoints, other: ProjectedPoints, reach_px: int) -> ProjectedPoints:
     """`measured`, and `other` where it is valid and nothing was measured within `reach_px` (steps to the four sides)."""
     near = torch.from_numpy(ndimage.binary_dilation(measured.valid.numpy(), iterations=max(reach_px, 1)))
     taken = other.valid & ~near
     pick = lambda mine, theirs: torch.where(taken, theirs, mine)  # noqa: E731
-    return Sparse(
+    return ProjectedPoints(
         pick(measured.rgb, other.rgb), pick(measured.depth, other.depth), measured.valid | taken, pick(measured.moving, other.moving),
         pick(measured.semantics, other.semantics),
     )  # fmt: skip
@@ -258,8 +258,8 @@ def build_conditions(
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
     points = DrawnCloud(cloud, tracks, rules, beyond)
-    looks = [_look(points, view, recorded, rules, sources) for view in fine_views]
-    color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*looks))
+    parts = [_condition_of_view(points, view, recorded, rules, sources) for view in fine_views]
+    color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*parts))
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
                      warped, backdrop, ids, far_ids)  # fmt: skip
     if size == (rules.width, rules.height):
@@ -278,7 +278,7 @@ def build_conditions(
     return condition, fine
 
 
-def _look(
+def _condition_of_view(
     points: DrawnCloud,
     view: View,
     recorded: Sequence[Photo],
@@ -314,7 +314,7 @@ def _look(
     return colour, depth[None], sparse.valid[None], found[None], backdrop, ids[None], far_ids
 
 
-def _filled(sparse: Sparse, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest valid pixel, for every pixel."""
     if not bool(sparse.valid.any()):
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
@@ -391,8 +391,8 @@ def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
     return functional.interpolate(own[None, None], size=(height, width), mode="nearest-exact")[0, 0]
 
 
-def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules: ConditionRules) -> Sparse:
-    """Project a fused cloud into a view of the condition's resolution (see `Sparse`)."""
+def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules: ConditionRules) -> ProjectedPoints:
+    """Project a fused cloud into a view of the condition's resolution (see `ProjectedPoints`)."""
     poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
     config = ProjectConfig(
         static_splat_px=rules.point_px,
@@ -410,4 +410,4 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
     unknown = np.uint8(palette.UNLABELLED)
     ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
     table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
-    return Sparse(seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()])
+    return ProjectedPoints(seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()])

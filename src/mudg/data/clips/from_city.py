@@ -33,7 +33,7 @@ HELD_OUT = 1_000_000
 rig, all cameras, and shifts of exactly 2, 3 and 4 m, whatever the seed."""
 
 DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
-"""Cities to look at while choosing; also what `learn` watches."""
+"""Cities for choosing between variants; also what `learn` watches."""
 REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 """Cities whose scores are reported and on which nothing is chosen."""
 

@@ -161,12 +161,12 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
         return (middle + contrast * (x - middle)).clamp(0, 1)
 
     rgb = curve(clip.rgb, 1.0)
-    shown: dict[str, Tensor] = {name: curve(getattr(given, name), error) for name in ("color", "backdrop", "reference")}
-    shown["semantics"], shown["backdrop_semantics"] = _worse_ids(given.semantics, given.backdrop_semantics, rng)
+    varied: dict[str, Tensor] = {name: curve(getattr(given, name), error) for name in ("color", "backdrop", "reference")}
+    varied["semantics"], varied["backdrop_semantics"] = _worse_ids(given.semantics, given.backdrop_semantics, rng)
     if rng.random() >= 0.5:
-        return replace(clip, rgb=rgb, condition=replace(given, **shown))
-    shown |= {name: getattr(given, name) for name in ("depth", "valid", "warped")}
-    turned = replace(given, **{name: x.flip(-1) for name, x in shown.items()})
+        return replace(clip, rgb=rgb, condition=replace(given, **varied))
+    varied |= {name: getattr(given, name) for name in ("depth", "valid", "warped")}
+    turned = replace(given, **{name: x.flip(-1) for name, x in varied.items()})
     flipped = {name: getattr(clip, name).flip(-1) for name in ("depth", "depth_valid", "semantics")}
     return replace(clip, condition=turned, rgb=rgb.flip(-1), **flipped, shift_m=-clip.shift_m)
 

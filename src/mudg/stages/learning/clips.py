@@ -44,7 +44,7 @@ def cities_in_use(config: LearnConfig, step: int) -> int:
 
 
 def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.CityClipRules:
-    """What the generator is asked for; `points_alone`: the published system's condition."""
+    """Rules for the generator; `points_alone`: the published system's condition."""
     data = config.data
     return from_city.CityClipRules(
         data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone
@@ -127,11 +127,11 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
 def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tuple[int, int]:
     """Make the missing clips of all logs; returns how many there are to train on and to score."""
     sources = [from_log.log_source(text) for text in config.data.scenes]
-    rows, counts = from_log.plan(sources, rules, from_city.HELD_OUT)
-    from_log.claim(folder, rules, sources)
+    rows = from_log.plan_shards(sources, rules, from_city.HELD_OUT)
+    from_log.claim_folder(folder, rules, sources)
     jobs: list[tuple[LogSource, LogClipRules, list[tuple[int, LogWindow]], Path]] = []
     for source in dict.fromkeys(sources):
-        windows = [(n, w) for n, of, w in rows if of == source]
+        windows = [(number, window) for number, owner, window in rows if owner == source]
         jobs.append((source, rules, windows, folder))
     with log.task("clips of logs", len(jobs)) as bar:
         if config.compute.workers < 2 or len(jobs) == 1:
@@ -144,7 +144,8 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
                 for future in [pool.submit(from_log.write_log, *job) for job in jobs]:
                     future.result()
                     bar.advance()
-    return counts.train, counts.held_out
+    scored = sum(window.held_out for _, _, window in rows)
+    return len(rows) - scored, scored
 
 
 def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) -> LearnConfig:
@@ -168,7 +169,7 @@ def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
     given = "the projected points and the first image" if rules.published else "images taken at other times"
     return (
         f"{config.data.cities} clips of {config.data.window} frames of {len(config.data.scenes)} recorded "
-        f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, looked at from where they were\n"
+        f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where they were\n"
         f"recorded, with {given} as condition. Depth was learned where a sweep measured it. The model this\n"
         f"one continues from has training data of its own. `held-out` below means every {config.data.held_out_every}. window of these logs."
     )

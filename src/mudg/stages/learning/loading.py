@@ -78,15 +78,15 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
 
 def _fitting(model: PublishedMDM, budget_gb: float, bytes_per_value: int, guided: bool) -> WorkSplit:
     """How the model's work is cut to fit a memory budget in GB."""
-    plan = memory_plan.choose(memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=guided)
-    if plan.peak_bytes > budget_gb * 1e9:
+    split, peak_bytes = memory_plan.choose(memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=guided)
+    if peak_bytes > budget_gb * 1e9:
         raise ResourceError(
             "the model does not fit into the memory budget however its work is cut", where="--memory-budget-gb",
-            expected=f">= {plan.peak_bytes / 1e9:.1f} GB", got=f"{budget_gb} GB", remedy="use the 320x512 model, or bfloat16",
+            expected=f">= {peak_bytes / 1e9:.1f} GB", got=f"{budget_gb} GB", remedy="use the 320x512 model, or bfloat16",
         )  # fmt: skip
     log.info(
-        f"synthesize: modalities {'together' if plan.modalities_together else 'one by one'}, guidance "
-        f"{'together' if plan.guidance_together else 'in two passes'}, {plan.frames_at_once} frames per decoding, "
-        f"about {plan.peak_bytes / 1e9:.1f} GB at most"
+        f"synthesize: modalities {'together' if split.modalities_together else 'one by one'}, guidance "
+        f"{'together' if split.guidance_together else 'in two passes'}, {split.frames_at_once} frames per decoding, "
+        f"about {peak_bytes / 1e9:.1f} GB at most"
     )
-    return WorkSplit(plan.modalities_together, plan.guidance_together, plan.frames_at_once)
+    return split

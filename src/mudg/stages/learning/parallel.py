@@ -149,7 +149,7 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
     A process group that exists already is used and left open. Only the leader's messages are shown.
 
     Raises:
-        ResourceError: a CUDA device is asked for and there is none.
+        ResourceError: `device` is cuda and there is none.
         UsageError: the launcher's variables are not numbers.
     """
     if device == "cuda" and not torch.cuda.is_available():
@@ -328,7 +328,7 @@ class Interruption:
 
     @property
     def requested(self) -> bool:
-        """Whether this process was told to stop."""
+        """Whether a signal to stop has arrived."""
         return self._number != 0
 
     def end(self, number: int = 0, frame: types.FrameType | None = None) -> None:
@@ -342,7 +342,7 @@ class Interruption:
 def agreed_terms(
     ranks: Ranks, terms: Mapping[str, float], portions: int, step: int, what: str, *, stop: bool = False
 ) -> tuple[dict[str, float], bool]:
-    """Mean of the loss terms over processes and portions, and whether anyone was asked to stop.
+    """Mean of the loss terms over processes and portions, and whether any process is to stop.
 
     Raises:
         NumericsError: in every process, if a term is not finite in any; names the terms, the step and the processes.

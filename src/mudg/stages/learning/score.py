@@ -56,7 +56,7 @@ def score(
     """
     rows: dict[str, list[dict[str, float]]] = {}
     counts: dict[str, Tensor] = {}
-    shown: list[tuple[Clip, GeneratedClip]] = []
+    pairs: list[tuple[Clip, GeneratedClip]] = []
     for city in cities:
         for number in range(clip_shards.clips_in(folder, city)):
             frames = range(model.config.window)
@@ -67,10 +67,10 @@ def score(
             row, matrix = score_clip(clip, sample)
             rows.setdefault(name, []).append(row)
             counts[name] = counts.get(name, torch.zeros_like(matrix)) + matrix
-            if len(shown) < 6 and (clip.shift_m != 0 or number == 0):
-                shown.append((clip, sample))
-    if picture is not None and shown:
-        save_grid(picture, shown)
+            if len(pairs) < 6 and (clip.shift_m != 0 or number == 0):
+                pairs.append((clip, sample))
+    if picture is not None and pairs:
+        save_grid(picture, pairs)
     by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
     shifted = [n for n in rows if n != "recorded"] or list(rows)
     pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))  # type: ignore[arg-type]
@@ -197,10 +197,10 @@ def rgb_image(rgb: Tensor) -> NDArray[np.uint8]:
     return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
 
 
-def save_grid(path: Path, shown: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
+def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
     """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes; confidence."""
     rows = []
-    for clip, sample in shown:
+    for clip, sample in pairs:
         t = min(frame, len(sample.confidence) - 1)
         given = clip.condition
         measured = torch.where(given.valid[t], given.depth[t], 100.0)

@@ -36,7 +36,7 @@ from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras, path_inside, refuse_missing_cameras, refuse_untwist
 from mudg.data.importers.nuscenes import tables
 from mudg.data.importers.options import ImportOptions
 
@@ -44,13 +44,9 @@ Matrix = NDArray[np.float64]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
 CAMERAS: Final[Mapping[str, str]] = {
-    "CAM_FRONT": "front",
-    "CAM_FRONT_LEFT": "front_left",
-    "CAM_FRONT_RIGHT": "front_right",
-    "CAM_BACK": "back",
-    "CAM_BACK_LEFT": "back_left",
-    "CAM_BACK_RIGHT": "back_right",
-}
+    "CAM_FRONT": "front", "CAM_FRONT_LEFT": "front_left", "CAM_FRONT_RIGHT": "front_right", "CAM_BACK": "back",
+    "CAM_BACK_LEFT": "back_left", "CAM_BACK_RIGHT": "back_right",
+}  # fmt: skip
 LIDAR: Final = "LIDAR_TOP"
 SENSOR: Final = "lidar_top"
 MAX_GAP_S: Final = 1.1
@@ -65,31 +61,18 @@ _OWN_VEHICLE_M: Final = ((-1.05, 1.05), (-2.2, 3.1), (-2.2, 0.5))
 _MAX_BEFORE_SCENE_S: Final = 1.0
 
 LABELS: Final[Mapping[str, str]] = {
-    "animal": "animal",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.personal_mobility": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "human.pedestrian.stroller": "stroller",
-    "human.pedestrian.wheelchair": "wheelchair",
-    "movable_object.barrier": "barrier",
-    "movable_object.debris": "debris",
-    "movable_object.pushable_pullable": "pushable",
-    "movable_object.trafficcone": "traffic_cone",
-    "static_object.bicycle_rack": "bicycle_rack",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
+    "animal": "animal", "human.pedestrian.adult": "pedestrian", "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian", "human.pedestrian.personal_mobility": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian", "human.pedestrian.stroller": "stroller",
+    "human.pedestrian.wheelchair": "wheelchair", "movable_object.barrier": "barrier",
+    "movable_object.debris": "debris", "movable_object.pushable_pullable": "pushable",
+    "movable_object.trafficcone": "traffic_cone", "static_object.bicycle_rack": "bicycle_rack",
+    "vehicle.bicycle": "bicycle", "vehicle.bus.bendy": "bus", "vehicle.bus.rigid": "bus", "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle", "vehicle.emergency.ambulance": "van",
+    "vehicle.emergency.police": "car", "vehicle.motorcycle": "motorcycle", "vehicle.trailer": "trailer",
     "vehicle.truck": "truck",
-}
-"""The release's categories in the product's words."""
+}  # fmt: skip
+"""The release's categories -> labels."""
 _RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
 _WITH_RIDER: Final = "cycle.with_rider"
 
@@ -115,7 +98,7 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "nuScenes", str(source))
+    refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
         from mudg.data.importers.nuscenes.info import import_info_frame
@@ -157,13 +140,13 @@ class _Release:
     def path(self, name: str) -> Path:
         return self.folder / f"{name}.json"
 
-    def all_of(self, name: str) -> tables.Table:
+    def all_of(self, name: str) -> tables.TokenTable:
         """A small table, whole."""
-        return tables.Table(self.path(name), tables.iter_records(self.path(name)))
+        return tables.TokenTable(self.path(name), tables.iter_records(self.path(name)))
 
-    def those(self, name: str, field: str, values: set[str]) -> tables.Table:
+    def those(self, name: str, field: str, values: set[str]) -> tables.TokenTable:
         """The records of a large table whose ``field`` is one of ``values``."""
-        return tables.Table(self.path(name), tables.find_records(self.path(name), field, values))
+        return tables.TokenTable(self.path(name), tables.find_records(self.path(name), field, values))
 
 
 def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
@@ -182,7 +165,7 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
         channel_of[row["token"]] = tables.text(sensor, "channel", sensors.where)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
     chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, tuple(CAMERAS))}
-    _check_all_cameras(there, options, where)
+    refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
@@ -203,7 +186,7 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
     tracks, notes = _read_tracks(release, samples, zero_us)
     if not sweeps:
         notes.append("no LiDAR sweeps in the tables")
-    ego = drive_log.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
+    ego = common.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
     source = Source("nuscenes", LICENCE, None, (f"release {folder.name}, {scene['name']}", *notes))
     return DriveLog(str(scene["name"]), cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
 
@@ -223,12 +206,9 @@ def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Pat
     if not found or (not wanted and len(found) > 1):
         several = "the release holds several scenes" if found else "the release has no such scene"
         listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
-        raise UsageError(
-            several,
-            where=", ".join(str(folder) for folder in releases),
+        raise UsageError(several, where=", ".join(str(folder) for folder in releases),
             expected=f"--sequence with one of {listed}" if names else "a release with scenes",
-            got=options.sequence or "none chosen",
-        )
+            got=options.sequence or "none chosen")  # fmt: skip
     return found[0]  # the same scene may lie in two releases: the smaller one is quicker
 
 
@@ -241,47 +221,28 @@ def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
     while at:
         if at in stamps:
             raise InputError("the chain of key frames runs in a circle", where=samples.where, got=f"back at {at!r}")
-        stamps[at] = tables.whole(samples[at], "timestamp", samples.where)
-        at = tables.text(samples[at], "next", samples.where)
+        stamps[at] = tables.integer(samples.record(at, samples.where), "timestamp", samples.where)
+        at = tables.text(samples.rows[at], "next", samples.where)
     values = np.array(list(stamps.values()), np.int64)
-    drive_log.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
+    common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
         late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
-        raise InputError(
-            "time stamps of key frames do not increase along the scene",
-            where=f"{samples.where}: record {late!r}",
-            got=f"{stamps[late]} after a later one",
-            expected="microseconds, increasing from one key frame to the next",
-            remedy="copy the table again",
-        )
+        raise InputError("time stamps of key frames do not increase along the scene",
+            where=f"{samples.where}: record {late!r}", got=f"{stamps[late]} after a later one",
+            expected="microseconds, increasing from one key frame to the next", remedy="copy the table again")  # fmt: skip
     return stamps
-
-
-def _check_all_cameras(there: Mapping[str, str], options: ImportOptions, where: str) -> None:
-    absent = [name for raw, name in CAMERAS.items() if raw not in there]
-    if absent and not options.cameras and not options.skip_missing:
-        raise InputError(
-            "cameras are missing in the tables",
-            where=where,
-            got=f"no images of {', '.join(absent)}",
-            expected="six cameras",
-            remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing",
-        )
 
 
 def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: str) -> None:
     """Stamps of images and sweeps are microseconds near their scene."""
-    stamps = np.array([tables.whole(row, "timestamp", where) for row in rows], np.int64)
-    drive_log.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
+    stamps = np.array([tables.integer(row, "timestamp", where) for row in rows], np.int64)
+    common.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
     if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
-        raise InputError(
-            "an image or sweep lies outside its scene's time",
+        raise InputError("an image or sweep lies outside its scene's time",
             where=f"{where}: record {rows[int(beside.argmax())]['token']!r}",
-            got=f"{beside.max():.3f} s away from the key frames",
-            expected="microseconds since 1970, within the scene",
-        )
+            got=f"{beside.max():.3f} s away from the key frames", expected="microseconds since 1970, within the scene")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,8 +251,8 @@ class _RowReader:
 
     release: _Release
     where: str
-    calibrations: tables.Table
-    ego_poses: tables.Table
+    calibrations: tables.TokenTable
+    ego_poses: tables.TokenTable
     zero_us: int
 
     def time_s(self, row: tables.Row) -> float:
@@ -305,7 +266,7 @@ class _RowReader:
         return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
 
     def file(self, row: tables.Row) -> Path:
-        return drive_log.path_inside(self.release.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+        return path_inside(self.release.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
 
     def image(self, row: tables.Row, camera: str) -> ImageRecord:
         return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))
@@ -317,11 +278,11 @@ class _RowReader:
     def camera(self, row: tables.Row, name: str) -> Camera:
         calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
         where = f"{self.calibrations.where}: record {calibration['token']!r}"
-        width, height = tables.whole(row, "width", self.where), tables.whole(row, "height", self.where)
-        return camera_from_intrinsics(name, width, height, calibration.get("camera_intrinsic"), where)
+        size = tables.integer(row, "width", self.where), tables.integer(row, "height", self.where)
+        return camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), where)
 
 
-def camera_from_intrinsics(name: str, width: int, height: int, intrinsics: Any, where: str) -> Camera:
+def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, where: str) -> Camera:
     """A camera from the release's 3x3 intrinsics, whose pixel centres are whole numbers: half a pixel is added here."""
     try:
         k = np.array(intrinsics, np.float64)
@@ -329,13 +290,9 @@ def camera_from_intrinsics(name: str, width: int, height: int, intrinsics: Any, 
         raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
     off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
     if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
-        raise InputError(
-            "intrinsics are malformed",
-            where=where,
-            expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
-            got=str(intrinsics)[:120],
-        )
-    return Camera(name, width, height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
+        raise InputError("intrinsics are malformed", where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+            got=str(intrinsics)[:120])  # fmt: skip
+    return Camera(name, *size, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
 
 
 def _pose(row: tables.Row, where: str) -> Matrix:
@@ -360,17 +317,19 @@ def _read_tracks(release: _Release, samples: Mapping[str, int], zero_us: int) ->
     for row in annotations.rows.values():
         instance = instances.get(row, "instance_token", annotations.where)
         category = categories.get(instance, "category_token", instances.where)
-        label = tracks.word(tables.text(category, "name", categories.where))
+        label = tracks.label_of(tables.text(category, "name", categories.where))
         if attributes is not None and label in _RIDDEN and _is_ridden(row, attributes):
             label = _RIDDEN[label]
         width, length, height = tables.numbers(row, "size", 3, annotations.where)  # in this order in the tables
         where = f"{annotations.where}: record {row['token']!r}"
         time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
-        tracks.add(instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where)
+        tracks.add(
+            instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where
+        )
     return tracks.tracks()
 
 
-def _is_ridden(row: tables.Row, attributes: tables.Table) -> bool:
+def _is_ridden(row: tables.Row, attributes: tables.TokenTable) -> bool:
     tokens = row.get("attribute_tokens")
     return isinstance(tokens, list) and any(
         attributes.rows.get(token, {}).get("name") == _WITH_RIDER for token in tokens if isinstance(token, str)
@@ -391,13 +350,9 @@ def read_scan(path: Path) -> SweepPoints:
     rows = read_float_rows(path, 5, "sweep")
     rings = rows[:, 4]
     if len(rows) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
-        raise InputError(
-            "fifth value of the points is no ring number",
-            where=str(path),
-            expected=f"whole numbers 0 to {BEAMS - 1}",
-            got=f"{rings.min():g} to {rings.max():g}",
-            remedy="is this a file of another sensor or format?",
-        )
+        raise InputError("fifth value of the points is no ring number", where=str(path),
+            expected=f"whole numbers 0 to {BEAMS - 1}", got=f"{rings.min():g} to {rings.max():g}",
+            remedy="is this a file of another sensor or format?")  # fmt: skip
     dt_s = point_times(rows[:, :3], rings)
     own = np.ones(len(rows), bool)
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):

@@ -1,35 +1,71 @@
-"""Range images -> points, and when each column of the top LiDAR was measured.
+"""Waymo sensors: range images as points, when the top LiDAR's columns were measured, where a view is, and panoptic classes.
 
 A range image has a row per beam (the highest first) and a column per step of the turn. Column 0 looks backwards, the middle
 column along the vehicle's x axis, and time runs with the columns: the sensor turns clockwise seen from above (the side-left
 camera is triggered before the front one, the side-right one after). Azimuth is counter-clockwise in the LiDAR's own frame,
 whose x axis may point anywhere; the heading of that frame is taken off.
 
+The cameras' shutters roll from left to right within some 45 ms; scenes know one pose per image. That pose is the vehicle's at the
+moment the middle column was exposed: the recorded one, up to a few milliseconds older or newer, carried on with the recorded
+velocity.
+
 Source: the message description and the conversion documented with the data set.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from scipy.spatial.transform import Rotation
 
 from mudg.base.errors import InputError
-from mudg.base.types import SweepPoints
-from mudg.data.importers.waymo.records import LaserCalibration, LaserScan, Matrix
+from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points
+from mudg.base.palette import ID, UNLABELLED
+from mudg.base.types import Camera, SweepPoints
+from mudg.data.importers.images import Lens, brown_conrady
+from mudg.data.importers.waymo.records import (
+    CAMERAS,
+    CameraCalibration,
+    CameraShot,
+    LaserCalibration,
+    LaserScan,
+    Matrix,
+    Panoptic,
+)
 
 TURN_S: Final = 0.1
 _MIN_MOTION_M: Final = 0.3
 _MAX_FIT_ERROR_S: Final = 0.004
 _CLOCK_ERROR_S: Final = 0.0025
 _MIN_ROWS_SHARE: Final = 0.05
+MAX_POSE_SHIFT_S: Final = 0.05
+DIRECTIONS: Final = ("in an unknown direction", "downwards", "left to right", "upwards", "right to left", "not at all")
+"""How a camera reads its image, by the data set's number."""
+
+GLOBAL_SHUTTER: Final = 5
+EGO_CLASS: Final = 1
+SKY_CLASS: Final = 25
+TRAIN_IDS: Final[Mapping[int, int]] = {
+    2: ID["car"], 3: ID["truck"], 4: ID["bus"], 5: ID["truck"], 6: ID["bicycle"], 7: ID["motorcycle"], 9: ID["person"],
+    10: ID["rider"], 11: ID["rider"], 15: ID["pole"], 17: ID["traffic sign"], 18: ID["traffic light"], 19: ID["building"],
+    20: ID["road"], 21: ID["road"], 22: ID["road"], 23: ID["sidewalk"], 24: ID["vegetation"], 25: ID["sky"],
+}  # fmt: skip
+"""Class of a camera segmentation label -> train id. A cyclist is labelled together with the bicycle; other large vehicles count as
+trucks. Without a counterpart, so unlabelled: undefined, own vehicle, trailer, bird, animal, cone, carried object, other ground,
+other things."""
+
+
+# --- range images ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Points:
+class ScanPoints:
     """Points of one turn in the LiDAR's frame at the frame's pose, where each came from in the range images, and how many
     were left out because no pose was recorded for their pixel.
 
@@ -48,7 +84,7 @@ class Points:
     without_pose: int
 
 
-def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str) -> Points:
+def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str) -> ScanPoints:
     """All points of a scan, first returns and then second ones.
 
     Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured to
@@ -72,10 +108,8 @@ def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle
         pixel = np.flatnonzero(image[..., 0].reshape(-1) > 0)
         values = image.reshape(-1, image.shape[2])[pixel, :2]
         if not np.isfinite(values).all():
-            raise InputError(
-                "range image holds values that are not finite", where=f"{where}: return {index + 1}",
-                got=f"{int((~np.isfinite(values).all(1)).sum())} of {len(values)} points",
-            )  # fmt: skip
+            raise InputError("range image holds values that are not finite", where=f"{where}: return {index + 1}",
+                got=f"{int((~np.isfinite(values).all(1)).sum())} of {len(values)} points")  # fmt: skip
         row, column = np.divmod(pixel, columns)
         reach = values[:, 0].astype(np.float64)
         flat = reach * np.cos(inclination)[row]
@@ -90,7 +124,7 @@ def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle
             xyz = _carried(xyz, poses.astype(np.float64), laser.vehicle_from_lidar, global_from_vehicle)
         parts.append((xyz, values[:, 1], turn[column], pixel, np.full(len(pixel), index)))
     xyz, intensity, turns, pixels, images = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Points(xyz, intensity, turns, pixels, images, without_pose)
+    return ScanPoints(xyz, intensity, turns, pixels, images, without_pose)
 
 
 def heading_of(laser: LaserCalibration) -> float:
@@ -122,7 +156,7 @@ def _carried(
     return (in_vehicle - vehicle_from_lidar[:3, 3]) @ vehicle_from_lidar[:3, :3]
 
 
-def sweep_points(points: Points, dt_s: NDArray[np.float64]) -> SweepPoints:
+def sweep_points(points: ScanPoints, dt_s: NDArray[np.float64]) -> SweepPoints:
     """Points as a sweep holds them. Intensity has no limit in the data set; tanh, as is customary, brings it to 0..1."""
     intensity = np.tanh(np.maximum(points.intensity.astype(np.float64), 0))
     return SweepPoints(points.xyz.astype(np.float32), intensity.astype(np.float32), dt_s.astype(np.float32))
@@ -193,3 +227,122 @@ def median_clock(turns: Sequence[tuple[float, float]]) -> TurnClock:
     if max(abs(start), abs(start + duration - TURN_S)) <= _CLOCK_ERROR_S:
         return TurnClock()
     return TurnClock(start, duration, True)
+
+
+# --- cameras --------------------------------------------------------------------------------------------------------
+
+
+def recorded_camera(calibration: CameraCalibration, shot: CameraShot) -> tuple[Camera, Lens | None]:
+    """The camera as recorded, and its lens (None where the coefficients are all zero)."""
+    fx, fy, cx, cy, *coefficients = calibration.intrinsic
+    camera = Camera(
+        calibration.name, calibration.width, calibration.height, fx, fy, cx, cy, tuple(coefficients),
+        0.0 if calibration.direction == GLOBAL_SHUTTER else readout_s(shot),
+    )  # fmt: skip
+    return camera, brown_conrady(*coefficients) if any(coefficients) else None
+
+
+def readout_s(shot: CameraShot) -> float:
+    """Time between the exposure of the first column and of the last one."""
+    return max(0.0, shot.done_s - shot.trigger_s - shot.shutter_s) if shot.done_s else 0.0
+
+
+def middle_of_exposure(shot: CameraShot) -> tuple[Matrix, float]:
+    """Vehicle pose f64[4, 4] in the global frame when the middle column was exposed, and this time in seconds of the epoch.
+
+    Without recorded exposure times or velocity, or where the two are far apart, pose and time are those recorded.
+    """
+    middle = (shot.trigger_s + shot.done_s) / 2 if shot.done_s else shot.pose_time_s
+    late = middle - shot.pose_time_s
+    if shot.velocity is None or not shot.done_s or abs(late) > MAX_POSE_SHIFT_S:
+        return shot.global_from_vehicle, shot.pose_time_s
+    pose = shot.global_from_vehicle.copy()
+    pose[:3, :3] = Rotation.from_rotvec(shot.velocity[3:] * late).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] += shot.velocity[:3] * late
+    return pose, middle
+
+
+def vehicle_from_cam(calibration: CameraCalibration) -> Matrix:
+    """Camera axes of this package (x right, y down, z forward) to the vehicle, f64[4, 4]."""
+    return calibration.vehicle_from_camera @ CAM_FROM_EGO_AXES.T
+
+
+def panoptic_ids(label: Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
+    """Values of a panoptic label, i32[H, W]: class * divisor + instance.
+
+    Raises:
+        InputError: no 16-bit PNG of the camera's size, or no divisor.
+    """
+    if label.divisor < 1:
+        raise InputError("panoptic label has no divisor", where=where, expected="a positive number",
+            got=str(label.divisor))  # fmt: skip
+    try:
+        with Image.open(io.BytesIO(label.png), formats=("PNG",)) as image:
+            if image.size != (camera.width, camera.height) or not image.mode.startswith("I"):
+                raise InputError("panoptic label is not a 16-bit image of its camera's size", where=where,
+                    expected=f"{camera.width}x{camera.height}, 16 bits",
+                    got=f"{image.width}x{image.height}, mode {image.mode}")  # fmt: skip
+            return np.array(image).astype(np.int32)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        raise InputError("panoptic label cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
+
+
+def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[Any]]:
+    """Labels of one image: ``semantics`` u8[H, W] train ids, ``instance`` i32[H, W], ``sky`` and ``ego`` bool[H, W].
+
+    An instance is called class * divisor + number, 0 where there is none: it means the same thing in this one image only.
+    """
+    classes, numbers = np.divmod(ids, divisor)
+    table = np.full(256, UNLABELLED, np.uint8)
+    table[list(TRAIN_IDS)] = list(TRAIN_IDS.values())
+    return {
+        "semantics": table[np.clip(classes, 0, 255)],
+        "instance": np.where(numbers > 0, ids, 0).astype(np.int32),
+        "sky": classes == SKY_CLASS,
+        "ego": classes == EGO_CLASS,
+    }
+
+
+def projection_errors(
+    points: ScanPoints,
+    scan: LaserScan,
+    laser: LaserCalibration,
+    global_from_vehicle: Matrix,
+    cameras: Mapping[str, tuple[CameraCalibration, Matrix]],
+) -> dict[str, NDArray[np.float64]]:
+    """How far our projections of a scan lie from those recorded with it, in pixels of the recorded images.
+
+    The recorded ones follow the rolling shutter, ours hold for the middle column, so while the vehicle moves some pixels are
+    normal; wrong calibrations, poses or conversions show as hundreds.
+
+    Args:
+        points, scan, laser: a scan with projections, and its points.
+        global_from_vehicle: pose that the points are given for.
+        cameras: name -> calibration and the vehicle's pose in the global frame at the middle of the exposure.
+
+    Returns:
+        Camera name -> distances f64[n], for cameras with points.
+    """
+    xyz_vehicle = transform_points(laser.vehicle_from_lidar, points.xyz)
+    errors: dict[str, NDArray[np.float64]] = {}
+    for index, projections in enumerate(scan.projections):
+        chosen = points.image == index
+        recorded = projections.reshape(-1, 6)[points.pixel[chosen]]
+        for half in (recorded[:, :3], recorded[:, 3:]):
+            for number, name in CAMERAS.items():
+                if name not in cameras or not (here := half[:, 0] == number).any():
+                    continue
+                calibration, pose = cameras[name]
+                cam_from_vehicle = invert(pose @ vehicle_from_cam(calibration)) @ global_from_vehicle
+                uv = _recorded_pixels(calibration, transform_points(cam_from_vehicle, xyz_vehicle[chosen][here]))
+                off = np.linalg.norm(uv - (half[here, 1:] + 0.5), axis=1)
+                errors[name] = np.concatenate([errors.get(name, np.zeros(0)), off])
+    return errors
+
+
+def _recorded_pixels(calibration: CameraCalibration, xyz_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels f64[N, 2] of the recorded (distorted) image; infinite behind the camera."""
+    fx, fy, cx, cy, *coefficients = calibration.intrinsic
+    z = np.where(xyz_cam[:, 2:] > 0.1, xyz_cam[:, 2:], np.nan)
+    uv = brown_conrady(*coefficients)(xyz_cam[:, :2] / z) * [fx, fy] + [cx, cy]
+    return np.where(np.isfinite(uv), uv, np.inf)
