@@ -8,7 +8,7 @@ data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled
 from __future__ import annotations
 
 import io
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
