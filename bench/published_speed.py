@@ -89,7 +89,7 @@ def main() -> None:
         encoded = PublishedLatents(draw(batch, frames, 2 * channels, h, w), features, features[:1], draw(batch, frames, 1, h, w))
 
         def step() -> None:
-            model.loss(truth, encoded, seeds.torch_generator(0, 0, "step")).total.backward()
+            model.velocity_loss(truth, encoded, seeds.torch_generator(0, 0, "step")).total.backward()
             for value in moving:
                 value.grad = None
 

@@ -4,7 +4,6 @@ import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -18,7 +17,6 @@ from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import learn
 from mudg.stages.config import LearnConfig
 from mudg.stages.config.learn import LearnData, LearnNetwork
-from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
 from mudg.stages.learning.state import TrainingState
 
@@ -100,16 +98,6 @@ def test_an_embedded_kind_of_network_need_not_be_described_again(unrefined, clip
     config = replace(tiny(clips, start=str(unrefined), steps=2, log_every=1, augment=False), network=LearnNetwork())
     model = files.load(learn.run(config, tmp_path / "run"))
     assert model.config == replace(files.load(unrefined).config, area_px=48 * 32)
-
-
-def test_references_are_dropped_as_often_as_asked(clips):
-    def dropped(share):
-        drawn = learn_clips.draw_clips(tiny(clips, reference_dropout=share), clips, 1, 40, 2, "batch")
-        return np.mean([torch.equal(clip.condition.reference, clip.condition.color[0]) for clip in drawn])
-
-    assert dropped(0.0) == 0.0
-    assert dropped(1.0) == 1.0
-    assert 0.05 < dropped(0.2) < 0.4
 
 
 def test_constant_rate_and_averages(clips):

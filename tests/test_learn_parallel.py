@@ -139,7 +139,7 @@ def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
 
 
 def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
-    config = tiny(clips, reference_dropout=0.5)
+    config = tiny(clips)
     everything = learn_clips.draw_clips(config, clips, 7, 4, 2, "batch")
     for part in (slice(0, 1), slice(1, 3), slice(3, 4)):
         for own, clip in zip(

@@ -18,7 +18,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -193,8 +192,6 @@ def _train_network(
     settings = LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)
     board = _tensorboard(run_dir.path / "tensorboard") if config.compute.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.compute.parallel}
-    drops = kind_of(model).drops_reference
-    drawn = replace(config, data=replace(config.data, reference_dropout=0.0)) if drops else config
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
     with log.task("network", config.steps, begun) as bar, Interruption() as interruption:
@@ -207,7 +204,7 @@ def _train_network(
             terms: dict[str, float] = {}
             state.optimizer.zero_grad(set_to_none=True)
             for part in parts:
-                clips = draw_clips(drawn, folder, step, count, frames, "batch", part)
+                clips = draw_clips(config, folder, step, count, frames, "batch", part)
                 clips = [clip.to(ranks.device) for clip in clips]
                 with spread.portion(last=part is parts[-1]):
                     with torch.autocast(ranks.device.type, torch.bfloat16, enabled=bf16):

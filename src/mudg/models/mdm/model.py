@@ -99,7 +99,7 @@ class LossSettings:
 
     class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
-    reference_dropout  share of the clips that go without their reference; only of models that leave it out themselves
+    reference_dropout  share of the clips that go without their reference image; the published kind
     """
 
     class_weights: Tensor | None = None

@@ -27,8 +27,8 @@ class LearnData:
     augment: bool = True
     """Vary colours, mirror, and spoil given classes."""
     reference_dropout: float = Field(default=0.2, ge=0, le=1)
-    """How often a clip goes without its reference image; only for models that use one. Published-type models: 0.2 as the
-    paper says, 0.1 as the released code does."""
+    """Published-type models: how often a clip goes without its reference image; 0.2 as the paper says, 0.1 as the released code
+    does."""
     cities: int = Field(default=240, ge=1)
     """Generated cities to train on."""
     first_cities: int = Field(default=40, ge=1)

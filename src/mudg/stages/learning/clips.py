@@ -203,11 +203,8 @@ def draw_clips(
                 expected=f"{config.data.width}x{config.data.height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
                 remedy="give another --data.clips",
             )  # fmt: skip
-        own = seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}")
         if config.data.augment:
-            clip = clip_shards.vary(clip, own)
-        if own.random() < config.data.reference_dropout:  # the sparse view itself stands in for the image
-            clip = replace(clip, condition=replace(clip.condition, reference=clip.condition.color[0]))
+            clip = clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))
         clips.append(clip)
     return clips
 

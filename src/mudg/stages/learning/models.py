@@ -31,18 +31,16 @@ Model = MDM | PublishedMDM
 
 @dataclass(frozen=True)
 class ModelKind:
-    """How one class of models is saved, and what its clips are.
+    """How one class of models is saved, described and rebuilt.
 
     save    (model, folder, card, facts)
     card    (model, settings, scores, sentence on the training data) -> text of the model card
     rebuilt (model, weights of its trained part) -> a model with these, ready for use
-    drops_reference  the model's own loss leaves references out: clips come with theirs
     """
 
     save: Callable[[Any, Path, str, Mapping[str, Any]], None]
     card: Callable[[Any, LearnConfig, Mapping[str, Any], str], str]
     rebuilt: Callable[[Any, Mapping[str, Tensor]], Any]
-    drops_reference: bool = False
 
 
 def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
@@ -55,7 +53,7 @@ def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
 
 KINDS: dict[type[nn.Module], ModelKind] = {
     MDM: ModelKind(mdm_files.save, learn_score.model_card, mdm_rebuilt),
-    PublishedMDM: ModelKind(learn_published.save, learn_published.card, learn_published.rebuilt, drops_reference=True),
+    PublishedMDM: ModelKind(learn_published.save, learn_published.card, learn_published.rebuilt),
 }
 
 
