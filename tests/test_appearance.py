@@ -12,6 +12,7 @@ from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError
+from mudg.base.run_folder import RunDir
 from mudg.core.fused import adam_columns
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import torch_adam_columns
@@ -172,10 +173,9 @@ def begin(world, change=None, **options) -> tuple[fit.FitState, FitConfig]:
 
 
 def optimised(state, config, tmp_path):
-    from mudg.base import store
     from mudg.base.config import to_dict
 
-    fit.optimise(state, config, store.RunDir.open(tmp_path, "fit", to_dict(config), {}, 1, False))
+    fit.optimise(state, config, RunDir.open(tmp_path, fit.OUTPUT, to_dict(config), {}))
     return state
 
 

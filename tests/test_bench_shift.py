@@ -169,7 +169,11 @@ def test_what_a_log_lacks_is_left_out_and_named():
     assert document["pooled"]["b"]["shifted"]["psnr"]["mean"] == pytest.approx(20.0)
     assert document["pooled"]["a"]["2"]["miou"] == "not produced"
     assert "not produced" in shift_tables.markdown(document)
-    assert "<script>" in shift_page.page(document)
+    evil = "<script>alert(1)</script>"
+    document["methods"][0]["name"], document["pooled"][evil] = evil, document["pooled"]["a"]
+    document["logs"][0] |= {"log": evil, "words": evil, "films": [evil]}
+    page = shift_page.page(document)
+    assert evil not in page and page.count("&lt;script&gt;alert(1)") >= 5
 
 
 # ---- end to end --------------------------------------------------------------------------------------------------------
@@ -206,7 +210,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     better = {m: document["pooled"][m]["0"]["psnr"]["mean"] for m in ("nearest_fill", "street_gaussians")}
     assert better["street_gaussians"] > better["nearest_fill"]
     assert (out / log / "film" / "front_shift+3.0.jpg").is_file()
-    assert f'src="{log}/film/front_shift+3.0.mp4"' in (out / "page.html").read_text()
+    assert f'src="{log}/film/front_shift%2B3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
     again = bench_shift.run(
         dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify:none",)), out,
@@ -223,14 +227,14 @@ def test_stored_truth_is_the_drawn_truth(made):
     stored = score_truth.stored_truth(log / "truth")
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     view = read_observations(log / "truth" / "front_shift+3.0").views[2]
-    found, drawn = stored.at(view, None, "front_shift+3.0"), world.render(view)
+    found, drawn = stored.at_view(view, None, "front_shift+3.0"), world.render(view)
     assert np.array_equal(found.seen.semantics.numpy(), drawn.semantics)
     assert float((found.seen.rgb.permute(1, 2, 0).numpy() - drawn.rgb).__abs__().max()) <= 0.5 / 255 + 1e-6
     assert np.array_equal(found.moving[0].numpy(), np.isin(drawn.instance, city_logs.moving_instances(world)))
     with pytest.raises(InputError, match="another view"):
-        stored.at(dataclasses.replace(view, time_s=view.time_s + 0.05), None, "front_shift+3.0")
+        stored.at_view(dataclasses.replace(view, time_s=view.time_s + 0.05), None, "front_shift+3.0")
     with pytest.raises(InputError, match="lacks a trajectory"):
-        stored.at(view, None, "front_shift+9.0")
+        stored.at_view(view, None, "front_shift+9.0")
 
 
 def test_other_settings_in_the_same_folder_are_refused(made):

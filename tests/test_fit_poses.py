@@ -7,8 +7,9 @@ import pytest
 import torch
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
-from mudg.base import geometry, store
+from mudg.base import geometry
 from mudg.base.config import to_dict
+from mudg.base.run_folder import RunDir
 from mudg.bench.poses import pose_errors
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.scene import read_scene
@@ -37,7 +38,7 @@ def fitted(tmp_path_factory) -> fit.FitState:
     state = fit.start_state(
         config, fit.RECIPES[config.method], scene, fused_cloud(FRAMES), fit_views.ViewSet(recorded, ()), classes
     )
-    fit.optimise(state, config, store.RunDir.open(root / "fit", "fit", to_dict(config), {}, 1, False))
+    fit.optimise(state, config, RunDir.open(root / "fit", fit.OUTPUT, to_dict(config), {}))
     return state
 
 

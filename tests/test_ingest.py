@@ -15,6 +15,7 @@ from toy_scene import ToyStreet
 from mudg import native
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
+from mudg.base.run_folder import RunDir
 from mudg.data.city import CityConfig
 from mudg.data.importers import IMPORTERS, files_of
 from mudg.data.importers.options import ImportOptions
@@ -208,7 +209,7 @@ def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) ->
 def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     config, out = IngestConfig(contact_sheet=False), tmp_path / "out"
-    store.RunDir.open(out, "ingest", {"frames": "0:2"}, {"source": "another"}, 1)
+    RunDir.open(out, ingest._OUTPUT, {"frames": "0:2"}, {"source": "another"})
     partial = out / ".scene.999999999-1.part"
     partial.mkdir()
     store.write_json(out / "lock", {"pid": os.getppid(), "host": socket.gethostname()})

@@ -19,7 +19,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, project, transform_points
 from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.nuscenes.importer import camera_from_intrinsics, point_times, read_scan
+from mudg.data.importers.nuscenes.sensors import camera_from_intrinsics, point_times, read_scan
 from mudg.data.importers.nuscenes.tables import find_records, iter_records
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import read_points

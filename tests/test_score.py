@@ -14,6 +14,7 @@ import toy_views
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
+from mudg.core.pictures import resize_nearest
 from mudg.report import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
@@ -136,8 +137,8 @@ def test_methods_of_other_sizes_are_compared_at_the_cameras_size(tmp_path: Path,
 
 def test_nearest_resize_mixes_nothing() -> None:
     ids = torch.tensor([[[0, 1], [2, 3]]])
-    assert score.resize_nearest(ids, 4, 4).tolist() == [[[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 3, 3], [2, 2, 3, 3]]]
-    assert score.resize_nearest(torch.arange(16).reshape(1, 4, 4), 2, 2).tolist() == [[[5, 7], [13, 15]]]
+    assert resize_nearest(ids, 4, 4).tolist() == [[[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 3, 3], [2, 2, 3, 3]]]
+    assert resize_nearest(torch.arange(16).reshape(1, 4, 4), 2, 2).tolist() == [[[5, 7], [13, 15]]]
 
 
 def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Path) -> None:

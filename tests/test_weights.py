@@ -296,8 +296,9 @@ def test_conversion_in_its_own_process(tmp_path, complete):
     assert published_files.load(tmp_path / "model").config.height == 320
     with pytest.raises(UsageError, match="exists"):
         convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
+    (tmp_path / "photos").mkdir()
     with pytest.raises(UsageError, match="something else"):
-        convert.run(ConvertConfig(), path, tmp_path, overwrite=True, network=TINY)
+        convert.run(ConvertConfig(), path, tmp_path / "photos", overwrite=True, network=TINY)
 
 
 @pytest.mark.slow

@@ -41,9 +41,10 @@ class Output(Common):
     """Flags of commands that write a folder."""
 
     out: Annotated[Path, arg(metavar="FOLDER")]
-    """Folder to write. A finished result of the same settings and inputs is verified and reused."""
+    """Folder to write, apart from everything that is read. A finished result of the same settings and inputs is verified and reused."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace the result of other settings or inputs in --out instead of refusing."""
+    """Replace the result of other settings or inputs in --out instead of refusing. The new result is made beside the old one and takes
+    its place when it is finished (until then the disk holds both); files that are not of the old result stay."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +52,8 @@ class Many(Common):
     """Flags of commands that go over a list of scenes too."""
 
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace the result of other settings or inputs in the output folder instead of refusing."""
+    """Replace the result of other settings or inputs in the output folder instead of refusing. The new result is made beside the old
+    one and takes its place when it is finished (until then the disk holds both); files that are not of the old result stay."""
     list: Annotated[Path | None, arg(metavar="FILE")] = None
     """Many at once: a file with one source a line (SOURCE [name=NAME] ...), or a folder of them. Each goes to OUT/NAME; the exit
     code is 0, or 10 + the number that failed."""
@@ -111,7 +113,8 @@ class Convert(Common):
     to: Annotated[Path, arg(metavar="FOLDER")]
     """Model folder to write."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace a model that is there already."""
+    """Replace a model that is there already, when the new one is finished (until then the disk holds both); files that are not of the
+    model stay."""
     settings: Annotated[stage_config.ConvertConfig, arg(name="")]
 
 

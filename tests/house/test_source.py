@@ -185,6 +185,17 @@ def test_only_the_store_opens_files_for_writing(package_dir: Path) -> None:
     refuse(problems)
 
 
+def test_outputs_are_kept_apart_from_inputs(package_dir: Path) -> None:
+    """A verb's folder is opened after its inputs were compared with it; ``bench/poses.py`` opens folders of its own result."""
+    problems = []
+    for name, tree in parsed(package_dir):
+        opened = [call.lineno for call, function in calls(tree) if function.endswith("RunDir.open")]
+        compared = [call.lineno for call, function in calls(tree) if function.endswith(("refuse_overlap", "_refuse_overlap"))]
+        if len(compared) < len(opened) and name != "bench/poses.py":
+            problems.append(f"{name}:{opened[0]}: RunDir.open without refuse_overlap")
+    refuse(problems)
+
+
 def test_no_global_random_state(package_dir: Path) -> None:
     problems = []
     for name, tree in parsed(package_dir):
@@ -424,6 +435,7 @@ def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> No
         ("import pickle\n", test_nothing_executes_data),
         ("def f(x: int) -> int:\n    '''d'''\n    return eval('x')\n", test_nothing_executes_data),
         ("import subprocess\nsubprocess.run('ls', shell=True)\n", test_nothing_executes_data),
+        ("run = RunDir.open(out, OUTPUT, {}, {})\n", test_outputs_are_kept_apart_from_inputs),
         ("import torch\ntorch.rand(3)\n", test_no_global_random_state),
         ("import numpy as np\nnp.random.default_rng(0)\n", test_no_global_random_state),
         ("open('x', 'w')\n", test_only_the_store_opens_files_for_writing),

@@ -119,3 +119,13 @@ def _moved_error(old: str, new: str | None, where: str, path: str) -> UsageError
         where=where,
         remedy="rename it (a dot is one level of YAML)",
     )
+
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        found = []
+        for name in sorted(set(old) | set(new), key=str):
+            found += differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
+        return found
+    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry, log, seeds, store
 from mudg.base.config import to_dict
+from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Scene, Track
 from mudg.core import metrics
 from mudg.core.fusion import fuse_sweeps
@@ -135,7 +136,10 @@ def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> 
         load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0), ()
     )
     state = fit.start_state(config, recipe, scene, cloud, views, classes)
-    run = store.RunDir.open(folder, "fit", to_dict(config), {}, fit.VERSION, overwrite=True)
+    run = RunDir.open(folder, fit.OUTPUT, to_dict(config), {})
+    if not run.fresh:  # the fit starts again, and so does its log
+        run.discard()
+        run = RunDir.open(folder, fit.OUTPUT, to_dict(config), {})
     fit.optimise(state, config, run)
     return state
 

@@ -23,6 +23,7 @@ import torch
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.bench import poses as bench_poses
 from mudg.bench import shift as bench_shift
 from mudg.core import flicker
@@ -37,7 +38,7 @@ from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
-_VERSION = 1
+_FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "fits/", "rows/*.json")
 SHIFT = "shift"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
@@ -53,7 +54,8 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
     if name not in BENCHES:
         raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
-    directory = store.RunDir.open(out, f"bench {name}", to_dict(config), inputs, _VERSION, overwrite)
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
+    directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), to_dict(config), inputs, overwrite)
     if directory.complete:
         return directory.reused()
     torch.set_num_threads(config.threads)

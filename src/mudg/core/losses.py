@@ -6,13 +6,15 @@ the work. Published form: Street Gaussians (recorded views) and the supervision 
 
     recorded:  (1 - w) L1 + w (1 - SSIM)  +  trimmed LiDAR depth  +  sky  +  semantics
     virtual:   perceptual + robust dense depth + semantics, every pixel weighted by the observation's confidence
+
+``core.fused`` holds native twins of some, ``core.perceptual`` the distance in a network's features. The losses of the diffusion
+model stand beside that model.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -210,31 +212,6 @@ def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Ten
         scale_weight = F.adaptive_avg_pool2d(weight.to(mine.dtype), (mine.shape[-2], mine.shape[-1]))
         total = total + confident_mean((mine - theirs).abs(), scale_weight)
     return total / len(prediction)
-
-
-def unit_feature_distance(
-    prediction: Sequence[Tensor], target: Sequence[Tensor], weight: Tensor, channel_weights: Sequence[Tensor] | None = None
-) -> Tensor:
-    """LPIPS-like distance (Zhang et al. 2018, eq. 1) with every place weighted by its confidence; see ``metrics.perceptual_distance``.
-
-    Args:
-        prediction, target: per stage ``[C_l, h_l, w_l]``; every place's vector is brought to length 1.
-        weight: ``[1, H, W]`` in [0, 1] at full size; averaged down to each stage.
-        channel_weights: per stage ``[C_l]``; the stages are then summed as LPIPS does, else averaged.
-    """
-    total = prediction[0].new_zeros(())
-    for stage, (mine, theirs) in enumerate(zip(prediction, target)):
-        _same_shape(mine, theirs, "unit_feature_distance")
-        squared = (_unit(mine) - _unit(theirs)) ** 2
-        if channel_weights is not None:
-            squared = squared * channel_weights[stage].view(-1, 1, 1)
-        share = F.adaptive_avg_pool2d(weight.to(mine.dtype), (mine.shape[-2], mine.shape[-1]))
-        total = total + confident_mean(squared.sum(0, keepdim=True), share)
-    return total / len(prediction) if channel_weights is None else total
-
-
-def _unit(features: Tensor) -> Tensor:
-    return features / (features.square().sum(0, keepdim=True) + 1e-12).sqrt()
 
 
 # ---- diffusion model ---------------------------------------------------------------------------------------------

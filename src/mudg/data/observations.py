@@ -25,6 +25,8 @@ from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 1
+OBSERVATION_FILES = (_INDEX, "rgb/*.png", "data/*.safetensors")
+"""Patterns of the names in a folder of observations."""
 
 
 class ObservationWriter:
@@ -161,23 +163,13 @@ def read_observations(path: Path) -> ObservationSet:
             raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
                 got=str(content["schema"]))  # fmt: skip
         records = content["observations"]
-        views = tuple(
-            View(
-                _camera(r["camera"], f"{index}: observations[{i}].camera"),
-                np.asarray(r["world_from_cam"], np.float64),
-                float(r["time_s"]),
-            )
-            for i, r in enumerate(records)
-        )
-        return ObservationSet(
-            Path(path),
-            str(content["trajectory"]),
-            str(content["source"]),
-            "recorded" if content["kind"] == "recorded" else "virtual",
-            views,
-            tuple(bool(r["depth"]) for r in records),
-            tuple(bool(r["semantics"]) for r in records),
-        )
+        cameras = [_camera(r["camera"], f"{index}: observations[{i}].camera") for i, r in enumerate(records)]
+        poses = [np.asarray(r["world_from_cam"], np.float64) for r in records]
+        views = tuple(View(c, p, float(r["time_s"])) for c, p, r in zip(cameras, poses, records, strict=True))
+        has_depth, has_semantics = (tuple(bool(r[key]) for r in records) for key in ("depth", "semantics"))
+        kind: ObservationKind = "recorded" if content["kind"] == "recorded" else "virtual"
+        trajectory, source = str(content["trajectory"]), str(content["source"])
+        return ObservationSet(Path(path), trajectory, source, kind, views, has_depth, has_semantics)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
 

@@ -7,6 +7,7 @@ text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import zipfile
 from collections.abc import Callable, Mapping
@@ -19,6 +20,8 @@ from torch import Tensor
 
 from mudg.base import log, processes, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.replacement import Replacement, all_names
+from mudg.base.run_folder import refuse_overlap
 from mudg.data import weights
 from mudg.models.published import clip
 from mudg.models.published import files as published_files
@@ -57,19 +60,51 @@ def run(
         ResourceError: memory limit or disk.
     """
     checkpoint, to = Path(checkpoint), Path(to)
-    if to.exists() and not overwrite:
+    refuse_overlap(to, {"checkpoint": checkpoint, "towers": config.towers})
+    replacement = Replacement.at(to)
+    replacement.recover(_holds_model, own_names)
+    replaces = to.exists()
+    if replaces and not overwrite:
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
-    if to.exists() and not (to / "model.json").is_file():
+    if replaces and not _holds_model(to):
         raise UsageError("the folder holds something else than a model", where=str(to), remedy="choose another --to")
+    place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
     work, limit = (
-        _from_folder(config, checkpoint, to) if checkpoint.is_dir() else _from_file(config, checkpoint, to, network)
+        _from_folder(config, checkpoint, place)
+        if checkpoint.is_dir()
+        else _from_file(config, checkpoint, place, network)
     )
-    with log.task("convert", 1) as bar:
-        peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
-        bar.advance()
+    if replaces:
+        replacement.begin()
+    try:
+        with log.task("convert", 1) as bar:
+            peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
+            bar.advance()
+        if replaces:
+            replacement.swap(own_names)
+    finally:
+        with contextlib.suppress(OSError):  # there and empty only if converting failed
+            replacement.staging.rmdir()
     memory = f"; peak memory {peak / processes.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
     log.info(f"convert: {to} is complete{memory}")
     return to
+
+
+def _holds_model(folder: Path) -> bool:
+    """Whether a folder holds a model that was converted, or trained, by this program."""
+    return bool(own_names(folder))
+
+
+def own_names(folder: Path) -> list[str]:
+    """Names of the files that a model folder's description lists, and its own last; none if there is no such description."""
+    try:
+        content = store.read_json(folder / "model.json")
+        files = list(content["files"]) if "files" in content else []
+        files += [f"{part}/{name}" for part, entry in content.get("parts", {}).items() for name in entry["files"]]
+    except (InputError, KeyError, TypeError, AttributeError):
+        return []
+    there = set(all_names(folder))
+    return [name for name in (*files, "MODEL_CARD.md", "model.json") if name in there] if files else []
 
 
 def _from_file(

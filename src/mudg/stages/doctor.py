@@ -17,7 +17,7 @@ from mudg.base.versions import version
 if TYPE_CHECKING:
     from mudg.data.scene.check import Finding
 
-_CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av")
+_CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av", "jinja2")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
     # module: (what it is for, how to get it)
     "pyarrow": ("logs of Argoverse 2 and format 2 of Waymo", "pip install 'mudg[data]'"),

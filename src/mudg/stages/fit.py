@@ -31,9 +31,11 @@ from torch import Tensor
 from mudg.base import checkpoint, log, palette, seeds, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import fused as kernels
 from mudg.core import losses, metrics
+from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_scene
@@ -59,7 +61,10 @@ from mudg.stages.fitting.views import (
     training_frames,
 )
 
-VERSION = 1
+OUTPUT = VerbOutput(
+    "fit", 1,
+    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "preview/*.png", "steps/"),
+)  # fmt: skip
 PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
@@ -109,12 +114,15 @@ def run(
     if recipe.virtual and observations is None:
         raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and hand its folder on")
     virtual = observations if recipe.virtual else None
+    refuse_overlap(
+        out, {"scene": scene, "fused": fused, "observations": observations, "lpips-weights": config.lpips_weights}
+    )
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
     if virtual is not None:
         inputs["observations"] = store.digest(Path(virtual))
     if config.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
-    folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
+    folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     with _one_torch_thread():
@@ -191,7 +199,7 @@ def start_state(
 # ---- the loop ------------------------------------------------------------------------------------------------------
 
 
-def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
+def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``virtual_beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
@@ -604,13 +612,11 @@ def render_view(model: SceneModel, view: View, raster: RasterConfig, sky_below_a
 
 def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
     """A picture: truth, render, depth, semantics of the middle recorded view."""
-    from mudg.data.exporters.video import depth_colors
-
     stored = state.views.recorded[len(state.views.recorded) // 2]
     seen = render_view(state.model, stored.view, raster)
-    panels = [stored.rgb, (seen.rgb * 255).round().byte().permute(1, 2, 0).numpy(), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
+    panels = [stored.rgb, to_bytes(seen.rgb), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
     if seen.semantics is not None:
-        panels.append(palette.encode(seen.semantics.numpy(), palette.DISPLAY_COLORS))
+        panels.append(class_colors(seen.semantics.numpy()))
     with store.atomic_path(path) as temporary:
         Image.fromarray(np.concatenate(panels, 1)).save(temporary)
 

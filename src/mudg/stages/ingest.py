@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,18 +13,19 @@ from typing import Any
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap, run_state
 from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS, files_of
 from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
-from mudg.data.scene import SceneWriter, alignment, read_scene
+from mudg.data.scene import SCENE_FILES, SceneWriter, alignment, read_scene
 from mudg.data.scene import check as scene_check
 from mudg.report import contact_sheet
 from mudg.stages import batch
 from mudg.stages.config import IngestConfig
 
 CITY = "city"
-_VERSION = 1
+_OUTPUT = VerbOutput("ingest", 1, (*SCENE_FILES, contact_sheet.NAME))
 
 
 def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> Path:
@@ -43,44 +42,32 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
         InputError: the log is missing, malformed or contradictory. UsageError: ``out`` holds something else.
     """
     source = str(source)
+    refuse_overlap(out, {"log": "" if source == CITY else source, "poses": config.poses, "boxes": config.boxes})
     kind = CITY if source == CITY else _kind(config, Path(source))
+    if kind in IMPORTERS:
+        files = files_of(kind, Path(source), import_options(config))
+        refuse_overlap(out, {f"file {n} of the log": path for n, path in enumerate((*files.files, *files.entries))})
     inputs = {} if kind == CITY else {"source": source_digest(Path(source), kind, config)}
     idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
     settings = {name: value for name, value in to_dict(config).items() if name not in idle}
-    existed = out.exists()
-    fresh = not existed or (out.is_dir() and not any(out.iterdir()))
-    folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite or _abandoned(out))
+    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite or _abandoned(out))
     if folder.complete:
         return folder.reused()
     try:
         return _fill(folder, kind, config, Path(source))
     except BaseException:
-        if (
-            fresh and not (folder.path / "scene.json").is_file()
-        ):  # nothing was made: the next try may ask for something else
-            _empty(folder.path, remove=not existed)
+        if folder.fresh and not (folder.path / "scene.json").is_file():
+            folder.discard()  # nothing was made: the next try may ask for something else
         raise
-
-
-def _empty(folder: Path, *, remove: bool) -> None:
-    """Take everything out of a folder, and the folder away."""
-    with contextlib.suppress(OSError):  # the error that brought us here is the one to tell
-        for entry in folder.iterdir():
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-        if remove:
-            folder.rmdir()
 
 
 def _abandoned(out: Path) -> bool:
     """Whether an import that is not finished made no scene at ``out`` yet."""
-    try:
-        state = store.read_json(out / "run.json")
-        return bool(state["verb"] == "ingest" and state["state"] != "complete" and not (out / "scene.json").is_file())
-    except (InputError, KeyError, TypeError):
-        return False
+    state = run_state(out)
+    return state.get("verb") == "ingest" and state["state"] != "complete" and not (out / "scene.json").is_file()
 
 
-def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -> Path:
+def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path:
     """Make the scene in its folder, draw its contact sheet and finish the run."""
     if (folder.path / "scene.json").is_file():
         scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
@@ -103,7 +90,7 @@ def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -
     }
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
-        log.info(f"ingest: look at {sheet}")
+        log.info(f"ingest: look at {folder.out / sheet.name}")
     folder.finish({**summary, **({} if kind == CITY else _alignment(scene))})
     return folder.path
 
@@ -164,7 +151,9 @@ def run_many(
     commas), poses and boxes for itself."""
     entries = batch.shard(batch.read_list(listed, _OF_A_LINE), shard)
     work = functools.partial(_one_of_many, config)
-    return batch.run_batch("ingest", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+    return batch.run_batch(
+        "ingest", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed
+    )
 
 
 def _one_of_many(config: IngestConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:

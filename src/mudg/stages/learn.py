@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from torch import Tensor
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.clips import from_log
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
@@ -42,6 +44,12 @@ from mudg.stages.learning.models import Model, draw_weights, freeze, kind_of, st
 from mudg.stages.learning.parallel import Interruption, Ranks, Spread, agreed_terms
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.state import TrainingState, mean_of
+
+_OUTPUT = VerbOutput(
+    "learn", 1,
+    ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", "samples/*.png", "tensorboard/", "loss.png",
+     "metrics.json", "model/*", "model.part/"),
+)  # fmt: skip
 
 
 def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
@@ -71,27 +79,40 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     return out / "model"
 
 
-def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> store.RunDir | None:
+def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunDir | None:
     """The run's folder, locked by the leader; None if a finished result is there and was verified."""
-    opened: list[store.RunDir] = []
+    opened: list[RunDir] = []
     settings = {name: value for name, value in to_dict(config).items() if name != "compute"}
 
-    def open_it() -> bool:
+    def open_it() -> str:
+        sources = [from_log.log_source(text) for text in config.data.scenes]
+        _refuse_overlap(config, out, sources, overwrite)
         inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
-        for number, text in enumerate(config.data.scenes):
-            source = from_log.log_source(text)
+        for number, source in enumerate(sources):
             inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
-        opened.append(store.RunDir.open(out, verb="learn", config=settings, inputs=inputs, overwrite=overwrite))
+        opened.append(RunDir.open(out, _OUTPUT, settings, inputs, overwrite))
         if opened[0].complete:
             opened[0].reused()
-        return opened[0].complete
+        return "" if opened[0].complete else str(opened[0].path)
 
-    if ranks.leader_does(open_it):
+    path = ranks.leader_does(open_it)
+    if not path:
         return None
-    return opened[0] if ranks.leads else store.RunDir(out, "learn", "", {}, complete=False)
+    return opened[0] if ranks.leads else RunDir(out, Path(path), _OUTPUT, "", {})
 
 
-def _train(model: Model, fresh: set[str], config: LearnConfig, directory: store.RunDir, ranks: Ranks) -> None:
+def _refuse_overlap(config: LearnConfig, out: Path, sources: Sequence[from_log.LogSource], overwrite: bool) -> None:
+    """UsageError where `out` touches something that is read. Clips may lie in `out` where they do by default, unless a result there
+    is to be replaced."""
+    read: dict[str, Path | str] = {"start": mdm_files.folder_of(config.start) if config.start else ""}
+    for number, source in enumerate(sources):
+        read |= {f"scene {number}": source.scene, f"fused {number}": source.fused}
+    clips = config.data.clips
+    own_clips = not overwrite and Path(clips).resolve() == (out / "clips").resolve()
+    refuse_overlap(out, {**read, "clips": "" if own_clips else clips})
+
+
+def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
     """Clips, codec, network, scores. From logs, `config` is rewritten in terms of shards: `given` is what the user said."""
     out, given, kind = directory.path, config, kind_of(model)
     bf16 = choose_bf16(config.precision)
@@ -183,7 +204,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
 
 
 def _train_network(
-    model: Model, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool, ranks: Ranks
+    model: Model, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool, ranks: Ranks
 ) -> dict[str, Tensor]:
     """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
     out = run_dir.path / "steps"
@@ -241,7 +262,7 @@ def _train_network(
     return state.export_weights(ranks)
 
 
-def _record(run_dir: store.RunDir, board: Any, step: int, values: dict[str, float]) -> None:
+def _record(run_dir: RunDir, board: Any, step: int, values: dict[str, float]) -> None:
     """A line of the log, the loss curve, and the same for TensorBoard if it is wanted."""
     run_dir.log(step=step, **values)
     learn_score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
@@ -260,7 +281,7 @@ def _score_watched(
     model: Model,
     weights: dict[str, Tensor],
     config: LearnConfig,
-    run_dir: store.RunDir,
+    run_dir: RunDir,
     folder: Path,
     step: int,
     bf16: bool,

@@ -29,25 +29,28 @@ from torch.nn import functional
 from mudg.base import log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.clips.condition import ConditionRules, ProjectedPoints, WarpSource, build_conditions
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationWriter
+from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip
 from mudg.models.mdm.codec import Modality
-from mudg.models.mdm.files import digest
+from mudg.models.mdm.files import digest, folder_of
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.learning import loading
 from mudg.stages.learning.precision import choose_bf16
-from mudg.stages.learning.score import class_image, depth_image, rgb_image
 
 SOURCE = "mudg_r"
 SKY = palette.ID["sky"]
-_VERSION = 1
+FITS = "depth_fits.json"
+"""Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
+_OUTPUT = VerbOutput("synthesize", 1, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
 
 
 @dataclass(frozen=True)
@@ -78,18 +81,19 @@ def run(
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
+    refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "model": folder_of(config.model)})
     config = loading.check_config(config, fitted is not None)
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": digest(config.model)}
     if fitted is not None:
         inputs["fitted"] = store.digest(fitted)
-    directory = store.RunDir.open(out, "synthesize", to_dict(config), inputs, _VERSION, overwrite)
+    directory = RunDir.open(out, _OUTPUT, to_dict(config), inputs, overwrite)
     if directory.complete:
         return directory.reused()
     loaded = read_scene(scene)
     cameras = config.cameras or tuple(loaded.cameras)[:1]
     if not cameras or not config.shifts_m:
         raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
-    jobs = [Job(config, Path(scene), Path(fused), Path(out), c, s, fitted) for c in cameras for s in config.shifts_m]
+    jobs = [Job(config, Path(scene), Path(fused), directory.path, c, s, fitted) for c in cameras for s in config.shifts_m]
     names = [trajectory_of(loaded, job).name for job in jobs]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
@@ -99,7 +103,7 @@ def run(
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
-    return out
+    return directory.path
 
 
 def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
@@ -253,10 +257,6 @@ def make_trajectory(job: Job) -> int:
     return len(path)
 
 
-FITS = "depth_fits.json"
-"""Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
-
-
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     """Number of finished windows and the latents of the last one."""
     files = sorted(state.glob("[0-9]*.safetensors"))
@@ -400,9 +400,8 @@ def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
 
 def _sheet_row(condition: Condition, sample: GeneratedClip, i: int) -> np.ndarray:
     """Condition, colour, depth, classes and confidence of one frame side by side, u8[H,5W,3]."""
-    trust = (sample.confidence[i, 0].clamp(0, 1) * 255).byte().numpy()
     cells = [
-        rgb_image(condition.color[i]), rgb_image(sample.rgb[i]), depth_image(sample.depth[i]), class_image(sample.semantics[i]),
-        np.repeat(trust[..., None], 3, 2),
+        to_bytes(condition.color[i]), to_bytes(sample.rgb[i]), depth_colors(sample.depth[i, 0].numpy()),
+        class_colors(sample.semantics[i].numpy()), gray(sample.confidence[i, 0].numpy()),
     ]  # fmt: skip
     return np.concatenate(cells, 1)

@@ -24,7 +24,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
@@ -32,6 +31,7 @@ from torch.nn import functional
 from mudg.base import palette
 from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, Track, View
+from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 
 
@@ -144,13 +144,6 @@ def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
         return rows, columns
     rows, columns = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
     return rows, columns
-
-
-def resize_image(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Area-averaged resize of u8[H,W,3] (the same array if the size is right already)."""
-    if rgb.shape[:2] == (height, width):
-        return rgb
-    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BOX))
 
 
 def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
@@ -349,7 +342,7 @@ def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> 
     if rules.published and rules.fine_width:
         size = (rules.height, rules.width)
         return functional.interpolate(_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
-    return _tensor(resize_image(nearest.rgb, rules.width, rules.height))
+    return _tensor(resize_area(nearest.rgb, rules.width, rules.height))
 
 
 def _tensor(rgb: NDArray[np.uint8]) -> Tensor:
@@ -379,7 +372,7 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     view = recorded.view.resized(width, height)
     _, depth, moving, _ = _filled(points.project(view), rules)
     return WarpSource(
-        view, _tensor(resize_image(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
+        view, _tensor(resize_area(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
     )
 
 

@@ -27,8 +27,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import geometry, palette, seeds, store
+from mudg.base.config import differences
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointCloud, Scene, Sweep, View
+from mudg.core.pictures import resize_area
 from mudg.core.project import project_points
 from mudg.data.clips.condition import (
     ConditionRules,
@@ -36,7 +38,6 @@ from mudg.data.clips.condition import (
     build_condition,
     nearest_valid,
     remove_shine_through,
-    resize_image,
 )
 from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
@@ -247,7 +248,7 @@ def _stacked(parts: Sequence[Condition]) -> Condition:
 def _truth(scene: Scene, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """rgb f32[3,H,W], depth f32[1,H,W] metres, where it is known bool[1,H,W], classes i64[H,W], all at the size of `view`."""
     width, height = view.camera.width, view.camera.height
-    rgb = torch.from_numpy(resize_image(recorded.rgb, width, height).copy()).permute(2, 0, 1).float() / 255
+    rgb = torch.from_numpy(resize_area(recorded.rgb, width, height).copy()).permute(2, 0, 1).float() / 255
     rows = ((np.arange(height) + 0.5) * recorded.rgb.shape[0] / height).astype(int)[:, None]
     columns = ((np.arange(width) + 0.5) * recorded.rgb.shape[1] / width).astype(int)[None]
     ids = np.full((height, width), palette.UNLABELLED, np.uint8)
@@ -329,7 +330,7 @@ def claim_folder(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]
         found = store.read_json(path)
         if found != wanted:
             raise UsageError("the folder holds training clips of other logs or settings", where=str(folder),
-                             got="; ".join(store.differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
+                             got="; ".join(differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
         return
     if folder.is_dir() and any(folder.glob("*.safetensors")):
         raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --data.clips")

@@ -183,7 +183,7 @@ def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> Non
             remedy="are records of another log, or of another unit, mixed in?")  # fmt: skip
 
 
-def nearest_index(sorted_times_s: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.intp]:
+def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
     """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to the earlier."""
     return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
 

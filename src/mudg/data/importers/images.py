@@ -26,6 +26,7 @@ from PIL import Image
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera
+from mudg.core.pictures import resize_nearest, shrink_exact
 from mudg.data.importers.options import ImportOptions, Resolution
 from mudg.data.scene import decode_image
 
@@ -135,7 +136,7 @@ class ImageFit:
         if self.table is not None:
             rgb = self.table.bilinear(rgb)
         size = (self.camera.height, self.camera.width)
-        return rgb if rgb.shape[:2] == size else shrink(rgb, *size)
+        return rgb if rgb.shape[:2] == size else shrink_exact(rgb, *size)
 
     def ids(self, ids: NDArray[Any]) -> NDArray[Any]:
         """Labels [H, W] of the recorded size -> [h, w] of the scene's: each pixel takes the nearest recorded one, none are mixed."""
@@ -145,11 +146,7 @@ class ImageFit:
                 expected=f"[{height}, {width}]", got=str(list(ids.shape)))  # fmt: skip
         if self.table is not None:
             ids = self.table.nearest(ids)
-        if (self.camera.height, self.camera.width) == (height, width):
-            return ids
-        rows = (np.arange(self.camera.height) + 0.5) * height / self.camera.height
-        columns = (np.arange(self.camera.width) + 0.5) * width / self.camera.width
-        return ids[rows.astype(int)[:, None], columns.astype(int)]
+        return resize_nearest(ids, self.camera.height, self.camera.width)
 
 
 def fit_images(
@@ -303,33 +300,3 @@ class _Table:
         """Each target pixel as its nearest source pixel."""
         place = self.corner + (self.right >= 128) + (self.down >= 128).astype(np.int32) * self.size[1]
         return np.ascontiguousarray(ids).reshape(-1).take(place)
-
-
-# --- shrinking --------------------------------------------------------------------------------------------------------------
-
-
-def shrink(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """u8[H, W, 3] -> u8[height, width, 3]: each new pixel is the mean over its exact area of the old image.
-
-    Raises:
-        InputError: larger than the image.
-    """
-    tall, wide = rgb.shape[:2]
-    if height > tall or width > wide:
-        raise InputError("images are never enlarged", expected=f"at most {wide}x{tall}", got=f"{width}x{height}")
-    down = _area_weights(tall, height) @ rgb.reshape(tall, wide * 3).astype(np.float32)
-    across = _area_weights(wide, width) @ down.reshape(height, wide, 3).transpose(1, 0, 2).reshape(wide, height * 3)
-    return np.rint(across.reshape(width, height, 3).transpose(1, 0, 2)).clip(0, 255).astype(np.uint8)
-
-
-def _area_weights(old: int, new: int) -> Any:
-    """Sparse f32[new, old]: the share of each old pixel in each new one; rows add to 1."""
-    from scipy.sparse import csr_matrix
-
-    edges = np.arange(new + 1) * (old / new)
-    first = np.floor(edges[:-1] + 1e-9).astype(int)
-    last = np.minimum(np.ceil(edges[1:] - 1e-9).astype(int), old)
-    rows = np.repeat(np.arange(new), last - first)
-    columns = np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
-    share = np.minimum(columns + 1, edges[rows + 1]) - np.maximum(columns, edges[rows])
-    return csr_matrix(((share * new / old).astype(np.float32), (rows, columns)), (new, old))

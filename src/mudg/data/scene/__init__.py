@@ -16,9 +16,10 @@ from __future__ import annotations
 from mudg.data.scene.check import Finding, check_scene
 from mudg.data.scene.labels import read_label, read_trusted_classes
 from mudg.data.scene.read import decode_image, read_image, read_points, read_scene
-from mudg.data.scene.write import SceneWriter, write_zip
+from mudg.data.scene.write import SCENE_FILES, SceneWriter, write_zip
 
 __all__ = [
+    "SCENE_FILES",
     "Finding",
     "SceneWriter",
     "check_scene",

@@ -22,6 +22,8 @@ from PIL import Image
 
 from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError
+from mudg.base.processes import process_alive
+from mudg.base.replacement import all_names
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
 from mudg.data.scene import schema
 from mudg.data.scene.files import open_files
@@ -29,6 +31,8 @@ from mudg.data.scene.labels import encode_label, encode_png, encode_safetensors,
 from mudg.data.scene.read import all_refs, check_image, checked_points, is_grey, read_points, read_scene
 
 _MAX_PENDING_WRITES: Final = 8
+SCENE_FILES: Final = ("scene.json", "tracks.json", "images/*/*", "lidar/*/*.safetensors", "labels/*/*/*")
+"""Patterns of the names in a scene directory."""
 
 
 class SceneWriter:
@@ -275,11 +279,13 @@ class SceneWriter:
                 return
             entries = sorted(self._partial.iterdir(), key=lambda entry: entry.name == "scene.json")
             for entry in entries:  # scene.json last: without it the folder is no scene
-                target = self.root / entry.name
-                if target.is_dir():
-                    shutil.rmtree(target)
-                entry.replace(target)
-            self._partial.rmdir()
+                if (self.root / entry.name).is_dir():  # file by file: what else lies there stays
+                    for name in all_names(entry):
+                        (self.root / entry.name / name).parent.mkdir(parents=True, exist_ok=True)
+                        (entry / name).replace(self.root / entry.name / name)
+                else:
+                    entry.replace(self.root / entry.name)
+            shutil.rmtree(self._partial)
         except OSError as error:
             raise ResourceError("scene cannot be moved into place", where=str(self.root), got=str(error)) from error
 
@@ -319,7 +325,7 @@ def _partial_folder(root: Path) -> Path:
     for stale in parent.iterdir() if parent.is_dir() else ():
         if stale.name.startswith(prefix) and stale.name.endswith(".part") and stale.is_dir():
             pid = stale.name.removeprefix(prefix).split("-")[0]
-            if pid.isdigit() and not store.process_alive(int(pid)):
+            if pid.isdigit() and not process_alive(int(pid)):
                 shutil.rmtree(stale, ignore_errors=True)
     return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
 

@@ -24,7 +24,6 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
@@ -33,6 +32,7 @@ from torch.nn import functional
 
 from mudg.base import seeds, shards
 from mudg.base.errors import InputError, UsageError
+from mudg.core.pictures import resize_bicubic
 from mudg.models import folders
 from mudg.models.depth.inputs import DepthInput, Prediction
 from mudg.models.depth.marigold import ddim_scheduler
@@ -300,7 +300,7 @@ def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: i
     low, high = float(depth[known].min()), float(depth[known].max())
     values = ((depth - low) / (high - low + 1e-6) - 0.5) * (2 * sampling.normalize_scale)
     index: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    scaled = np.array(Image.fromarray(given.rgb).resize((size[1], size[0]), Image.Resampling.BICUBIC))
+    scaled = resize_bicubic(given.rgb, size[1], size[0])
     fill = (0, -size[1] % cell, 0, -size[0] % cell)
 
     def padded(planes: NDArray[Any]) -> Tensor:
@@ -338,7 +338,7 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
     height, width = rgb.shape[:2]
     shorter = min(height, width)
     high, wide = height * side_px // shorter, width * side_px // shorter
-    scaled = np.array(Image.fromarray(rgb).resize((wide, high), Image.Resampling.BICUBIC))
+    scaled = resize_bicubic(rgb, wide, high)
     top, left = (high - side_px) // 2, (wide - side_px) // 2
     cut = torch.from_numpy(scaled[top : top + side_px, left : left + side_px]).permute(2, 0, 1)[None].float() / 255
     mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (_CLIP_MEAN, _CLIP_DEVIATION))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.core import losses
+from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures
 from mudg.models.mdm import files as mdm_files
 from mudg.stages.config import FitConfig
@@ -29,12 +30,16 @@ def perception_of(config: FitConfig) -> Perception:
         return _compared(FilterBank(), losses.feature_distance)
     if config.virtual_perception == "codec":
         codec = mdm_files.load("embedded").codec
-        return _compared(CodecFeatures(codec.requires_grad_(False)), losses.unit_feature_distance)
+        return _compared(CodecFeatures(codec.requires_grad_(False)), _lpips())
     if not config.lpips_weights:
         raise UsageError("LPIPS needs a file of its weights", where="--virtual-perception lpips", remedy="give it with --lpips-weights")
     state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
     trunk = LpipsFeatures(state, config.lpips_weights)
-    return _compared(trunk, lambda a, b, weight: losses.unit_feature_distance(a, b, weight, trunk.channel_weights))
+    return _compared(trunk, _lpips(trunk.channel_weights))
+
+
+def _lpips(channel_weights: Sequence[Tensor] | None = None) -> Callable[[list[Tensor], list[Tensor], Tensor], Tensor]:
+    return lambda render, target, weight: lpips_distance(render, unit_features(target), weight, channel_weights)
 
 
 def _compared(features: nn.Module, distance: Callable[[list[Tensor], list[Tensor], Tensor], Tensor]) -> Perception:

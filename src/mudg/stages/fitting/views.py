@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Sweep, Track, View
+from mudg.core.pictures import resize_area, resize_nearest
 from mudg.data import scene as scenefile
 from mudg.data.clips.condition import ConditionRules, project_sparse
 from mudg.data.observations import list_observation_sets, read_observations
@@ -184,9 +184,9 @@ def load_recorded(
     points = _SweepCache(scene)
     for frame in log.progress(frames, len(frames), "reading frames"):
         view = resized_view(frame.view, width_px)
-        size = (view.camera.width, view.camera.height)
+        size = (view.camera.height, view.camera.width)
         labels = {
-            name: resized_labels(scenefile.read_label(scene, frame, name), size) if name in frame.labels else None
+            name: resize_nearest(scenefile.read_label(scene, frame, name), *size) if name in frame.labels else None
             for name in ("semantics", "sky", "ego", "semantics_confidence")
         }
         confidence = labels["semantics_confidence"]
@@ -196,7 +196,7 @@ def load_recorded(
         without_lidar += lidar is None
         stored.append(
             StoredView(
-                frame.id, view, "recorded", "camera", resized_rgb(scenefile.read_image(scene, frame), size),
+                frame.id, view, "recorded", "camera", resize_area(scenefile.read_image(scene, frame), *size[::-1]),
                 None if semantics is None or not classes else to_channels(semantics, classes), sky,
                 None if labels["ego"] is None else ~labels["ego"].astype(bool), lidar,
                 confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
@@ -284,23 +284,6 @@ def resized_view(view: View, width_px: int) -> View:
     if width_px in (0, camera.width):
         return view
     return view.resized(width_px, max(1, round(camera.height * width_px / camera.width)))
-
-
-def resized_rgb(rgb: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Area-averaged resize of u8[H, W, 3] to (width, height)."""
-    if (rgb.shape[1], rgb.shape[0]) == size:
-        return np.ascontiguousarray(rgb)
-    return np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BOX)).copy()
-
-
-def resized_labels(labels: NDArray, size: tuple[int, int]) -> NDArray:
-    """Nearest-pixel resize of a label map (classes are never mixed)."""
-    height, width = labels.shape
-    if (width, height) == size:
-        return np.ascontiguousarray(labels)
-    rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
-    columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
-    return np.ascontiguousarray(labels[rows][:, columns])
 
 
 # ---- LiDAR depth of a recorded view ---------------------------------------------------------------------------------

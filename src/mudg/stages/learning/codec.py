@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import log, palette, seeds, store
+from mudg.base import log, palette, seeds
 from mudg.base.errors import ResourceError
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Clip
 from mudg.core import losses
 from mudg.models.mdm.codec import Modality, PatchCodec
@@ -25,7 +26,7 @@ LEARNING_RATE = 2e-3
 FIT_IMAGES = 8
 
 
-def train_codec(codec: PatchCodec, config: LearnConfig, run_dir: store.RunDir, folder: Path, bf16: bool) -> None:
+def train_codec(codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool) -> None:
     """Fit the linear parts on the first cities of `folder`, then train the decoder on noisy latents."""
     steps, out = config.codec.steps, run_dir.path / "codec"
     optimizer = torch.optim.AdamW(codec.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.99), weight_decay=1e-3)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from torch import Tensor
 
@@ -19,6 +18,7 @@ from mudg.base import palette, store
 from mudg.base.types import Clip
 from mudg.core import metrics
 from mudg.core.flicker import flicker
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.data.clips import shards as clip_shards
 from mudg.models.diffusion import GeneratedClip, SampleRequest
 from mudg.models.mdm.model import MDM
@@ -174,29 +174,6 @@ def table(scores: Mapping[str, Any]) -> str:
 # pictures -------------------------------------------------------------------------------------------------------------
 
 
-def depth_image(depth: Tensor, far_m: float = 100.0) -> NDArray[np.uint8]:
-    """Depth f32[1,H,W] metres as a grey-free picture u8[H,W,3]: near red, far blue, logarithmic."""
-    d = depth[0].clamp(2.0, far_m).numpy()
-    share = np.log(d / 2.0) / np.log(far_m / 2.0)
-    anchors = np.array(
-        [[122, 4, 3], [230, 90, 14], [225, 220, 55], [72, 230, 120], [40, 130, 235], [48, 18, 59]], float
-    )
-    x = share * (len(anchors) - 1)
-    low = np.clip(x.astype(int), 0, len(anchors) - 2)
-    f = (x - low)[..., None]
-    return (anchors[low] * (1 - f) + anchors[low + 1] * f).astype(np.uint8)
-
-
-def class_image(ids: Tensor) -> NDArray[np.uint8]:
-    """Class ids i64[H,W] in display colours u8[H,W,3]."""
-    return palette.encode(ids.numpy(), palette.DISPLAY_COLORS)
-
-
-def rgb_image(rgb: Tensor) -> NDArray[np.uint8]:
-    """Colour f32[3,H,W] in [0,1] as u8[H,W,3]."""
-    return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-
-
 def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
     """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes; confidence."""
     rows = []
@@ -204,11 +181,11 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
         t = min(frame, len(sample.confidence) - 1)
         given = clip.condition
         measured = torch.where(given.valid[t], given.depth[t], 100.0)
-        trust = (sample.confidence[t, 0].clamp(0, 1) * 255).byte().numpy()
         cells = [
-            rgb_image(given.color[t]), rgb_image(sample.rgb[t]), rgb_image(clip.rgb[t]), depth_image(measured),
-            depth_image(sample.depth[t]), depth_image(clip.depth[t]), class_image(sample.semantics[t]),
-            class_image(clip.semantics[t]), np.repeat(trust[..., None], 3, 2),
+            *(to_bytes(rgb) for rgb in (given.color[t], sample.rgb[t], clip.rgb[t])),
+            *(depth_colors(depth[0].numpy()) for depth in (measured, sample.depth[t], clip.depth[t])),
+            *(class_colors(ids.numpy()) for ids in (sample.semantics[t], clip.semantics[t])),
+            gray(sample.confidence[t, 0].numpy()),
         ]  # fmt: skip
         rows.append(np.concatenate(cells, 1))
     with store.atomic_path(path) as temporary:

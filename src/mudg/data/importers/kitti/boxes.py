@@ -106,13 +106,14 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     boxes = []
     for track, item in enumerate(root.findall("./tracklets/item")):
         where = f"{path}: tracklet {track}"
-        size_m = box_size(*(_xml_number(item, key, where) for key in ("l", "w", "h")), where)
+        length, width, height = (_xml_number(item, key, where) for key in ("l", "w", "h"))
+        size_m = box_size(length, width, height, where)
         first = int(_xml_number(item, "first_frame", where))
         label = (item.findtext("objectType") or "").strip().lower()
         for step, pose in enumerate(item.findall("./poses/item")):
             here = f"{where} pose {step}"
             tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
-            boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + size_m[2] / 2))))
+            boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + height / 2))))
     return boxes
 
 

@@ -119,19 +119,14 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
 def files_of_nuplan(source: Path, options: ImportOptions) -> LogFiles:
     """The log's database, and which sensor blobs there are."""
     path, _ = _find(source, options)
-    found = (folder / "sensor_blobs" / path.stem for folder in path.resolve().parents[:5])
-    blobs = next((folder for folder in found if folder.is_dir()), None)
-    return LogFiles((path,), tuple(sorted(blobs.iterdir())) if blobs is not None else ())
+    blobs = _sensor_blobs(path, path.stem)
+    return LogFiles((path,), tuple(sorted((blobs / path.stem).iterdir())) if blobs is not None else ())
 
 
-def _blobs(path: Path, name: str) -> Path:
-    """The folder ``sensor_blobs`` that holds this log."""
-    for folder in path.resolve().parents[:5]:
-        if (folder / "sensor_blobs" / name).is_dir():
-            return folder / "sensor_blobs"
-    raise InputError("sensor blobs of the log were not found", where=str(path),
-        expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
-        remedy="download the camera and LiDAR blobs of this log; the database alone holds no images")  # fmt: skip
+def _sensor_blobs(path: Path, name: str) -> Path | None:
+    """The folder ``sensor_blobs`` that holds this log, beside the database or up to four folders above it."""
+    found = (folder / "sensor_blobs" for folder in path.resolve().parents[:5])
+    return next((folder for folder in found if (folder / name).is_dir()), None)
 
 
 # --- what is imported -------------------------------------------------------------------------------------------------
@@ -170,7 +165,11 @@ class _NuplanPlan:
 
 def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     name, where = opened.name(), str(opened.path)
-    blobs = _blobs(opened.path, name)
+    blobs = _sensor_blobs(opened.path, name)
+    if blobs is None:
+        raise InputError("sensor blobs of the log were not found", where=where,
+            expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
+            remedy="download the camera and LiDAR blobs of this log; the database alone holds no images")  # fmt: skip
     if scene and scene not in opened.scenes():
         raise UsageError("the log has no such scene", where=where, got=scene,
             expected=", ".join(opened.scenes()[:12]) or "no scenes")  # fmt: skip

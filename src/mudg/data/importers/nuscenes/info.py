@@ -23,7 +23,7 @@ from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.data.importers.images import image_size
 from mudg.data.importers.info_frames import Size, info_record, info_tracks
 from mudg.data.importers.layout import chosen_cameras, folder_contents, path_inside, refuse_options
-from mudg.data.importers.nuscenes.importer import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
+from mudg.data.importers.nuscenes.sensors import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
