@@ -11,7 +11,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core.metrics import Pair
 from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.featnets import CodecFeatures, PerceptualDistance
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.stages.config.fit import VirtualConfig
 from mudg.stages.fitting.perception import perception_of
 
@@ -28,7 +28,7 @@ def test_gradient_of_the_loss():
 
 
 def test_the_loss_is_the_scorers_distance_where_all_is_certain():
-    codec = CodecFeatures(mdm.load("embedded").codec)
+    codec = CodecFeatures(files.load("embedded").codec)
     render, truth = random(5, 3, 24, 32).float(), random(6, 3, 24, 32).float()
     loss = perception_of(VirtualConfig(perception="codec"))(render, truth, torch.ones(1, 24, 32))
     pair = Pair(rgb=render, truth_rgb=truth, **dict.fromkeys(

@@ -36,7 +36,7 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
 from mudg.methods import METHODS
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
 from mudg.stages import fit, fuse, ingest, render, score, score_truth, synthesize
 from mudg.stages.config import (
@@ -111,7 +111,7 @@ def run(
         UsageError: an unknown method, a malformed variant, or ``out`` holds logs of other settings. Whatever a verb raises.
     """
     rows = rows_of(config)
-    refuse_overlap(out, {"model": mdm.folder_of(config.model)})
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
     _refuse_foreign(Path(out))
     seeds = city_logs.LISTS[config.list][: config.logs]
     shifts = tuple(sign * d for d in distances_m for sign in (1.0, -1.0))
@@ -215,7 +215,7 @@ def rows_as_values(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
     """What was asked for, for JSON."""
     return {
-        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm.digest(config.model),
+        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
         "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
         "held_out_every": TEST_EVERY, "ablation": config.ablation,
     }  # fmt: skip

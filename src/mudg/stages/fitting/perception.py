@@ -13,7 +13,7 @@ from mudg.base.errors import UsageError
 from mudg.core import losses
 from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.stages.config.fit import VirtualConfig
 
 Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -29,7 +29,7 @@ def perception_of(config: VirtualConfig) -> Perception:
     if config.perception == "filters":
         return _compared(FilterBank(), losses.feature_distance)
     if config.perception == "codec":
-        codec = mdm.load("embedded").codec
+        codec = mdm_files.load("embedded").codec
         return _compared(CodecFeatures(codec.requires_grad_(False)), _lpips())
     if not config.lpips_weights:
         raise UsageError("LPIPS needs a file of its weights", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
