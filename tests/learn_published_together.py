@@ -11,8 +11,8 @@ os.environ["GLOO_SOCKET_IFNAME"] = "lo"
 import torch.distributed as dist
 from toy_published import published_settings
 
+from mudg.base.processes import Interruption
 from mudg.stages import learn
-from mudg.stages.learning.parallel import Interruption
 
 rank, store, start, clips, out = int(sys.argv[1]), *sys.argv[2:5], Path(sys.argv[5])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)

@@ -29,6 +29,7 @@ from torch import Tensor
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError
+from mudg.base.processes import Interruption
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.clips import from_log
 from mudg.models.diffusion import SampleRequest
@@ -41,7 +42,7 @@ from mudg.stages.learning import parallel
 from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.clips import class_weights, draw_clips
 from mudg.stages.learning.models import Model, draw_weights, freeze, kind_of, starting_model
-from mudg.stages.learning.parallel import Interruption, Ranks, Spread, agreed_terms
+from mudg.stages.learning.parallel import SAME_SIGNAL_S, Ranks, Spread, agreed_terms
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.state import TrainingState, mean_of
 
@@ -215,7 +216,7 @@ def _train_network(
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
-    with log.task("network", config.steps, begun) as bar, Interruption() as interruption:
+    with log.task("network", config.steps, begun) as bar, Interruption(SAME_SIGNAL_S) as interruption:
         for step in range(begun, config.steps):
             for group in state.optimizer.param_groups:
                 group["lr"] = learning_rate(config, step)
@@ -256,7 +257,7 @@ def _train_network(
                 ranks.leader_does(partial(_score_watched, model, made, config, run_dir, folder, done, bf16))
             if stop and not last:
                 log.info(f"learn: stopped after step {saved_at}, which is saved")
-                interruption.end()
+                interruption.stop_now()
     if board is not None:
         board.close()
     return state.export_weights(ranks)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.errors import InputError, ResourceError
+from mudg.base.processes import run_in_processes
 from mudg.base.types import Clip
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
@@ -139,11 +140,8 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
                 from_log.write_log(*job)
                 bar.advance()
         else:
-            context = multiprocessing.get_context("spawn")
-            with concurrent.futures.ProcessPoolExecutor(config.compute.workers, mp_context=context) as pool:
-                for future in [pool.submit(from_log.write_log, *job) for job in jobs]:
-                    future.result()
-                    bar.advance()
+            for _ in run_in_processes(from_log.write_log, jobs, config.compute.workers):
+                bar.advance()
     scored = sum(window.held_out for _, _, window in rows)
     return len(rows) - scored, scored
 

@@ -17,10 +17,7 @@ import functools
 import json
 import math
 import os
-import signal
-import threading
 import time
-import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -30,11 +27,14 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as recomputed
 
-from mudg.base import errors, log
+from mudg.base import log
 from mudg.base.errors import MudgError, NumericsError, ResourceError, UsageError
+from mudg.base.processes import error_from_record, error_record
 
 PATIENCE = datetime.timedelta(hours=6)
 """How long processes wait for each other: as long as the leader may need to make clips or to score."""
+SAME_SIGNAL_S = 2.0
+"""The terminal sends Ctrl-C to all processes, and launchers pass it on: within this time a second one is the same one."""
 PARTING_S = 0.5
 """Rest after the last message. Threads of gloo let go of its tensors a moment later, and need the interpreter for that; one that comes
 when the interpreter is already shutting down aborts the process, after all the work is done and saved."""
@@ -91,13 +91,11 @@ class Ranks:
             try:
                 answer = {"value": work()}
             except MudgError as error:
-                fields = (error.what, error.where, error.expected, error.got, error.remedy)
-                self.broadcast({"error": type(error).__name__, "fields": fields})
+                self.broadcast({"failed": error_record(error)})
                 raise
         answer = self.broadcast(answer)
-        if "error" in answer:
-            what, where, expected, got, remedy = answer["fields"]
-            raise _ERRORS.get(answer["error"], MudgError)(what, where=where, expected=expected, got=got, remedy=remedy)
+        if "failed" in answer:
+            raise error_from_record(answer["failed"])
         return answer["value"]
 
     def all_do(self, work: Callable[[], None]) -> None:
@@ -133,13 +131,6 @@ class Ranks:
             )  # fmt: skip
         first = self.rank * parts * size
         return [slice(first + n * size, first + (n + 1) * size) for n in range(parts)]
-
-
-_ERRORS: dict[str, type[MudgError]] = {
-    kind.__name__: kind
-    for kind in vars(errors).values()
-    if isinstance(kind, type) and issubclass(kind, MudgError)
-}  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -295,48 +286,6 @@ def clip_gradients(part: nn.Module, limit: float) -> float:
 
 
 # a step's end ---------------------------------------------------------------------------------------------------------
-
-
-class Interruption:
-    """Ctrl-C and SIGTERM wait for the end of the step, so that a checkpoint can be written; a second one does not wait.
-
-    Launchers pass on a signal that the terminal has sent already: a repetition within two seconds is the same one.
-    """
-
-    def __init__(self) -> None:
-        self._number = 0
-        self._since = 0.0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Interruption:
-        if threading.current_thread() is threading.main_thread():
-            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, before in self._before.items():
-            signal.signal(number, before)
-        self._before = {}
-
-    def _note(self, number: int, frame: types.FrameType | None) -> None:
-        now = time.monotonic()
-        if self._number and now - self._since > 2.0:
-            self.end(number, frame)
-        if not self._number:
-            self._number, self._since = number, now
-            log.info("stopping after this step; once more to stop at once")
-
-    @property
-    def requested(self) -> bool:
-        """Whether a signal to stop has arrived."""
-        return self._number != 0
-
-    def end(self, number: int = 0, frame: types.FrameType | None = None) -> None:
-        """Do what the signal would have done at once: raise KeyboardInterrupt, or what the program has set."""
-        before = self._before.get(number or self._number)
-        if callable(before):
-            before(number or self._number, frame)
-        raise KeyboardInterrupt
 
 
 def agreed_terms(
