@@ -24,11 +24,11 @@ def view_at(x=0.0, y=0.0, time_s=0.0, camera=CAMERA):
     return View(camera, pose, time_s)
 
 
-def wall(x_m, colour_of_y, y_range=(-20, 20), z_range=(-9, 9), step=0.05):
+def wall(x_m, color_of_y, y_range=(-20, 20), z_range=(-9, 9), step=0.05):
     """A wall across the view at x = x_m with colours by lateral position."""
     y, z = np.meshgrid(np.arange(*y_range, step), np.arange(*z_range, step))
     xyz = np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], 1).astype(np.float32)
-    return PointCloud(xyz, colour_of_y(y.ravel()).astype(np.uint8), "world")
+    return PointCloud(xyz, color_of_y(y.ravel()).astype(np.uint8), "world")
 
 
 def stripes(y):

@@ -101,7 +101,7 @@ def test_distorted_images_are_rectified_and_jpeg_stays_jpeg(truth: Scene, tmp_pa
     assert any("rectified" in note for note in scene.source.notes)
     plain = made.write_nuplan(truth, tmp_path / "plain", jpeg=True)  # no distortion: the files are kept
     roundtrip.assert_same_log(
-        ingest(plain, tmp_path / "same"), truth, labels={"car": "vehicle"}, intensity=0.002, colour_levels=3
+        ingest(plain, tmp_path / "same"), truth, labels={"car": "vehicle"}, intensity=0.002, color_levels=3
     )
 
 

@@ -187,8 +187,8 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
     assert "mudg_r" not in panels
     atlas = next(run_report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
     h, w = toy_views.HEIGHT, toy_views.WIDTH
-    assert np.array_equal(atlas[:h, :w], toy_views.colours(0))
-    assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colours(0) * 0.8)).max() <= 1
+    assert np.array_equal(atlas[:h, :w], toy_views.colors(0))
+    assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colors(0) * 0.8)).max() <= 1
     assert (atlas[h : 2 * h, :w][np.isnan(toy_views.depths())] == 0).all()
     assert tuple(atlas[2 * h, 0]) == (70, 130, 180)  # sky in the usual colour
     assert (atlas[:h, 2 * w : 3 * w] == 24).all()  # not produced
@@ -206,7 +206,7 @@ def test_a_shifted_view_of_a_log_shows_the_recorded_path_beside_it(tmp_path: Pat
     panels = {c: (run_report._rows(columns, c)) for c in columns.sets}
     assert all("error" not in rows for rows in panels.values())
     atlas = next(run_report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
-    assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colours(0))
+    assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colors(0))
 
 
 def run_of(psnr: dict[tuple[str, float], float | str], truth: str = "exact") -> dict[str, Any]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fit_settings import fit_config
 from scipy import ndimage
 from toy_scene import ToyStreet
 
@@ -18,7 +19,7 @@ from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import fit, fuse, synthesize
-from mudg.stages.config import FitConfig, FuseConfig, SynthesizeConfig
+from mudg.stages.config import FuseConfig, SynthesizeConfig
 
 FRAMES = 7
 
@@ -188,7 +189,7 @@ def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
     """Views change where nothing was measured, and the scene's class stands there."""
     root, config = world
     fitted = fit.run(
-        FitConfig(method="street_gaussians", iterations=4, initial_gaussians=900, max_gaussians=1500), root / "scene", root / "fused",
+        fit_config(method="street_gaussians", iterations=4, start__gaussians=900), root / "scene", root / "fused",
         tmp_path / "fit",
     )  # fmt: skip
     scene, cloud = read_scene(root / "scene"), read_fused(root / "fused")

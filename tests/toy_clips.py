@@ -22,8 +22,8 @@ def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
     """A clip with structure: a horizon, a box, a noisy half-seen condition."""
     generator = torch.Generator().manual_seed(seed)
     rows = torch.arange(height).view(1, 1, height, 1).expand(WINDOW, 1, height, width)
-    colour = torch.rand(2, 3, 1, 1, generator=generator)
-    rgb = torch.where(rows < 12, colour[0], colour[1])
+    color = torch.rand(2, 3, 1, 1, generator=generator)
+    rgb = torch.where(rows < 12, color[0], color[1])
     depth = torch.where(rows < 12, torch.tensor(1000.0), 200.0 / (rows - 8).clamp(min=1).float())
     ids = torch.where(rows < 12, 10, 0)[:, 0].clone()
     box = int(torch.randint(4, width - 14, (), generator=generator))

@@ -230,7 +230,7 @@ VERBS: dict[str, Verb] = {
     "bench": Verb(
         "Measurements against exact truth: mdm, poses, shift.",
         ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses",
-         "mudg bench shift --list development --logs 1 --variant strong=virtual_probability:0.4 --out runs/shift"),
+         "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift"),
         _bench,
     ),
 }  # fmt: skip

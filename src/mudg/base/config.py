@@ -62,6 +62,20 @@ def load(
     return build(config_type, values, str(yaml_path or "configuration"))
 
 
+def nested(dotted: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys such as ``virtual.start`` as mappings in mappings; UsageError if a name is both a value and a group."""
+    tree: dict[str, Any] = {}
+    for key, value in dotted.items():
+        *groups, name = key.split(".")
+        place = tree
+        for group in groups:
+            place = place.setdefault(group, {})
+            if not isinstance(place, dict):
+                raise UsageError("a configuration key is both a value and a group", where=key)
+        place[name] = value
+    return tree
+
+
 def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> Config:
     """Validate plain values as a ``config_type``; UsageError names the first wrong field."""
     try:

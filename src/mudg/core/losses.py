@@ -87,7 +87,7 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
 
-    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.fused.photometric`` computes the same value and
+    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes the same value and
     gradient in one native pass.
     """
     if weight is not None:
@@ -176,7 +176,7 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
 def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
 
-    ``core.fused.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
+    ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
     """
     if lift is not None:
         logits = logits.index_add(0, torch.tensor([lift[0]], device=logits.device), lift[1].detach()[None].to(logits.dtype))
@@ -194,6 +194,28 @@ def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) 
     alpha = object_alpha.clamp(floor, 1 - floor)
     entropy = -(alpha * torch.log(alpha) + (1 - alpha) * torch.log(1 - alpha))
     return torch.where(inside_boxes, entropy, -torch.log(1 - alpha))
+
+
+# ---- regularisers ------------------------------------------------------------------------------------------------
+
+
+def opacity_and_scale(opacity: Tensor, scales_m: Tensor, opacity_weight: float, scale_weight: float) -> dict[str, Tensor]:
+    """Weighted mean opacity and mean scale of all Gaussians (Kheradmand et al. 2024), scalars by name; a weight of 0 leaves a term out.
+
+    Args:
+        opacity: ``[N]`` in [0, 1]. scales_m: ``[N, 3]`` metres.
+    """
+    terms = {}
+    if opacity_weight:
+        terms["opacity"] = opacity_weight * opacity.mean()
+    if scale_weight:
+        terms["scale"] = scale_weight * scales_m.mean()
+    return terms
+
+
+def identity_distance(difference: Tensor) -> Tensor:
+    """Mean absolute entry (scalar) of what a colour map differs from the identity by, ``[3, 4]`` (Street Gaussians)."""
+    return difference.abs().mean()
 
 
 # ---- features ----------------------------------------------------------------------------------------------------

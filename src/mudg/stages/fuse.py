@@ -82,7 +82,7 @@ def rules_of(config: FuseConfig) -> FusionRules:
 
 def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
     """The sweeps of a scene, one at a time, each with the images that may colour it."""
-    frames = [f for f in scene.frames if config.colour_from_held_out or scene.split.get(f.id, "train") == "train"]
+    frames = [f for f in scene.frames if config.color_from_held_out or scene.split.get(f.id, "train") == "train"]
     by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "fusing sweeps"):
         chosen = [_nearest(found, sweep.time_s) for found in by_camera.values() if found]
@@ -121,7 +121,7 @@ def describe(report: FusionReport) -> list[str]:
     movers = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
     total = max(report.points_in, 1)
     lines = [
-        f"{report.sweeps} sweeps, {report.points_in} points: {report.points_coloured / total:.0%} coloured, "
+        f"{report.sweeps} sweeps, {report.points_in} points: {report.points_colored / total:.0%} coloured, "
         f"{report.points_hidden / total:.1%} hidden behind nearer surfaces, {report.points_unseen / total:.0%} in no image",
         f"{len(movers)} of {len(report.verdicts)} tracked boxes move; {report.points_static} points in the static cloud",
     ]

@@ -96,7 +96,7 @@ def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
         "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
         "ingest.poses": config.ingest.poses, "ingest.boxes": config.ingest.boxes, "annotate.weights": config.annotate.weights,
         "annotate.depth-network": config.annotate.depth_network, "synthesize.model": folder_of(config.synthesize.model),
-        "fit.lpips-weights": config.fit.lpips_weights, "score.lpips-weights": config.score.lpips_weights,
+        "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights, "score.lpips-weights": config.score.lpips_weights,
     })  # fmt: skip
 
 

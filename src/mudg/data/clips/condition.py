@@ -287,10 +287,10 @@ def _condition_of_view(
         return sources[number]
 
     sparse = points.project(view)
-    colour, depth, moving, ids = _filled(sparse, rules)
+    color, depth, moving, ids = _filled(sparse, rules)
     found = torch.zeros_like(sparse.valid)
     if not (rules.warp and recorded):
-        return colour, depth[None], sparse.valid[None], found[None], colour, ids[None], ids[None]
+        return color, depth[None], sparse.valid[None], found[None], color, ids[None], ids[None]
     order = _order_of_images(view, recorded, rules)
     nearest = source(order[0])
     x, y, _ = carry(view, torch.full((1, *depth.shape), rules.backdrop_m), nearest.view)
@@ -301,10 +301,10 @@ def _condition_of_view(
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
         rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
         new = new & ~found if fresh else new & ~found & ~moving
-        colour = torch.where(new, rgb, colour)
+        color = torch.where(new, rgb, color)
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
         found = found | new
-    return colour, depth[None], sparse.valid[None], found[None], backdrop, ids[None], far_ids
+    return color, depth[None], sparse.valid[None], found[None], backdrop, ids[None], far_ids
 
 
 def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -43,7 +43,7 @@ class BenchConfig:
     ablation: bool = False
     """shift: also mudg_s with only some of its virtual terms: colour; colour and depth; colour and classes."""
     variant: tuple[str, ...] = ()
-    """shift: also mudg_s with other settings of fit, each NAME=FIELD:VALUE,FIELD:VALUE."""
+    """shift: also mudg_s with other settings of fit, each NAME=FIELD:VALUE,FIELD:VALUE (virtual.start is a field)."""
     processes: int = Field(default=0, ge=0)
     """shift: logs worked on at the same time, one thread each (0 = one per core)."""
     videos: bool = True

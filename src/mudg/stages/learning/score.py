@@ -221,9 +221,9 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
             y = place(50, 10**power)[1]
             draw.line([(50, y), (width - 20, y)], fill="#dddddd")
             draw.text((4, y - 6), f"{10**power:.3f}", fill="black")
-    for (name, line), colour in zip(series.items(), ("black", "#c03030", "#2050c0", "#209050"), strict=False):
-        draw.line([place(s, v) for s, v in line], fill=colour, width=2)
-        draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=colour)
+    for (name, line), color in zip(series.items(), ("black", "#c03030", "#2050c0", "#209050"), strict=False):
+        draw.line([place(s, v) for s, v in line], fill=color, width=2)
+        draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=color)
     draw.text((50, height - 18), f"steps, logarithmic, 50 to {last}", fill="black")
     with store.atomic_path(path) as temporary:
         image.save(temporary)

@@ -32,17 +32,10 @@ from numpy.typing import NDArray
 from mudg.base import log
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene, Source, Track
-from mudg.data.importers import common, drive_log
+from mudg.data.importers import common, drive_log, layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import (
-    LogFiles,
-    chosen_cameras,
-    path_inside,
-    refuse_missing_cameras,
-    refuse_untwist,
-    the_only,
-)
+from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.nuscenes import tables
 from mudg.data.importers.nuscenes.info import import_info_frame, looks_like_info_frame
 from mudg.data.importers.nuscenes.sensors import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
@@ -92,7 +85,7 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
-    refuse_untwist(options, "nuScenes", str(source))
+    layout.refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
         return import_info_frame(source, out, options)
@@ -145,8 +138,8 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
         sensor = sensors.get(calibration, "sensor_token", calibrations.where)
         channel_of[row["token"]] = tables.text(sensor, "channel", sensors.where)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
-    chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, tuple(CAMERAS))}
-    refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
+    chosen = {there[raw]: raw for raw in layout.chosen_cameras(there, options, where, tuple(CAMERAS))}
+    layout.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
@@ -185,7 +178,7 @@ def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Pat
             if wanted in ("", name, row.get("token")):
                 found.append((folder, row))
     # the same scene may lie in two releases: the smaller one is quicker
-    return the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
+    return layout.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
 
 
 def _samples_in_order(folder: Path, scene: tables.Row) -> dict[str, int]:
@@ -243,7 +236,7 @@ class _RowReader:
         return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
 
     def file(self, row: tables.Row) -> Path:
-        return path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+        return layout.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
 
     def image(self, row: tables.Row, camera: str) -> ImageRecord:
         return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))

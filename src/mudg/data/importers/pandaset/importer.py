@@ -34,20 +34,13 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
+from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.columns import finite_columns, record_fields, require_columns
 from mudg.data.importers.common import pose_from_quaternion, seconds, world_from_first
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.data.importers.layout import (
-    LogFiles,
-    chosen_cameras,
-    complete_frames,
-    folder_contents,
-    numbered_files,
-    refuse_options,
-    the_only,
-)
+from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
 from mudg.data.importers.pandaset.pandas_frame import read_frame
 
@@ -130,13 +123,13 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
         UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
         InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
-    refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
+    layout.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)
     cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}
-    chosen = chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
-    images = {name: numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
-    clouds = numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
-    frames = complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
+    chosen = layout.chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
+    images = {name: layout.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
+    clouds = layout.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
+    frames = layout.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
     motion = _Motion.read(folder, frames, chosen)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
     cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
@@ -189,15 +182,15 @@ def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
         return source
     sequences = _sequences(source)
     if not sequences and not options.sequence:
-        raise InputError("no PandaSet sequence found", where=str(source), got=folder_contents(source),
+        raise InputError("no PandaSet sequence found", where=str(source), got=layout.folder_contents(source),
             expected="lidar/poses.json and camera/front_camera and so on")  # fmt: skip
     matching = [name for name in sequences if options.sequence in ("", name)]
-    return source / the_only(matching, sequences, options, source, "sequence")
+    return source / layout.the_only(matching, sequences, options, source, "sequence")
 
 
 def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -> dict[int, Path]:
     """Cuboid tables by frame number; none at all is allowed, gaps are not."""
-    cuboids = numbered_files(folder, (".pkl.gz", ".pkl"))
+    cuboids = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
     lacks = [number for number in frames if number not in cuboids]
     if cuboids and lacks and not options.skip_missing:
         raise InputError("a frame has no boxes", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz",

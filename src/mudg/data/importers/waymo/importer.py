@@ -35,7 +35,7 @@ from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, 
 from mudg.data.importers.images import ImageFit, fit_images
 from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
 from mudg.data.importers.options import ImportOptions
-from mudg.data.importers.waymo import sensors
+from mudg.data.importers.waymo import sensors, tracks
 from mudg.data.importers.waymo.parquet import REQUIRED, ParquetLog
 from mudg.data.importers.waymo.records import (
     CAMERAS,
@@ -47,16 +47,7 @@ from mudg.data.importers.waymo.records import (
     WaymoLog,
 )
 from mudg.data.importers.waymo.tfrecord import TfrecordLog
-from mudg.data.importers.waymo.tracks import (
-    FAST_M_S,
-    MOMENTS,
-    Moment,
-    TimedBoxes,
-    build_tracks,
-    choose_moment,
-    points_inside,
-    velocities,
-)
+from mudg.data.importers.waymo.tracks import Moment, TimedBoxes
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
@@ -97,7 +88,7 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     plan = _plan(waymo, frames, cameras, options, notes)
     moment, note = _moment_of_boxes(waymo, frames, plan)
     notes += [note] if note else []
-    tracks, track_notes = build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
+    found, track_notes = tracks.build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
     notes += track_notes
     check = _check_projections(waymo, frames, cameras, plan)
     notes += [check] if check else []
@@ -112,16 +103,8 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     path = EgoPath(np.array([plan.pose_s(f) for f in frames]), np.stack([plan.world_from_vehicle(f) for f in frames]))
     origin = Source("waymo", LICENCE, None, tuple(notes))
     content = SceneContent(
-        waymo.name,
-        origin,
-        plan.fits,
-        items(),
-        convert,
-        lambda item: item[0].where,
-        path,
-        lambda: (tracks, ()),
-        len(frames),
-    )
+        waymo.name, origin, plan.fits, items(), convert, lambda item: item[0].where, path, lambda: (found, ()), len(frames)
+    )  # fmt: skip
     return write_scene(content, out, options)
 
 
@@ -346,10 +329,11 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
     """For which moment the boxes of this log hold, by the points in the boxes of its fast objects; and a note."""
     boxes = [plan.timed_boxes(frame, "pose") for frame in frames]
     fast = [
-        {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= FAST_M_S} for speeds in velocities(boxes)
+        {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= tracks.FAST_M_S}
+        for speeds in tracks.velocities(boxes)
     ]
     order = sorted(range(len(frames)), key=lambda index: -len(fast[index]))[:_MOMENT_FRAMES]
-    counts = np.zeros(len(MOMENTS), np.int64)
+    counts = np.zeros(len(tracks.MOMENTS), np.int64)
     for index in sorted(order):
         frame = frames[index]
         if not fast[index] or TOP not in frame.lasers:
@@ -361,12 +345,12 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
         for box, late in zip(frame.boxes, plan.seen_s(frame), strict=True):
             if box.id in fast[index]:
                 velocity = fast[index][box.id] @ rotation
-                counts += points_inside(box, velocity, xyz, seen, float(late), plan.middle_s[frame.number])
+                counts += tracks.points_inside(box, velocity, xyz, seen, float(late), plan.middle_s[frame.number])
     if not counts.any():
         return ("seen" if any(TOP in frame.lasers for frame in frames) else "pose"), ""
-    moment = choose_moment(counts)
+    moment = tracks.choose_moment(counts)
     texts = {"seen": "when the LiDAR passes them", "start": "at the timestamp", "pose": "at the frame's pose"}
-    tallies = ", ".join(f"{count} {texts[name]}" for name, count in zip(MOMENTS, counts, strict=True))
+    tallies = ", ".join(f"{count} {texts[name]}" for name, count in zip(tracks.MOMENTS, counts, strict=True))
     return moment, f"boxes hold {texts[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
 
 

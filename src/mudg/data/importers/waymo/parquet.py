@@ -15,26 +15,8 @@ from numpy.typing import NDArray
 
 from mudg.base.errors import InputError
 from mudg.data.importers.columns import arrow_files, require_columns
-from mudg.data.importers.waymo.records import (
-    CAMERAS,
-    LASERS,
-    TOP,
-    CameraCalibration,
-    CameraShot,
-    FrameContent,
-    FrameRecord,
-    LaserCalibration,
-    LaserScan,
-    Panoptic,
-    WaymoBox,
-    box_of,
-    by_name,
-    camera_of,
-    each_once,
-    laser_of,
-    shaped,
-    transform_of,
-)
+from mudg.data.importers.waymo import records
+from mudg.data.importers.waymo.records import CAMERAS, LASERS, FrameRecord, LaserScan
 
 _SEGMENT: Final = "key.segment_context_name"
 _TIME: Final = "key.frame_timestamp_micros"
@@ -70,12 +52,12 @@ class ParquetLog:
 
     def __init__(self, root: Path, segment: str, wanted: tuple[int, int] | None = None) -> None:
         self._root, self.name = root, segment
-        self.cameras: Mapping[str, CameraCalibration] = dict(_cameras(self._need("camera_calibration")))
+        self.cameras: Mapping[str, records.CameraCalibration] = dict(_cameras(self._need("camera_calibration")))
         self._images, self._vehicle = self._need("camera_image"), self._need("vehicle_pose")
         self._lidar, self._poses = self._table("lidar"), self._table("lidar_pose")
         self._labels, self._projections = self._table("camera_segmentation"), self._table("lidar_camera_projection")
         calibration = self._table("lidar_calibration") if self._lidar is None else self._need("lidar_calibration")
-        self.lasers: Mapping[str, LaserCalibration] = {} if calibration is None else dict(_lasers(calibration))
+        self.lasers: Mapping[str, records.LaserCalibration] = {} if calibration is None else dict(_lasers(calibration))
         if self._lidar is not None and self._poses is None:
             raise InputError("the top LiDAR's pixel poses are missing", where=str(root),
                 expected=f"lidar_pose/{segment}.parquet",
@@ -83,7 +65,7 @@ class ParquetLog:
         self.frames: Sequence[FrameRecord] = self._frames(wanted)
         self.conditions = self._conditions()
 
-    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> FrameContent:
+    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> records.FrameContent:
         """The bulky parts of a frame; see ``WaymoLog``. Reading frames in the order of time is fastest."""
         time = frame.timestamp_us
         images = {
@@ -91,32 +73,32 @@ class ParquetLog:
             for name, row in self._images.rows(time, _CAMERA, CAMERAS)
             if name in cameras
         }
-        panoptic: dict[str, Panoptic] = {}
+        panoptic: dict[str, records.Panoptic] = {}
         for name, row in self._labels.rows(time, _CAMERA, CAMERAS) if self._labels is not None else ():
             if name in cameras and self._labels is not None:
                 column = "[CameraSegmentationLabelComponent].panoptic_label"
                 png, divisor = self._labels.value(row, column), self._labels.value(row, f"{column}_divisor")
-                panoptic[name] = Panoptic(int(divisor), bytes(png))
+                panoptic[name] = records.Panoptic(int(divisor), bytes(png))
         scans: dict[str, LaserScan] = {}
         if self._lidar is not None:
             for name, row in self._lidar.rows(time, _LASER, LASERS):
                 if name in frame.lasers:
                     scans[name] = self._scan(self._lidar, frame, name, row, projections)
-        return FrameContent(images, panoptic, scans)
+        return records.FrameContent(images, panoptic, scans)
 
     def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
         """Poses of the top LiDAR's pixels f32[H, W, 6]; see ``WaymoLog``."""
         if self._poses is not None:
             for name, row in self._poses.rows(frame.timestamp_us, _LASER, LASERS):
-                if name == TOP:
+                if name == records.TOP:
                     return self._poses.image(row, "[LiDARPoseComponent].range_image_return1", 6)
         return None
 
     def _scan(self, lidar: ParquetTable, frame: FrameRecord, name: str, row: int, projections: bool) -> LaserScan:
         found = [lidar.image(row, f"[LiDARComponent].range_image_return{n}", 4) for n in (1, 2)]
         returns = [image for image in found if image is not None]
-        poses = self.pixel_poses(frame) if name == TOP else None
-        if name == TOP and poses is None:
+        poses = self.pixel_poses(frame) if name == records.TOP else None
+        if name == records.TOP and poses is None:
             raise InputError("frame has no pixel poses", where=f"{frame.where}: lidar_pose",
                 expected="a row for the top LiDAR")  # fmt: skip
         places: list[NDArray[np.int64]] = []
@@ -155,33 +137,33 @@ class ParquetLog:
                 FrameRecord(
                     number,
                     time,
-                    transform_of(poses[time], here),
-                    by_name(shots.get(time, ()), time, here),
-                    each_once(lasers, here),
+                    records.transform_of(poses[time], here),
+                    records.by_name(shots.get(time, ()), time, here),
+                    records.each_once(lasers, here),
                     tuple(boxes.get(time, ())),
                     here,
                 )  # fmt: skip
             )
         return frames
 
-    def _shots(self) -> dict[int, list[tuple[str, CameraShot]]]:
-        shots: dict[int, list[tuple[str, CameraShot]]] = {}
+    def _shots(self) -> dict[int, list[tuple[str, records.CameraShot]]]:
+        shots: dict[int, list[tuple[str, records.CameraShot]]] = {}
         names, optional = ("pose.transform", "pose_timestamp"), (*_EXPOSURE, *_VELOCITY)
         for where, row in self._images.records("CameraImageComponent", (_TIME, _CAMERA), names, optional):
             if row[_CAMERA] in CAMERAS:
                 speeds = [row[name] for name in _VELOCITY]
                 velocity = None if None in speeds else np.array(speeds, np.float64)
                 exposure = (float(row[name] or 0.0) for name in _EXPOSURE)
-                pose = transform_of(row["pose.transform"], where)
-                shot = CameraShot(pose, float(row["pose_timestamp"]), velocity, *exposure)
+                pose = records.transform_of(row["pose.transform"], where)
+                shot = records.CameraShot(pose, float(row["pose_timestamp"]), velocity, *exposure)
                 shots.setdefault(int(row[_TIME]), []).append((CAMERAS[row[_CAMERA]], shot))
         return shots
 
-    def _boxes(self) -> dict[int, list[WaymoBox]]:
+    def _boxes(self) -> dict[int, list[records.WaymoBox]]:
         table, boxes = self._table("lidar_box"), {}
         if table is not None:
             for where, row in table.records("LiDARBoxComponent", (_TIME, _OBJECT), ("type", *_BOX)):
-                box = box_of(str(row[_OBJECT]), row["type"], [row[name] for name in _BOX], where)
+                box = records.box_of(str(row[_OBJECT]), row["type"], [row[name] for name in _BOX], where)
                 boxes.setdefault(int(row[_TIME]), []).append(box)
         return boxes
 
@@ -205,22 +187,22 @@ class ParquetLog:
         return table
 
 
-def _cameras(table: ParquetTable) -> Iterator[tuple[str, CameraCalibration]]:
+def _cameras(table: ParquetTable) -> Iterator[tuple[str, records.CameraCalibration]]:
     names, direction = [f"intrinsic.{name}" for name in _INTRINSIC], "rolling_shutter_direction"
     required = (*names, "extrinsic.transform", "width", "height")
     for where, row in table.records("CameraCalibrationComponent", (_CAMERA,), required, (direction,)):
         if row[_CAMERA] in CAMERAS:
             name, image = CAMERAS[row[_CAMERA]], (int(row["width"]), int(row["height"]), int(row[direction] or 0))
-            yield name, camera_of(name, [row[n] for n in names], row["extrinsic.transform"], image, where)
+            yield name, records.camera_of(name, [row[n] for n in names], row["extrinsic.transform"], image, where)
 
 
-def _lasers(table: ParquetTable) -> Iterator[tuple[str, LaserCalibration]]:
+def _lasers(table: ParquetTable) -> Iterator[tuple[str, records.LaserCalibration]]:
     low, high, beams = (f"beam_inclination.{name}" for name in ("min", "max", "values"))
     required = ("extrinsic.transform", low, high)
     for where, row in table.records("LiDARCalibrationComponent", (_LASER,), required, (beams,)):
         if row[_LASER] in LASERS:
             name, limits = LASERS[row[_LASER]], (float(row[low]), float(row[high]))
-            yield name, laser_of(name, row[beams] or (), limits, row["extrinsic.transform"], where)
+            yield name, records.laser_of(name, row[beams] or (), limits, row["extrinsic.transform"], where)
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------
@@ -293,7 +275,7 @@ class ParquetTable:
         if not values.is_valid or not shape.is_valid or len(values) == 0:
             return None
         data = values.values.to_numpy(zero_copy_only=False)
-        return shaped(data, shape.as_py(), channels, f"{self.path}: row {row}, {prefix}")
+        return records.shaped(data, shape.as_py(), channels, f"{self.path}: row {row}, {prefix}")
 
     def _row(self, row: int, names: tuple[str, ...]) -> Any:
         """One row of some columns. Going forward goes on where the last call stopped; going back starts a row group anew."""

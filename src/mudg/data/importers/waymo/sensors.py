@@ -29,15 +29,8 @@ from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Camera, SweepPoints
 from mudg.data.importers.images import Lens, brown_conrady
-from mudg.data.importers.waymo.records import (
-    CAMERAS,
-    CameraCalibration,
-    CameraShot,
-    LaserCalibration,
-    LaserScan,
-    Matrix,
-    Panoptic,
-)
+from mudg.data.importers.waymo import records
+from mudg.data.importers.waymo.records import CameraCalibration, LaserCalibration, Matrix
 
 TURN_S: Final = 0.1
 _MIN_MOTION_M: Final = 0.3
@@ -84,7 +77,9 @@ class ScanPoints:
     without_pose: int
 
 
-def points_of_scan(scan: LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str) -> ScanPoints:
+def points_of_scan(
+    scan: records.LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str
+) -> ScanPoints:
     """All points of a scan, first returns and then second ones.
 
     Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured to
@@ -232,7 +227,7 @@ def median_clock(turns: Sequence[tuple[float, float]]) -> TurnClock:
 # --- cameras --------------------------------------------------------------------------------------------------------
 
 
-def recorded_camera(calibration: CameraCalibration, shot: CameraShot) -> tuple[Camera, Lens | None]:
+def recorded_camera(calibration: CameraCalibration, shot: records.CameraShot) -> tuple[Camera, Lens | None]:
     """The camera as recorded, and its lens (None where the coefficients are all zero)."""
     fx, fy, cx, cy, *coefficients = calibration.intrinsic
     camera = Camera(
@@ -242,12 +237,12 @@ def recorded_camera(calibration: CameraCalibration, shot: CameraShot) -> tuple[C
     return camera, brown_conrady(*coefficients) if any(coefficients) else None
 
 
-def readout_s(shot: CameraShot) -> float:
+def readout_s(shot: records.CameraShot) -> float:
     """Time between the exposure of the first column and of the last one."""
     return max(0.0, shot.done_s - shot.trigger_s - shot.shutter_s) if shot.done_s else 0.0
 
 
-def middle_of_exposure(shot: CameraShot) -> tuple[Matrix, float]:
+def middle_of_exposure(shot: records.CameraShot) -> tuple[Matrix, float]:
     """Vehicle pose f64[4, 4] in the global frame when the middle column was exposed, and this time in seconds of the epoch.
 
     Without recorded exposure times or velocity, or where the two are far apart, pose and time are those recorded.
@@ -267,7 +262,7 @@ def vehicle_from_cam(calibration: CameraCalibration) -> Matrix:
     return calibration.vehicle_from_camera @ CAM_FROM_EGO_AXES.T
 
 
-def panoptic_ids(label: Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
+def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
     """Values of a panoptic label, i32[H, W]: class * divisor + instance.
 
     Raises:
@@ -305,7 +300,7 @@ def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[A
 
 def projection_errors(
     points: ScanPoints,
-    scan: LaserScan,
+    scan: records.LaserScan,
     laser: LaserCalibration,
     global_from_vehicle: Matrix,
     cameras: Mapping[str, tuple[CameraCalibration, Matrix]],
@@ -329,7 +324,7 @@ def projection_errors(
         chosen = points.image == index
         recorded = projections.reshape(-1, 6)[points.pixel[chosen]]
         for half in (recorded[:, :3], recorded[:, 3:]):
-            for number, name in CAMERAS.items():
+            for number, name in records.CAMERAS.items():
                 if name not in cameras or not (here := half[:, 0] == number).any():
                     continue
                 calibration, pose = cameras[name]

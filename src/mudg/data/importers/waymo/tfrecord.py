@@ -20,28 +20,9 @@ from numpy.typing import NDArray
 
 from mudg.base import log
 from mudg.base.errors import InputError
+from mudg.data.importers.waymo import records
 from mudg.data.importers.waymo.messages import CONTEXT, FRAME, parse_message
-from mudg.data.importers.waymo.records import (
-    CAMERAS,
-    LASERS,
-    TOP,
-    VELOCITY,
-    CameraCalibration,
-    CameraShot,
-    FrameContent,
-    FrameRecord,
-    LaserCalibration,
-    LaserScan,
-    Panoptic,
-    box_of,
-    by_name,
-    camera_of,
-    each_once,
-    float_image,
-    int_image,
-    laser_of,
-    transform_of,
-)
+from mudg.data.importers.waymo.records import CAMERAS, LASERS, FrameRecord, LaserScan
 
 MAX_RECORD_BYTES: Final = 512 * 1024 * 1024
 """Real frames have 3 to 8 MB; what declares more than this is refused before any memory is taken."""
@@ -240,8 +221,10 @@ class TfrecordLog:
         context = parse_message(content, CONTEXT, where)
         self.name = str(context.get("name", "")) or self._path.stem
         cameras, lasers = _named(context["cameras"], CAMERAS), _named(context["lasers"], LASERS)
-        self.cameras: Mapping[str, CameraCalibration] = {name: _camera(name, item, where) for name, item in cameras}
-        self.lasers: Mapping[str, LaserCalibration] = {name: _laser(name, item, where) for name, item in lasers}
+        self.cameras: Mapping[str, records.CameraCalibration] = {
+            name: _camera(name, item, where) for name, item in cameras
+        }
+        self.lasers: Mapping[str, records.LaserCalibration] = {name: _laser(name, item, where) for name, item in lasers}
         stats = context.get("stats", {})
         self.conditions = ", ".join(stats[key] for key in ("time_of_day", "weather", "location") if stats.get(key))
 
@@ -254,29 +237,29 @@ class TfrecordLog:
             if _camera(name, item, where) != self.cameras.get(name):
                 raise InputError("a camera's calibration changes within the log", where=f"{where}: camera {name}")
 
-    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> FrameContent:
+    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> records.FrameContent:
         """The bulky parts of a frame; see ``WaymoLog``."""
         message = self._message(frame)
         images: dict[str, bytes] = {}
-        panoptic: dict[str, Panoptic] = {}
+        panoptic: dict[str, records.Panoptic] = {}
         for name, item in _named(message["images"], CAMERAS):
             if name in cameras:
                 images[name] = bytes(item.get("image", b""))
                 label = item.get("panoptic", {})
                 if label.get("png"):
-                    panoptic[name] = Panoptic(label.get("divisor", 0), bytes(label["png"]))
+                    panoptic[name] = records.Panoptic(label.get("divisor", 0), bytes(label["png"]))
         scans = {
             name: _scan(item, f"{frame.where}: LiDAR {name}", projections)
             for name, item in _named(message["lasers"], LASERS)
             if _has_ranges(item)
         }
-        return FrameContent(images, panoptic, scans)
+        return records.FrameContent(images, panoptic, scans)
 
     def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
         """Poses of the top LiDAR's pixels f32[H, W, 6]; see ``WaymoLog``."""
         for name, item in _named(self._message(frame)["lasers"], LASERS):
-            if name == TOP and item.get("return1", {}).get("poses"):
-                return float_image(item["return1"]["poses"], 6, f"{frame.where}: pixel poses")
+            if name == records.TOP and item.get("return1", {}).get("poses"):
+                return records.float_image(item["return1"]["poses"], 6, f"{frame.where}: pixel poses")
         return None
 
     def _message(self, frame: FrameRecord) -> dict[str, Any]:
@@ -297,21 +280,21 @@ def _sixteen(message: dict[str, Any], key: str) -> NDArray[np.float64]:
     return message.get(key, {}).get("values", np.zeros(0))
 
 
-def _camera(name: str, item: dict[str, Any], where: str) -> CameraCalibration:
+def _camera(name: str, item: dict[str, Any], where: str) -> records.CameraCalibration:
     image = item.get("width", 0), item.get("height", 0), item.get("direction", 0)
-    return camera_of(name, item["intrinsic"], _sixteen(item, "extrinsic"), image, where)
+    return records.camera_of(name, item["intrinsic"], _sixteen(item, "extrinsic"), image, where)
 
 
-def _laser(name: str, item: dict[str, Any], where: str) -> LaserCalibration:
+def _laser(name: str, item: dict[str, Any], where: str) -> records.LaserCalibration:
     limits = item.get("inclination_min", np.nan), item.get("inclination_max", np.nan)
-    return laser_of(name, item["inclinations"], limits, _sixteen(item, "extrinsic"), where)
+    return records.laser_of(name, item["inclinations"], limits, _sixteen(item, "extrinsic"), where)
 
 
-def _shot(item: dict[str, Any], where: str) -> CameraShot:
+def _shot(item: dict[str, Any], where: str) -> records.CameraShot:
     velocity = item.get("velocity")
-    return CameraShot(
-        transform_of(_sixteen(item, "pose"), f"{where}: pose"), item.get("pose_time_s", 0.0),
-        None if velocity is None else np.array([velocity.get(key, 0.0) for key in VELOCITY]),
+    return records.CameraShot(
+        records.transform_of(_sixteen(item, "pose"), f"{where}: pose"), item.get("pose_time_s", 0.0),
+        None if velocity is None else np.array([velocity.get(key, 0.0) for key in records.VELOCITY]),
         item.get("shutter_s", 0.0), item.get("trigger_s", 0.0), item.get("done_s", 0.0),
     )  # fmt: skip
 
@@ -319,25 +302,25 @@ def _shot(item: dict[str, Any], where: str) -> CameraShot:
 def _frame_record(message: dict[str, Any], number: int, where: str) -> FrameRecord:
     timestamp_us = message.get("timestamp_us", 0)
     images = [(name, item) for name, item in _named(message["images"], CAMERAS) if item.get("image")]
-    shots = by_name(
+    shots = records.by_name(
         ((name, _shot(item, f"{where}: image of camera {name}")) for name, item in images), timestamp_us, where
     )
-    lasers = each_once([name for name, item in _named(message["lasers"], LASERS) if _has_ranges(item)], where)
+    lasers = records.each_once([name for name, item in _named(message["lasers"], LASERS) if _has_ranges(item)], where)
     boxes = []
     for item in message["labels"]:
         box = item.get("box", {})
         values = [box.get(key, np.nan) for key in ("x", "y", "z", "length", "width", "height")]
-        boxes.append(box_of(item.get("id", ""), item.get("type", 0), [*values, box.get("heading", 0.0)], where))
-    pose = transform_of(_sixteen(message, "pose"), f"{where}: pose")
+        boxes.append(records.box_of(item.get("id", ""), item.get("type", 0), [*values, box.get("heading", 0.0)], where))
+    pose = records.transform_of(_sixteen(message, "pose"), f"{where}: pose")
     return FrameRecord(number, timestamp_us, pose, shots, lasers, tuple(boxes), where)
 
 
 def _scan(item: dict[str, Any], where: str, projections: bool) -> LaserScan:
     parts = [item[key] for key in ("return1", "return2") if item.get(key, {}).get("ranges")]
-    returns = [float_image(part["ranges"], 4, where) for part in parts]
+    returns = [records.float_image(part["ranges"], 4, where) for part in parts]
     packed = item["return1"].get("poses")
-    poses = float_image(packed, 6, f"{where}: pixel poses") if packed else None
+    poses = records.float_image(packed, 6, f"{where}: pixel poses") if packed else None
     found: list[NDArray[np.int64]] = []
     if projections and all(part.get("projections") for part in parts):
-        found = [int_image(part["projections"], 6, f"{where}: camera projections") for part in parts]
+        found = [records.int_image(part["projections"], 6, f"{where}: camera projections") for part in parts]
     return LaserScan(returns, poses, found)
