@@ -163,15 +163,8 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     origin, numbers = Source("pandaset", LICENCE, None, tuple(notes)), range(len(frames))
     content = SceneContent(
-        folder.resolve().name,
-        origin,
-        fits,
-        numbers,
-        convert,
-        lambda index: f"frame {frames[index]}",
-        motion.ego,
-        tracks,
-    )
+        folder.resolve().name, origin, fits, numbers, convert, lambda index: f"frame {frames[index]}", motion.ego, tracks
+    )  # fmt: skip
     return write_scene(content, out, options)
 
 
