@@ -87,7 +87,7 @@ CLOUDS: dict[tuple[str, str], tuple[Change, str]] = {
     ("dgp", "wrong checksum"): (flipped(0.5), "cut off"),
     ("custom", "wrong checksum"): (flipped(0.5), "not a readable NPZ"),
     ("pandaset", "wrong checksum"): (lambda c: c[:-8] + bytes([c[-8] ^ 1]) + c[-7:], "damaged"),
-    ("argoverse2", "no table"): (lambda c: b"FEA1" + c[4:], "no Feather table"),
+    ("argoverse2", "no table"): (lambda c: b"FEA1" + c[4:], "table cannot be read"),
 }
 
 

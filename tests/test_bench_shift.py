@@ -70,16 +70,16 @@ def test_moving_instances_are_those_of_the_generator():
 
 def test_variants_change_fields_of_the_fit():
     rows = bench_shift.rows_of(
-        BenchConfig(methods=("mudg_s",), variant=("a=virtual_probability:0.4,densify:none", "b=sh_degree:1"))
+        BenchConfig(methods=("mudg_s",), variant=("a=virtual.probability:0.4,densify.kind:none", "b=sh_degree:1"))
     )
     a, b = rows[-2].fit, rows[-1].fit
-    assert (a.virtual_probability, a.densify, a.iterations) == (0.4, "none", 1000)
+    assert (a.virtual.probability, a.densify.kind, a.iterations) == (0.4, "none", 1000)
     assert dataclasses.replace(b, sh_degree=0) == rows[0].fit
 
 
 @pytest.mark.parametrize(
     "text",
-    ["a", "a=", "a=densify", "=densify:none", "a/b=densify:none", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
+    ["a", "a=", "a=densify", "=densify.kind:none", "a/b=densify.kind:none", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
 )
 def test_a_malformed_variant_is_refused(text):
     with pytest.raises(UsageError):
@@ -90,10 +90,13 @@ def test_ablation_brings_the_rows_it_is_compared_with():
     rows = {r.name: r.fit for r in bench_shift.rows_of(BenchConfig(methods=("mudg_r",), ablation=True))}
     assert list(rows) == ["street_gaussians", "mudg_r", "mudg_s", "only_I", "only_I_D", "only_I_S", "exact"]
     full = rows["mudg_s"]
-    no_depth = {"virtual_depth_weight": 0, "virtual_lidar_weight": 0}
-    assert rows["only_I"] == dataclasses.replace(full, **no_depth, virtual_semantic_weight=0)
-    assert rows["only_I_D"] == dataclasses.replace(full, virtual_semantic_weight=0)
-    assert rows["only_I_S"] == dataclasses.replace(full, **no_depth)
+    no_depth, virtual = {"depth_weight": 0, "lidar_weight": 0}, full.virtual
+    expected = {
+        "only_I": dataclasses.replace(virtual, **no_depth, semantic_weight=0),
+        "only_I_D": dataclasses.replace(virtual, semantic_weight=0),
+        "only_I_S": dataclasses.replace(virtual, **no_depth),
+    }
+    assert all(rows[name] == dataclasses.replace(full, virtual=terms) for name, terms in expected.items())
     assert rows["exact"] == full
 
 
@@ -101,7 +104,7 @@ def test_unknown_methods_and_repeated_names_are_refused():
     with pytest.raises(UsageError, match="unknown method"):
         bench_shift.rows_of(BenchConfig(methods=("nerf",)))
     with pytest.raises(UsageError, match="same name"):
-        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify:none",)))
+        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify.kind:none",)))
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------------
@@ -213,7 +216,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     assert f'src="{log}/film/front_shift%2B3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
     again = bench_shift.run(
-        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify:none",)), out,
+        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify.kind:none",)), out,
         rules=TINY, distances_m=(3.0,),
     )  # fmt: skip
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before

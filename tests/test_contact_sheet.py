@@ -10,13 +10,17 @@ import pytest
 from PIL import Image
 from toy_scene import CAR_SIZE_M, ToyStreet
 
-from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project, yaw_matrix
+from mudg.base.geometry import CAM_FROM_EGO_AXES, box_corners, invert, project, transform_points, yaw_matrix
 from mudg.base.types import Camera, View
 from mudg.core.pictures import depth_colors
 from mudg.report import contact_sheet as sheets
 from mudg.report import top_view as above
 
 VIEW = View(Camera("front", 96, 64, 70.0, 70.0, 48.0, 32.0), invert(CAM_FROM_EGO_AXES), 0.0)
+
+
+def box_of(size_m: np.ndarray, world_from_box: np.ndarray) -> np.ndarray:
+    return transform_points(world_from_box, box_corners(size_m))
 
 
 def test_points_are_drawn_where_they_project_and_near_ones_win() -> None:
@@ -30,7 +34,7 @@ def test_points_are_drawn_where_they_project_and_near_ones_win() -> None:
 
 
 def test_edges_of_a_box_in_front_are_its_projected_corners() -> None:
-    corners = above.box_corners(CAR_SIZE_M, yaw_matrix(0.4, (12.0, 0.5, 0.0)))
+    corners = box_of(CAR_SIZE_M, yaw_matrix(0.4, (12.0, 0.5, 0.0)))
     uv, z = project(VIEW, corners)
     edges = dict(sheets.visible_edges(VIEW, corners))
     assert len(edges) == 12 and (z > 0).all()
@@ -42,11 +46,11 @@ def test_edges_of_a_box_in_front_are_its_projected_corners() -> None:
 
 def test_a_box_around_the_camera_is_cut_and_one_behind_is_not_drawn() -> None:
     size = np.array([10.0, 3.0, 2.0])
-    around = sheets.visible_edges(VIEW, above.box_corners(size, yaw_matrix(0.0)))
+    around = sheets.visible_edges(VIEW, box_of(size, yaw_matrix(0.0)))
     assert 0 < len(around) < 12
     for _, uv in around:
         assert np.isfinite(uv).all()
-    assert sheets.visible_edges(VIEW, above.box_corners(size, yaw_matrix(0.0, (-20.0, 0, 0)))) == []
+    assert sheets.visible_edges(VIEW, box_of(size, yaw_matrix(0.0, (-20.0, 0, 0)))) == []
     ends = sheets.cut_near(np.array([[0.0, 0, -1], [0, 0, 2]]))
     assert ends is not None and np.allclose(ends, [[0, 0, sheets.NEAR_M], [0, 0, 2]])
     assert sheets.cut_near(np.array([[0.0, 0, -1], [0, 0, -2]])) is None

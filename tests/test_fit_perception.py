@@ -11,8 +11,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core.metrics import Pair
 from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.featnets import CodecFeatures, PerceptualDistance
-from mudg.models.mdm import model as mdm
-from mudg.stages.config import FitConfig
+from mudg.models.mdm import files
+from mudg.stages.config.fit import VirtualConfig
 from mudg.stages.fitting.perception import perception_of
 
 
@@ -28,9 +28,9 @@ def test_gradient_of_the_loss():
 
 
 def test_the_loss_is_the_scorers_distance_where_all_is_certain():
-    codec = CodecFeatures(mdm.load("embedded").codec)
+    codec = CodecFeatures(files.load("embedded").codec)
     render, truth = random(5, 3, 24, 32).float(), random(6, 3, 24, 32).float()
-    loss = perception_of(FitConfig(virtual_perception="codec"))(render, truth, torch.ones(1, 24, 32))
+    loss = perception_of(VirtualConfig(perception="codec"))(render, truth, torch.ones(1, 24, 32))
     pair = Pair(rgb=render, truth_rgb=truth, **dict.fromkeys(
         ("depth", "semantics", "truth_depth", "truth_depth_valid", "truth_semantics")
     ))  # fmt: skip
@@ -41,7 +41,7 @@ def test_the_loss_is_the_scorers_distance_where_all_is_certain():
 def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
     path = tmp_path / "lpips.safetensors"
     store.write_safetensors(path, {key: value.numpy() for key, value in lpips_state().items()})
-    perception = perception_of(FitConfig(virtual_perception=name, lpips_weights=str(path)))
+    perception = perception_of(VirtualConfig(perception=name, lpips_weights=str(path)))
     truth = random(1, 3, 48, 64).float()
     everywhere = torch.ones(1, 48, 64)
     assert perception(truth, truth, everywhere).item() == pytest.approx(0, abs=1e-6)
@@ -56,7 +56,7 @@ def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
 
 def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
     with pytest.raises(UsageError, match="file of its weights"):
-        perception_of(FitConfig(virtual_perception="lpips"))
+        perception_of(VirtualConfig(perception="lpips"))
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
     with pytest.raises(InputError, match="incomplete"):
-        perception_of(FitConfig(virtual_perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))
+        perception_of(VirtualConfig(perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))

@@ -18,12 +18,11 @@ from toy_scene import CAR, CAR_SIZE_M, COLOURS, GROUND, PANEL, TRAIN_IDS, WALL_H
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.geometry import invert, yaw_matrix
-from mudg.base.types import FusedCloud, PointCloud, SweepPoints, Track, View
+from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core.fusion import (
     STATIC,
     CloudAccumulator,
     FusionRules,
-    Shot,
     SweepShots,
     fuse_sweeps,
     judge_track,
@@ -50,7 +49,7 @@ def shots_of(
         pose, points, _ = street.sweep(time_s)
         view = street.view(time_s + image_delay_s)
         rgb, ids, _ = street.image(view)
-        yield SweepShots(time_s, pose, points, [Shot(view, rgb, ids if labels else None)])
+        yield SweepShots(time_s, pose, points, [Photo(view, rgb, ids if labels else None)])
 
 
 def colour_share(cloud: PointCloud, chosen: np.ndarray, kind: int) -> float:
@@ -228,7 +227,7 @@ def test_the_camera_that_looks_straighter_gives_the_colour() -> None:
         np.full((middle.camera.height, middle.camera.width, 3), c, np.uint8) for c in ((255, 0, 0), (0, 0, 255))
     )
     for order in (1, -1):
-        sweep = SweepShots(0.0, pose, points, [Shot(middle, red), Shot(turned, blue)][::order])
+        sweep = SweepShots(0.0, pose, points, [Photo(middle, red), Photo(turned, blue)][::order])
         cloud, _ = fuse_sweeps([sweep], (), replace(RULES, occlusion_test=False))
         cosines = []
         for view in (middle, turned):
@@ -300,7 +299,7 @@ def test_nothing_to_fuse_is_an_empty_cloud(points: int, shots: int) -> None:
         np.zeros((points, 3), np.float32) + 1, np.zeros(points, np.float32), np.zeros(points, np.float32)
     )
     view = street.view(0.0)
-    given_shots = [Shot(view, street.image(view)[0])] * shots
+    given_shots = [Photo(view, street.image(view)[0])] * shots
     cloud, report = fuse_sweeps([SweepShots(0.0, np.eye(4), empty, given_shots)], (), RULES)
     assert len(cloud.static) == 0
     assert cloud.static.semantics is None
@@ -397,7 +396,7 @@ def test_small_training_size_is_fast() -> None:
         xyz = np.stack([reach * np.cos(elevation) * np.cos(azimuth), reach * np.cos(elevation) * np.sin(azimuth),
                         reach * np.sin(elevation)], 1).astype(np.float32)  # fmt: skip
         points = SweepPoints(xyz, np.zeros(60_000, np.float32), np.linspace(-0.05, 0.05, 60_000).astype(np.float32))
-        shots = [Shot(View(view.camera, yaw_matrix(a) @ view.world_from_cam, 0.1 * n), np.zeros((128, 192, 3), np.uint8),
+        shots = [Photo(View(view.camera, yaw_matrix(a) @ view.world_from_cam, 0.1 * n), np.zeros((128, 192, 3), np.uint8),
                       np.zeros((128, 192), np.uint8)) for a in (0.0, 0.8, -0.8)]  # fmt: skip
         sweeps.append(SweepShots(0.1 * n, np.eye(4), points, shots))
     tracks = [
@@ -494,7 +493,7 @@ class KittiCheck:
 
         sweeps = (
             SweepShots(self.scene.sweeps[n].time_s, pose(n), read_points(self.scene, self.scene.sweeps[n]),
-                       [Shot(view(n), self.images[n])])
+                       [Photo(view(n), self.images[n])])
             for n in range(16) if n != 8
         )  # fmt: skip
         cloud, _ = fuse_sweeps(sweeps, self.scene.tracks if mode.endswith("boxes") else (), rules)

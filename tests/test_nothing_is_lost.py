@@ -14,6 +14,7 @@ import kitti_folders
 import pytest
 import torch
 import toy_views
+from fit_settings import fit_config
 from toy_clips import tiny, write_clips
 from toy_published import TINY, tiny_checkpoint
 from toy_scene import ToyStreet
@@ -47,7 +48,6 @@ from mudg.stages.config import (
     AnnotateConfig,
     BenchConfig,
     ConvertConfig,
-    FitConfig,
     FuseConfig,
     IngestConfig,
     RenderConfig,
@@ -90,7 +90,7 @@ def _synthesize(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
 
 
 def _fit(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
-    config = FitConfig(method="mudg_s", iterations=6, seed=v, initial_gaussians=200, checkpoint_every=2, preview_every=3)
+    config = fit_config(method="mudg_s", iterations=6, seed=v, start__gaussians=200, checkpoint_every=2, preview_every=3)
     return fit.run(config, g["scene"], g["fused"], out, observations=g["views"], overwrite=o)
 
 
@@ -153,7 +153,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     given |= {"plain scene": root / "plain", "log": kitti_folders.write_raw_drive(root / "day"), "clips": write_clips(root / "clips")}
     given["fused"] = fuse.run(FuseConfig(), given["scene"], root / "fused")
     given["views"] = toy_views.write_views(given["scene"], root / "views", "a", (0.0, 1.0))
-    config = FitConfig(method="street_gaussians", iterations=2, initial_gaussians=200)
+    config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
     given["fitted"] = fit.run(config, given["scene"], given["fused"], root / "fitted")
     torch.manual_seed(0)
     mdm.save(MDM(SMALL), root / "model", "", {})

@@ -19,7 +19,7 @@ from mudg.core import metrics, perceptual
 from mudg.core.metrics import Pair
 from mudg.data.city import CityConfig, CityWorld
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.report import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
@@ -46,7 +46,7 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def distance():
-    perceptual_of = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
+    perceptual_of = PerceptualDistance(CodecFeatures(files.load("embedded").codec))
     return lambda made, truth, mask=None: perceptual_of(pair(rgb=made, truth_rgb=truth, mask=mask))
 
 

@@ -292,7 +292,7 @@ def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
     column = "[VehiclePoseComponent].world_from_vehicle.transform"
     found = table.columns(("key.segment_context_name", "key.frame_timestamp_micros", column))
     assert len(found[column]) == 199
-    assert all(geometry.is_rigid(np.array(values).reshape(4, 4), 1e-6) for values in found[column])
+    assert all(geometry.rigid_problem(np.array(values).reshape(4, 4), 1e-6) is None for values in found[column])
     steps = np.diff(np.array(found["key.frame_timestamp_micros"], np.int64))
     assert ((steps > 90_000) & (steps < 110_000)).all()
     assert np.allclose(table.value(57, column), found[column][57])

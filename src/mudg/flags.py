@@ -217,7 +217,7 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Positional[str]
-    """mdm, mdm-ablation, poses or shift."""
+    """mdm, poses or shift."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")]
 
 

@@ -1,9 +1,15 @@
-"""Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name."""
+"""Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name.
+
+A configuration class may say what became of keys that older files use: the class variable ``MOVED`` maps an old key to its new
+dotted one, or to None if it was removed. Such keys are refused with that name; a group's own name may stand there too, for files in
+which it was still a plain value.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -56,6 +62,20 @@ def load(
     return build(config_type, values, str(yaml_path or "configuration"))
 
 
+def nested(dotted: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys such as ``virtual.start`` as mappings in mappings; UsageError if a name is both a value and a group."""
+    tree: dict[str, Any] = {}
+    for key, value in dotted.items():
+        *groups, name = key.split(".")
+        place = tree
+        for group in groups:
+            place = place.setdefault(group, {})
+            if not isinstance(place, dict):
+                raise UsageError("a configuration key is both a value and a group", where=key)
+        place[name] = value
+    return tree
+
+
 def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> Config:
     """Validate plain values as a ``config_type``; UsageError names the first wrong field."""
     try:
@@ -84,26 +104,35 @@ def _merge(
     base: dict[str, Any], new: Mapping[str, Any], where: str, config_type: Any, path: str = ""
 ) -> dict[str, Any]:
     known = {f.name: f for f in dataclasses.fields(config_type)} if dataclasses.is_dataclass(config_type) else {}
+    types = typing.get_type_hints(config_type) if known else {}
+    moved: Mapping[str, str | None] = getattr(config_type, "MOVED", {})
     merged = dict(base)
     for name, value in new.items():
+        group = types.get(name)
+        is_group, is_mapping = dataclasses.is_dataclass(group), isinstance(value, Mapping)
+        if name in moved and (name not in known or (is_group and not is_mapping)):
+            raise _moved_error(f"{path}{name}", moved[name], where, path)
         if known and name not in known:
             near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
             what, expected = f"unknown configuration key {path}{name}", "one of " + ", ".join(known)
             remedy = f"did you mean {path}{near[0]}?" if near else "remove it"
             raise UsageError(what, where=where, expected=expected, remedy=remedy)
-        nested = getattr(base.get(name), "items", None) is not None and isinstance(value, Mapping) and known
-        if nested and dataclasses.is_dataclass(field_type(config_type, name)):
-            merged[name] = _merge(base[name], value, where, field_type(config_type, name), f"{path}{name}.")
+        if is_group and is_mapping and isinstance(base.get(name), Mapping):
+            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.")
         else:
             merged[name] = value
     return merged
 
 
-def field_type(config_type: Any, name: str) -> Any:
-    """Resolved type of a field (annotations may be strings)."""
-    import typing
-
-    return typing.get_type_hints(config_type).get(name)
+def _moved_error(old: str, new: str | None, where: str, path: str) -> UsageError:
+    """What to say about a key that a class lists in ``MOVED``."""
+    if new is None:
+        return UsageError(f"the configuration key {old} was removed", where=where, remedy="leave it out")
+    return UsageError(
+        f"the configuration key {old} is now called {path}{new}",
+        where=where,
+        remedy="rename it (a dot is one level of YAML)",
+    )
 
 
 def differences(old: Any, new: Any, path: str = "") -> list[str]:

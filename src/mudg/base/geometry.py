@@ -20,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from mudg.base.errors import InputError
 
 if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
+
     from mudg.base.types import View
 
 Matrix = NDArray[np.float64]
@@ -55,11 +57,6 @@ def all_rigid(transforms: Matrix, tolerance: float = 1e-4) -> bool:
         return False
     error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))
     return not (error > tolerance).any() and not (np.linalg.det(rotation) < 0).any()
-
-
-def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
-    """Whether ``transform`` is a finite, right-handed rigid 4x4 matrix within ``tolerance``."""
-    return rigid_problem(transform, tolerance) is None
 
 
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
@@ -193,3 +190,37 @@ def unproject(view: View, uv_px: NDArray[np.floating], depth_m: NDArray[np.float
     uv, z = np.asarray(uv_px, np.float64), np.asarray(depth_m, np.float64)
     xyz_cam = np.stack([(uv[:, 0] - camera.cx) / camera.fx * z, (uv[:, 1] - camera.cy) / camera.fy * z, z], 1)
     return transform_points(view.world_from_cam, xyz_cam)
+
+
+def box_corners(size_m: ArrayLike) -> Matrix:
+    """Corners f64[8, 3] of a box in its own frame; the bits of a corner's number: 4 = front, 2 = left, 1 = top."""
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
+    return signs * np.asarray(size_m, np.float64)
+
+
+def box_hull(view: View, world_from_box: Matrix, size_m: ArrayLike, near_m: float = 0.3) -> ConvexHull | None:
+    """Convex outline, in pixels, of what a view shows of a box: that part of it which is at least ``near_m`` ahead.
+
+    Returns:
+        The hull of the projected corners (of a cut box also of the points where its edges cross the near plane), or None if it lies
+        outside the image.
+    """
+    from scipy.spatial import ConvexHull, QhullError  # late: most of what imports this module needs no scipy
+
+    camera = view.camera
+    corners = transform_points(view.cam_from_world @ world_from_box, box_corners(size_m))
+    front = corners[:, 2] >= near_m
+    points = [corners[front]]
+    for i in range(8):
+        for j in (i ^ 1, i ^ 2, i ^ 4):
+            if front[i] and not front[j]:
+                u = (near_m - corners[i, 2]) / (corners[j, 2] - corners[i, 2])
+                points.append(corners[i : i + 1] + u * (corners[j : j + 1] - corners[i : i + 1]))
+    kept = np.concatenate(points)
+    uv = np.c_[camera.fx * kept[:, 0] / kept[:, 2] + camera.cx, camera.fy * kept[:, 1] / kept[:, 2] + camera.cy]
+    if not len(uv) or (uv.max(0) < 0).any() or uv[:, 0].min() > camera.width or uv[:, 1].min() > camera.height:
+        return None
+    try:
+        return ConvexHull(np.clip(uv, -1e5, 1e5))
+    except QhullError:
+        return None

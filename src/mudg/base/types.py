@@ -8,7 +8,7 @@ module imports no torch, so that facts can be read without it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,11 +19,18 @@ from mudg.base import checks, geometry
 from mudg.base.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 Matrix = NDArray[np.float64]
 TrajectoryOrigin = Literal["recorded", "shifted", "planned"]
 ObservationKind = Literal["recorded", "virtual"]
+
+
+def _moved(value: Any, device: torch.device) -> dict[str, Tensor]:
+    """The tensors among the fields of a dataclass, on a device."""
+    given = {f.name: getattr(value, f.name) for f in fields(value)}
+    return {name: tensor.to(device) for name, tensor in given.items() if hasattr(tensor, "device")}
 
 
 def _freeze(mapping: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -157,6 +164,16 @@ class Frame:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", _freeze(self.labels))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or None. The image may
+    have another size than the view's camera."""
+
+    view: View
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -400,6 +417,10 @@ class Condition:
         checks.check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
         checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one)
 
+    def to(self, device: torch.device) -> Condition:
+        """The same condition with its tensors on a device."""
+        return replace(self, **_moved(self, device))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clip:
@@ -407,8 +428,10 @@ class Clip:
 
     Args:
         rgb: f32[T, 3, H, W] in [0, 1].
-        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W].
+        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W]; elsewhere it only fills a gap.
         semantics: i64[T, H, W] train ids, 255 = unlabelled.
+        shift_m: lateral shift from the recorded path, metres, positive to the left.
+        point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring only.
     """
 
     condition: Condition
@@ -416,11 +439,18 @@ class Clip:
     depth: Tensor
     depth_valid: Tensor
     semantics: Tensor
+    shift_m: float = 0.0
+    point_color: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, _, h, w = self.condition.color.shape
         one = (t, 1, h, w)
         checks.check_tensors(self, rgb=(t, 3, h, w), depth=one, depth_valid=one, semantics=(t, h, w))
+        checks.check_given_tensors(self, point_color=(t, 3, h, w))
+
+    def to(self, device: torch.device) -> Clip:
+        """The same clip with its tensors on a device."""
+        return replace(self, condition=self.condition.to(device), **_moved(self, device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

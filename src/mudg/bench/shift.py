@@ -35,7 +35,8 @@ from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
-from mudg.models.mdm import model as mdm
+from mudg.methods import METHODS
+from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
 from mudg.stages import fit, fuse, ingest, render, score, score_truth, synthesize
 from mudg.stages.config import (
@@ -54,8 +55,8 @@ PERCEPTUAL_VIEWS: Final = 12
 WITHOUT, WITH, DIFFUSION, FILL = "street_gaussians", "mudg_s", "mudg_r", score.BASELINE
 GENERATED: Final = (FILL, DIFFUSION)
 """Methods without a fit."""
-_NO_DEPTH: Final = {"virtual_depth_weight": 0.0, "virtual_lidar_weight": 0.0}
-_NO_CLASSES: Final = {"virtual_semantic_weight": 0.0}
+_NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
+_NO_CLASSES: Final = {"semantic_weight": 0.0}
 ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
     "only_I": ("virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
     "only_I_D": ("virtual colour and depth", _NO_CLASSES),
@@ -73,7 +74,7 @@ _EXACT_OUTPUT: Final = VerbOutput(EXACT, 1, below("*", OBSERVATION_FILES))
 
 @dataclass(frozen=True)
 class Row:
-    """A method to compare: its name in tables and folders, words for it, and the settings of its fit (None = no fit)."""
+    """A method to compare: its name in tables and folders, its title, and the settings of its fit (None = no fit)."""
 
     name: str
     title: str
@@ -110,7 +111,7 @@ def run(
         UsageError: an unknown method, a malformed variant, or ``out`` holds logs of other settings. Whatever a verb raises.
     """
     rows = rows_of(config)
-    refuse_overlap(out, {"model": mdm.folder_of(config.model)})
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
     _refuse_foreign(Path(out))
     seeds = city_logs.LISTS[config.list][: config.logs]
     shifts = tuple(sign * d for d in distances_m for sign in (1.0, -1.0))
@@ -173,9 +174,8 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
         if name in wanted
     ]
     if config.ablation:
-        rows += [
-            Row(name, f"with {words}", replace(plain, **dict(weights))) for name, (words, weights) in ABLATION.items()
-        ]  # type: ignore[arg-type]
+        for name, (description, weights) in ABLATION.items():
+            rows.append(Row(name, f"with {description}", configuration.load(FitConfig, plain, overrides={"virtual": weights})))
     for text in config.variant:
         rows.append(variant_of(text, plain))
     names = [row.name for row in rows]
@@ -189,7 +189,8 @@ def _with_method(plain: FitConfig, name: str) -> FitConfig:
 
 
 def variant_of(text: str, plain: FitConfig) -> Row:
-    """A row from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML. UsageError if malformed or no field of ``FitConfig``."""
+    """A row from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field. UsageError if malformed or
+    no field of ``FitConfig``."""
     name, separator, rest = text.partition("=")
     fields: dict[str, Any] = {}
     for part in rest.split(","):
@@ -200,7 +201,7 @@ def variant_of(text: str, plain: FitConfig) -> Row:
             fields[field.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
             raise UsageError("malformed value", where=f"--variant {name}: {field}", got=value) from error
-    changed = configuration.load(FitConfig, plain, overrides=fields)
+    changed = configuration.load(FitConfig, plain, overrides=configuration.nested(fields))
     return Row(name, f"{name}: {rest}", changed)
 
 
@@ -214,7 +215,7 @@ def rows_as_values(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
     """What was asked for, for JSON."""
     return {
-        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm.digest(config.model),
+        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
         "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
         "held_out_every": TEST_EVERY, "ablation": config.ablation,
     }  # fmt: skip
@@ -275,7 +276,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
     _made(job, lambda o: ingest.run(IngestConfig(test_every=TEST_EVERY, city=city), ingest.CITY, scene, overwrite=o))
     fused, painted = out / "fuse", out / "synthesize"
     _made(job, lambda o: fuse.run(FuseConfig(), scene, fused, overwrite=o))
-    if any(row.name == DIFFUSION or (row.fit is not None and fit.RECIPES[row.fit.method].virtual) for row in job.rows):
+    if any(row.name == DIFFUSION or (row.fit is not None and "virtual" in METHODS[row.fit.method].supervision) for row in job.rows):
         _made(job, lambda o: synthesize.run(job.synthesize, scene, fused, painted, overwrite=o))
     drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False)
     paths = render.trajectories(read_scene(scene), drawn)

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from mudg.base import palette
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, yaw_of
-from mudg.base.types import FusedCloud, PointCloud, SweepPoints, Track, View
+from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 
 Matrix = NDArray[np.float64]
 STATIC: Final = -1
@@ -75,22 +75,13 @@ class FusionRules:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
-    """An image beside a sweep: ``rgb`` u8[H, W, 3] of ``view``, and ``semantics`` u8[H, W] train ids or None."""
-
-    view: View
-    rgb: NDArray[np.uint8]
-    semantics: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SweepShots:
     """A sweep (points in the LiDAR frame at ``time_s``) and the images that may colour it."""
 
     time_s: float
     world_from_lidar: Matrix
     points: SweepPoints
-    shots: Sequence[Shot]
+    shots: Sequence[Photo]
 
 
 @dataclass(frozen=True, slots=True)

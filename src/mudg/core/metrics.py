@@ -19,7 +19,7 @@ from torch import Tensor
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES
 from mudg.base.types import View
-from mudg.core import flicker, fused
+from mudg.core import flicker, native_ops
 from mudg.core.losses import ssim_map
 
 CLASS_COUNT: Final = len(CLASSES)
@@ -55,7 +55,7 @@ def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
     if prediction.numel() == 0:
         return math.nan
     if mask is None or bool(mask.all()):
-        return 1.0 - float(fused.photometric(prediction.clamp(0, 1), truth, 1.0))
+        return 1.0 - float(native_ops.photometric(prediction.clamp(0, 1), truth, 1.0))
     values = ssim_map(prediction.clamp(0, 1), truth)
     values = values[mask.expand_as(values)]
     return float(values.double().mean()) if values.numel() else math.nan

@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, ObservationKind, View
+from mudg.core.pictures import to_bytes
 from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
@@ -57,7 +58,7 @@ class ObservationWriter:
         if not bool(torch.isfinite(observation.rgb).all()):
             count = int((~torch.isfinite(observation.rgb)).sum())
             raise InputError("colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values")
-        rgb = (observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+        rgb = to_bytes(observation.rgb)
         with store.atomic_path(self._out / "rgb" / f"{name}.png") as temporary:
             Image.fromarray(rgb).save(temporary, compress_level=1)
         arrays = {"confidence": _numpy(observation.confidence[0], np.float16), "mask": _numpy(observation.mask[0], np.uint8)}
@@ -110,19 +111,25 @@ class ObservationSet:
         """Colour u8[H, W, 3] of one observation."""
         return read_image_file(self.path / "rgb" / f"{index:06d}.png", self.views[index].camera)
 
-    def __getitem__(self, index: int) -> Observation:
+    def arrays(self, index: int) -> dict[str, NDArray[Any]]:
+        """What the data file of one observation holds, as stored: confidence f16, mask u8, and where there are any depth f32 and
+        semantics u8, [H, W] each; InputError where an array is missing or of another size."""
         if not 0 <= index < len(self):
             raise IndexError(index)
-        view = self.views[index]
+        camera = self.views[index].camera
         path = self.path / "data" / f"{index:06d}.safetensors"
         arrays = store.read_safetensors(path)
-        shape = (view.camera.height, view.camera.width)
+        shape = (camera.height, camera.width)
         wanted = ["confidence", "mask"] + ["depth"] * self.has_depth[index] + ["semantics"] * self.has_semantics[index]
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
                 raise InputError("an observation file does not fit its view", where=f"{path}: {name}",
                     expected=str(shape), got=got)  # fmt: skip
+        return {name: arrays[name] for name in wanted}
+
+    def __getitem__(self, index: int) -> Observation:
+        arrays, view = self.arrays(index), self.views[index]
         return Observation(
             view=view,
             rgb=torch.from_numpy(self.rgb_u8(index).copy()).permute(2, 0, 1).float() / 255,

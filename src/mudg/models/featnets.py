@@ -25,8 +25,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mudg.base.errors import InputError
-from mudg.core.fused import box_mean
 from mudg.core.metrics import Pair
+from mudg.core.native_ops import box_mean
 from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.mdm.codec import PatchCodec
 

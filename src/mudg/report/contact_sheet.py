@@ -40,7 +40,7 @@ _SHADE: Final = (10, 10, 10)
 _SHADED_FROM_PX: Final = 24.0
 _THICKER_FROM_PX: Final = 700
 _EDGES: Final = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
-"""Pairs of corners; corner bits: 4 = front, 2 = left, 1 = top."""
+"""Pairs of corners (``geometry.box_corners``)."""
 
 Floats = NDArray[np.float64]
 
@@ -168,7 +168,7 @@ def cut_near(ends: Floats) -> Floats | None:
 def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, track: Track) -> None:
     """A box as lines in its class' colour, those of its front red; on a dark edge where it is large enough, so that points do not
     hide it."""
-    edges = visible_edges(view, drawing.box_corners(track.size_m, world_from_object))
+    edges = visible_edges(view, geometry.transform_points(world_from_object, geometry.box_corners(track.size_m)))
     if not edges:
         return
     line = 1 + view.camera.width // _THICKER_FROM_PX

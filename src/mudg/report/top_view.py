@@ -70,7 +70,7 @@ def draw_top_view(scene: Scene, content: TopView, width: int, height: int) -> Im
         draw.line(pairs(pixels(track.world_from_object[:, :3, 3])), fill=_COURSE_COLOR)
         pose = content.boxes[track.id]
         if pose is not None:
-            corners = pixels(box_corners(track.size_m, pose)[[0, 2, 6, 4]])
+            corners = pixels(geometry.transform_points(pose, geometry.box_corners(track.size_m)[[0, 2, 6, 4]]))
             draw.polygon(pairs(corners), outline=box_color(track.label))
             draw.line(pairs(corners[[2, 3]]), fill=FRONT_COLOR, width=2)
     if len(path) > 1:
@@ -113,11 +113,6 @@ def draw_caption(draw: ImageDraw.ImageDraw, text: str) -> None:
     draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill=GROUND_COLOR)
     draw.text((4, 3), text, fill=TEXT_COLOR)
 
-
-def box_corners(size_m: Floats, world_from_object: Floats) -> Floats:
-    """Corners f64[8, 3] of a box; bits of a corner's number: 4 = front, 2 = left, 1 = top."""
-    signs = np.array([[1 if n & 4 else -1, 1 if n & 2 else -1, 1 if n & 1 else -1] for n in range(8)])
-    return geometry.transform_points(world_from_object, signs * size_m / 2)
 
 
 def box_color(label: str) -> tuple[int, int, int]:

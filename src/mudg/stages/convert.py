@@ -24,11 +24,11 @@ from mudg.base.replacement import Replacement, all_names
 from mudg.base.run_folder import refuse_overlap
 from mudg.data import weights
 from mudg.models.published import clip
+from mudg.models.published import files as published_files
 from mudg.models.published.clip import TextTower
 from mudg.models.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
 from mudg.stages import convert_depthlab
 from mudg.stages.config import ConvertConfig
-from mudg.stages.learning import published_model
 
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
@@ -48,7 +48,7 @@ def run(
     overwrite: bool = False,
     network: PublishedConfig | None = None,
 ) -> Path:
-    """Convert one checkpoint; returns `to`, which is whole or not there.
+    """Convert one checkpoint; returns `to`, which is complete or not there.
 
     Args:
         config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's files.
@@ -56,7 +56,7 @@ def run(
         network: sizes of the network the checkpoint should hold (None: the published ones).
 
     Raises:
-        UsageError: the folder exists, or the resolution cannot be told. InputError: not such a checkpoint; nothing is written.
+        UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is written.
         ResourceError: memory limit or disk.
     """
     checkpoint, to = Path(checkpoint), Path(to)
@@ -86,7 +86,7 @@ def run(
         with contextlib.suppress(OSError):  # there and empty only if converting failed
             replacement.staging.rmdir()
     memory = f"; peak memory {peak / processes.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
-    log.info(f"convert: {to} is whole{memory}")
+    log.info(f"convert: {to} is complete{memory}")
     return to
 
 
@@ -132,7 +132,7 @@ def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Callabl
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
-    """Height and width that the checkpoint was trained at: as configured, else told by the file's name."""
+    """Height and width that the checkpoint was trained at: as configured, else from the file's name."""
     if config.resolution != "auto":
         height, width = config.resolution.split("x")
         return int(height), int(width)
@@ -175,7 +175,7 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
         "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
     }  # fmt: skip
-    published_model.write(
+    published_files.save(
         to,
         network,
         tensors,

@@ -18,8 +18,8 @@ from PIL import Image
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.base.types import Frame, FusedCloud, Scene, Track
-from mudg.core.fusion import FusionReport, FusionRules, Shot, SweepShots, fuse_sweeps
+from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
+from mudg.core.fusion import FusionReport, FusionRules, SweepShots, fuse_sweeps
 from mudg.data.cloudfile import write_fused
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.report.top_view import TopView, draw_top_view
@@ -86,7 +86,7 @@ def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
     by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "fusing sweeps"):
         chosen = [_nearest(found, sweep.time_s) for found in by_camera.values() if found]
-        shots = [_shot(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= config.max_image_gap_s]
+        shots = [_photo(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= config.max_image_gap_s]
         points = read_points(scene, sweep)
         yield SweepShots(sweep.time_s, sweep.world_from_lidar, points, shots)
 
@@ -95,9 +95,9 @@ def _nearest(frames: list[Frame], time_s: float) -> Frame:
     return min(frames, key=lambda frame: abs(frame.view.time_s - time_s))
 
 
-def _shot(scene: Scene, frame: Frame) -> Shot:
+def _photo(scene: Scene, frame: Frame) -> Photo:
     semantics = read_label(scene, frame, "semantics") if "semantics" in frame.labels else None
-    return Shot(frame.view, read_image(scene, frame), semantics)
+    return Photo(frame.view, read_image(scene, frame), semantics)
 
 
 def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:

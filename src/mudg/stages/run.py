@@ -90,13 +90,13 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
     """UsageError where the chain would write into, over or around what it reads. Its own scene is no such case: with a scene as
     source it writes none."""
-    from mudg.models.mdm import model as mdm
+    from mudg.models.mdm.files import folder_of
 
     refuse_overlap(out, {
         "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
         "ingest.poses": config.ingest.poses, "ingest.boxes": config.ingest.boxes, "annotate.weights": config.annotate.weights,
-        "annotate.depth-network": config.annotate.depth_network, "synthesize.model": mdm.folder_of(config.synthesize.model),
-        "fit.lpips-weights": config.fit.lpips_weights, "score.lpips-weights": config.score.lpips_weights,
+        "annotate.depth-network": config.annotate.depth_network, "synthesize.model": folder_of(config.synthesize.model),
+        "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights, "score.lpips-weights": config.score.lpips_weights,
     })  # fmt: skip
 
 

@@ -41,7 +41,7 @@ from mudg.data.observations import (
 )
 from mudg.data.scene import read_scene
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, Truth, ViewTruth, apart_m, stored_truth, truth_of
@@ -165,7 +165,7 @@ def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     """The rows that need weights and have them."""
     found: dict[str, PairDistance] = {}
     if config.perceptual_views:
-        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
+        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec))
     if config.lpips_weights:
         state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
         network = LpipsFeatures(state, config.lpips_weights)

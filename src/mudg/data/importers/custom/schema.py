@@ -245,7 +245,7 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
     origin_m = poses[0, :3, 3].copy()
     poses[:, :3, 3] -= origin_m
     ego = EgoPath(common.seconds([entry.time for entry in path], clock.unit, f"{where}: ego", clock.start), poses)
-    reader = _Reader(where, clock, origin_m, complain)
+    reader = _LogReader(where, clock, origin_m, complain)
     images = reader.items("images", top.images, LogImageEntry, top.cameras, cameras)
     sweeps = reader.items("sweeps", top.sweeps, LogCloudEntry, top.lidars, lidars)
     tracks = reader.tracks(top.tracks)
@@ -301,7 +301,7 @@ def _parse_lidar(name: str, value: object, where: str) -> LogLidar:
     return lidar
 
 
-class _Reader:
+class _LogReader:
     """Parses records that depend on the log's clock and origin."""
 
     def __init__(self, where: str, clock: LogClock, origin_m: NDArray[np.float64], complain: schema.Complain) -> None:
