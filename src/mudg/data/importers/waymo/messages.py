@@ -185,7 +185,7 @@ def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
 # --- the messages of the data set -----------------------------------------------------------------------------------
 
 
-def _message(title: str, /, **fields: tuple[int, Kind] | tuple[int, Kind, Message]) -> Message:
+def _message(title: str, /, **fields: tuple[Any, ...]) -> Message:
     """A description from fields by name: number, kind and, for messages, their description."""
     return Message(title, {number: Field(field, *kind) for field, (number, *kind) in fields.items()})
 
