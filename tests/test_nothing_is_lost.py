@@ -27,7 +27,7 @@ from mudg.bench import shift, shift_page
 from mudg.core import trajectory
 from mudg.data.city import CityConfig
 from mudg.data.scene import read_scene, write_zip
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import (
@@ -156,7 +156,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
     given["fitted"] = fit.run(config, given["scene"], given["fused"], root / "fitted")
     torch.manual_seed(0)
-    mdm.save(MDM(SMALL), root / "model", "", {})
+    files.save(MDM(SMALL), root / "model", "", {})
     given["model"] = root / "model"
     given["city"] = ingest.run(IngestConfig(city=CITY, contact_sheet=False), ingest.CITY, root / "city")
     return given
