@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -13,6 +14,8 @@ from mudg.base.config import STRICT
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class BenchConfig:
     """Measure on generated cities, against exact truth: the diffusion model on ones it never saw, or scenes, also off the path."""
+
+    MOVED: ClassVar[Mapping[str, str | None]] = {"ablation_steps": None, "ablation_cities": None}
 
     model: str = "embedded"
     """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
