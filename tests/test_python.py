@@ -82,3 +82,27 @@ def test_verbs_check_settings_as_the_command_does(session: dict[str, Any], tmp_p
     assert verbs.fuse(folder / "scene", folder / "fused") == folder / "fused"  # verified and reused
     assert verbs.doctor()["problems"] is not None
     assert mudg.read_scene(folder / "scene").frames
+
+
+def test_what_a_notebook_gets_wrong_is_refused_in_words(session: dict[str, Any], tmp_path: Path) -> None:
+    scene, view = session["folder"] / "scene", session["view"]
+    for said, wrong in (
+        ("views are names with their folders", lambda: verbs.score(scene, ["views"], tmp_path / "a")),  # type: ignore[arg-type]
+        ("shifts_m", lambda: verbs.run("city", tmp_path / "a", shifts_m=2.0)),
+        ("cameras", lambda: verbs.run("city", tmp_path / "a", cameras="front")),
+        ("seed", lambda: verbs.run("city", tmp_path / "a", seed="x")),  # type: ignore[arg-type]
+        (
+            r"loss: \{ssim_weight: \.\.\.\}",
+            lambda: verbs.fit(scene, scene, tmp_path / "a", **{"loss.ssim_weight": 0.1}),
+        ),
+        (r"not a mudg\.Camera", lambda: session["fitted"].render("front", view.world_from_cam, view.time_s)),
+    ):
+        with pytest.raises(UsageError, match=said):
+            wrong()
+    assert not (tmp_path / "a").exists()
+
+
+def test_settings_take_path_objects(session: dict[str, Any], tmp_path: Path) -> None:
+    folder = session["folder"]
+    with pytest.raises(InputError, match="no diffusion model here"):
+        verbs.synthesize(folder / "scene", folder / "fused", tmp_path / "a", model=tmp_path / "none")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import rigid_problem
 from mudg.base.types import Camera, View
 
@@ -106,7 +106,7 @@ class FittedScene:
             backend: ``auto``, ``cpu``, ``torch`` or ``gsplat``.
 
         Raises:
-            InputError: the pose is not rigid. ResourceError: the backend is not available.
+            UsageError: not a camera. InputError: the pose is not rigid. ResourceError: the backend is not available.
         """
         import torch
 
@@ -114,6 +114,12 @@ class FittedScene:
         from mudg.core.raster.rasterize import RasterConfig
         from mudg.stages.fit import render_view
 
+        if not isinstance(camera, Camera):
+            raise UsageError(
+                "the camera is not a mudg.Camera",
+                expected='e.g. scene.frames_of("front")[0].view.camera',
+                got=repr(camera),
+            )
         view = View(camera, np.asarray(world_from_cam, np.float64), float(time_s))
         with torch.no_grad():
             seen = render_view(self._model, view, RasterConfig(backend=backend))  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mudg.base import config as configuration
+from mudg.base.errors import UsageError
 from mudg.stages import config as stage_config
 
 Config = TypeVar("Config")
@@ -113,6 +114,10 @@ def score(
     from mudg.stages import score as stage
 
     made = _settings(stage_config.ScoreConfig, config, settings)
+    if not isinstance(views, Mapping):
+        raise UsageError(
+            "views are names with their folders", where="views", expected="{name: folder}", got=repr(views)
+        )
     folders = {name: Path(folder) for name, folder in views.items()}
     return stage.run(made, Path(scene), folders, Path(out), fused=_optional(fused), overwrite=overwrite)
 
@@ -133,9 +138,13 @@ def run(
     from mudg.stages import run as stage
 
     preset = stage_config.run_preset(fast)
+    common = {"seed": seed, **{name: settings.pop(name, None) for name in ("cameras", "shifts_m")}}
+    given = {name: value for name, value in common.items() if value is not None}
+    checked = configuration.load(stage_config.SynthesizeConfig, overrides=given)
     if seed is not None:
-        preset = stage_config.with_seed(preset, seed)
-    cameras, shifts_m = settings.pop("cameras", None), settings.pop("shifts_m", None)
+        preset = stage_config.with_seed(preset, checked.seed)
+    cameras = checked.cameras if "cameras" in given else None
+    shifts_m = checked.shifts_m if "shifts_m" in given else None
     made = _settings(stage_config.RunConfig, config, settings, preset)
     return stage.run_chain(
         stage_config.with_lines(made, cameras=cameras, shifts_m=shifts_m), log, Path(out), overwrite=overwrite
@@ -161,7 +170,16 @@ def doctor(scene: Location | None = None) -> dict[str, Any]:
 def _settings(
     kind: type[Config], file: Location | None, settings: Mapping[str, Any], preset: Config | None = None
 ) -> Config:
-    return configuration.load(kind, preset, _optional(file), settings)
+    return configuration.load(kind, preset, _optional(file), _with_text_paths(settings))
+
+
+def _with_text_paths(value: Any) -> Any:
+    """Settings hold paths as text, in files as here."""
+    if isinstance(value, Mapping):
+        return {name: _with_text_paths(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_text_paths(inner) for inner in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def _optional(path: Location | None) -> Path | None:

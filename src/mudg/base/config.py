@@ -114,6 +114,13 @@ def _merge(
             near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
             what, expected = f"unknown configuration key {path}{name}", "one of " + ", ".join(known)
             remedy = f"did you mean {path}{near[0]}?" if near else "remove it"
+            if str(name).split(".")[0] in known and "." in str(name):
+                remedy = (
+                    "write each part before a dot as a group: "
+                    + str(name).replace(".", ": {")
+                    + ": ..."
+                    + "}" * str(name).count(".")
+                )
             raise UsageError(what, where=where, expected=expected, remedy=remedy)
         if is_group and is_mapping and isinstance(base.get(name), Mapping):
             merged[name] = _merge(base[name], value, where, group, f"{path}{name}.")
