@@ -30,6 +30,7 @@ from mudg.data.city.config import CityConfig
 from mudg.models.scene.densify import DensifyStats
 from mudg.stages import fit, fuse, ingest
 from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
+from mudg.stages.config.fit import DensifyConfig
 from mudg.stages.fitting.views import ViewSet
 
 FORWARD = ("project", "sort", "bin", "blend")
@@ -119,7 +120,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     config = FitConfig(
         method="street_gaussians",
         iterations=options.iterations,
-        densify=options.densify,
+        densify=DensifyConfig(kind=options.densify),
         checkpoint_every=1_000_000,
         preview_every=1_000_000,
     )
@@ -146,7 +147,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         fit.run(config, scene, fused, Path(folder) / "fit")
     clock.seconds["rest"] += taken["seconds"] - sum(clock.seconds.values())
     return {
-        **taken, "iterations": config.iterations, "densify": config.densify, "frames": options.frames, "cameras": options.cameras,
+        **taken, "iterations": config.iterations, "densify": config.densify.kind, "frames": options.frames, "cameras": options.cameras,
         "size": options.size, "threads": options.threads, "clock": "processor" if options.threads == 1 else "wall",
         "isa": native.isa(), "it_per_s": taken["steps"] / taken["seconds"],
         "ms": {part: 1e3 * value / taken["steps"] for part, value in clock.seconds.items()},

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from mudg.base.types import Camera, Condition, View
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import SampleRequest
+from mudg.models.mdm import files as mdm_files
 
 
 def seconds(work: Callable[[], object], repeats: int = 3) -> float:
@@ -47,11 +48,11 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true", help="also where the time of a clip goes (bfloat16)")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    model = mdm.load(options.model)
+    model = mdm_files.load(options.model)
     height = max(1, round((model.config.area_px / 1.5) ** 0.5 / model.config.pixel_multiple)) * model.config.pixel_multiple
     width = model.config.area_px // height
     condition = made_up_condition(model.config.window, height, width)
-    latents = model.sample(condition, steps=1).latents
+    latents = model.sample(condition, SampleRequest(1)).latents
     encoded = model.encode_condition(condition)
     print(  # noqa: T201
         f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M parameters, {model.config.window} frames of {width}x{height}"
@@ -62,8 +63,8 @@ def main() -> None:
                 decode = seconds(lambda: model.codec.decode(latents))
             else:
                 decode = seconds(lambda: model.refine(latents, encoded.pixels, model.config.window))
-        one = seconds(lambda bf16=bf16: model.sample(condition, steps=1, bf16=bf16))
-        more = seconds(lambda bf16=bf16: model.sample(condition, steps=options.steps, bf16=bf16))
+        one = seconds(lambda bf16=bf16: model.sample(condition, SampleRequest(1, bf16=bf16)))
+        more = seconds(lambda bf16=bf16: model.sample(condition, SampleRequest(options.steps, bf16=bf16)))
         pass_s = (more - one) / max(1, options.steps - 1)
         name = "bfloat16" if bf16 else "float32"
         print(  # noqa: T201
@@ -71,7 +72,7 @@ def main() -> None:
         )
     if options.profile:
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
-            model.sample(condition, steps=options.steps, bf16=True)
+            model.sample(condition, SampleRequest(options.steps, bf16=True))
         print(profile.key_averages().table(sort_by="self_cpu_time_total", row_limit=12, max_name_column_width=40))  # noqa: T201
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"largest memory of this process {peak_gb:.2f} GB")  # noqa: T201

@@ -23,11 +23,11 @@ def report(needs: memory_plan.Needs) -> list[str]:
     for frames in memory_plan.FRAMES_AT_ONCE:
         lines.append(f"  autoencoder, {frames:2d} frames at once {needs.one_frame * frames / 1e9:24.2f} GB")
     for budget in BUDGETS_GB:
-        plan = memory_plan.choose(needs, budget * 10**9)
+        plan, peak_bytes = memory_plan.choose(needs, budget * 10**9)
         way = [f"modalities {'together' if plan.modalities_together else 'apart'}"]
         way += [f"guidance {'together' if plan.guidance_together else 'apart'}", f"{plan.frames_at_once} frames per decoding"]
-        fits = "" if plan.peak_bytes <= budget * 1e9 else "  (does not fit)"
-        lines.append(f"  budget {budget:2d} GB: {', '.join(way):<64}{plan.peak_bytes / 1e9:5.1f} GB{fits}")
+        fits = "" if peak_bytes <= budget * 1e9 else "  (does not fit)"
+        lines.append(f"  budget {budget:2d} GB: {', '.join(way):<64}{peak_bytes / 1e9:5.1f} GB{fits}")
     return lines
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import torch
 
 from mudg.base import seeds
-from mudg.models.published.model import Encoded, PublishedConfig, PublishedMDM, choose_trainable
+from mudg.models.published.model import PublishedConfig, PublishedLatents, PublishedMDM, choose_trainable
 from mudg.stages.learning import memory_plan
 
 
@@ -86,10 +86,10 @@ def main() -> None:
         model.net.checkpointing = True
         truth = {m: draw(batch, frames, channels, h, w) for m in ("rgb", "depth", "semantics")}
         features = draw(batch, 257, config.image.width).to(model.dtype)
-        encoded = Encoded(draw(batch, frames, 2 * channels, h, w), features, features[:1], draw(batch, frames, 1, h, w))
+        encoded = PublishedLatents(draw(batch, frames, 2 * channels, h, w), features, features[:1], draw(batch, frames, 1, h, w))
 
         def step() -> None:
-            model.loss(truth, encoded, seeds.torch_generator(0, 0, "step")).total.backward()
+            model.velocity_loss(truth, encoded, seeds.torch_generator(0, 0, "step")).total.backward()
             for value in moving:
                 value.grad = None
 

@@ -78,7 +78,7 @@ def pose_row(pose: np.ndarray) -> dict[str, list[float]]:
 
 def make_nuscenes(root: Path, seconds: float, rows: int) -> int:
     """Six cameras of 1600x900 at 12 Hz, 34,720 points at 20 Hz; returns the moments of the reference camera."""
-    from mudg.data.importers.nuscenes.importer import CAMERAS
+    from mudg.data.importers.nuscenes.sensors import CAMERAS
 
     (root / "image.jpg").write_bytes(jpeg(1600, 900))
     xyz = street(34_720)

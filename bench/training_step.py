@@ -23,12 +23,13 @@ from raster import street
 
 from mudg import native
 from mudg.base.types import Render
-from mudg.core import fused, losses
+from mudg.core import losses, native_ops
 from mudg.core.raster import cpu as raster_cpu
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
 from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
-from mudg.models.scene.nodes import SceneModel, StaticNode, compose, composite_semantics
+from mudg.models.scene.model import SceneModel, compose, composite_semantics
+from mudg.models.scene.nodes import StaticNode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -84,7 +85,7 @@ class Target:
     def loss(self, model: SceneModel, render: Render, classes: bool) -> Tensor:
         """Weighted sum of the terms."""
         terms = [
-            fused.photometric(render.rgb, self.rgb),
+            native_ops.photometric(render.rgb, self.rgb),
             0.1 * losses.sparse_depth(render.depth, self.pixel, self.depth_m),
         ]
         if classes and render.extra is not None:
@@ -103,7 +104,7 @@ def one_step(model: SceneModel, view: View, target: Target, stats: DensifyStats,
     with clock.part("backward"):
         loss.backward()
     with clock.part("adam"):
-        model.table.adam_step(step, RATES, fused.adam_columns, render.trace.visible)
+        model.table.adam_step(step, RATES, native_ops.adam_columns, render.trace.visible)
         model.table.clear_gradients()
     with clock.part("statistics"):
         stats.observe(render.trace, view.camera.width, view.camera.height)

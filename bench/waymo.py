@@ -34,7 +34,7 @@ IMPORT = """
 import sys
 from pathlib import Path
 from mudg.data.importers.options import ImportOptions
-from mudg.data.importers.waymo import import_waymo
+from mudg.data.importers.waymo.importer import import_waymo
 source, out, frames, workers = sys.argv[1:]
 import_waymo(Path(source), Path(out), ImportOptions(frames=(0, int(frames)), workers=int(workers)))
 """

@@ -11,26 +11,26 @@ os.environ["GLOO_SOCKET_IFNAME"] = "lo"
 import torch.distributed as dist
 from toy_published import published_settings
 
+from mudg.base.processes import Interruption
 from mudg.stages import learn
-from mudg.stages.learning.parallel import Interruption
 
 rank, store, start, clips, out = int(sys.argv[1]), *sys.argv[2:5], Path(sys.argv[5])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
 common = {"frozen": "temporal_transformers", "steps": 3}
-losses, asked = learn._losses, Interruption.asked
+draw, asked = learn.draw_clips, Interruption.requested
 
 
-def stop_after_two(spread, model, config, batch, at, *rest):
-    if at == 1:
-        Interruption.asked = property(lambda self: True)
-    return losses(spread, model, config, batch, at, *rest)
+def stop_after_two(config, folder, step, *rest):
+    if step == 1:
+        Interruption.requested = property(lambda self: True)
+    return draw(config, folder, step, *rest)
 
 
-learn._losses = stop_after_two
+learn.draw_clips = stop_after_two
 try:
     learn.run(published_settings(start, clips, **common), out)
 except KeyboardInterrupt:
-    learn._losses, Interruption.asked = losses, asked
+    learn.draw_clips, Interruption.requested = draw, asked
 else:
     sys.exit("the run was not stopped")
 learn.run(published_settings(start, clips, **common, parallel="fsdp", recompute=True), out)

@@ -12,8 +12,8 @@ import torch.distributed as dist
 from toy_clips import tiny
 
 from mudg.base.errors import NumericsError, UsageError
+from mudg.base.processes import Interruption
 from mudg.stages import learn
-from mudg.stages.learning.parallel import Interruption
 
 rank, store, clips, out = int(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
@@ -22,21 +22,21 @@ said = {}
 
 def run_until(step, config, folder, stopper):
     """Run on; process `stopper` alone is asked to stop during step number `step`."""
-    losses = learn._losses
+    draw = learn.draw_clips
 
-    def stop_then(spread, model, config, batch, at, *rest):
-        if rank == stopper and at == step - 1:
-            Interruption.asked = property(lambda self: True)
-        return losses(spread, model, config, batch, at, *rest)
+    def stop_then(config, folder, drawn_step, count, frames, purpose, *rest):
+        if rank == stopper and purpose == "batch" and drawn_step == step - 1:
+            Interruption.requested = property(lambda self: True)
+        return draw(config, folder, drawn_step, count, frames, purpose, *rest)
 
-    asked = Interruption.asked
-    learn._losses = stop_then
+    asked = Interruption.requested
+    learn.draw_clips = stop_then
     try:
         learn.run(config, folder)
     except KeyboardInterrupt:
         return True
     finally:
-        learn._losses, Interruption.asked = losses, asked
+        learn.draw_clips, Interruption.requested = draw, asked
     return False
 
 

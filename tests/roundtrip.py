@@ -5,7 +5,7 @@ A test of a format writes ``small_log`` in that format with a writer of its own,
     truth = roundtrip.small_log(tmp_path / "truth")
     write_waymo(truth, tmp_path / "log")
     scene = IMPORTERS["waymo"](tmp_path / "log", tmp_path / "scene", ImportOptions())
-    roundtrip.assert_same_log(scene, truth, cloud_m=2e-3, colour_levels=3)
+    roundtrip.assert_same_log(scene, truth, cloud_m=2e-3, color_levels=3)
 
 Importers may put the world's origin and the clock's zero where they like; both are taken from the first image of the first
 camera. Everything else must agree within the tolerances.
@@ -74,7 +74,7 @@ def assert_same_log(
     cloud_share: float = 1.0,
     intensity: float | None = 1e-3,
     dt_s: float | None = None,
-    colour_levels: float = 0.0,
+    color_levels: float = 0.0,
     missing_tracks: int = 0,
     sweeps: bool = True,
 ) -> None:
@@ -92,7 +92,7 @@ def assert_same_log(
         cloud_share: share of points that must have one; 1 also asks for equal counts.
         intensity: largest difference to the partner; None = not compared.
         dt_s: the same for point times relative to the first image's time; None = not compared.
-        colour_levels: mean absolute difference of images, 0..255; 0 = equal.
+        color_levels: mean absolute difference of images, 0..255; 0 = equal.
         missing_tracks: so many boxes may be left out by the format (say why at the call).
         sweeps: whether the format has LiDAR.
     """
@@ -111,7 +111,7 @@ def assert_same_log(
         if len(a) != len(b):
             problems.append(f"camera {ours}: {len(b)} frames, expected {len(a)}")
         for one, other in zip(a, b):
-            compared.frame(one, other, pose, time_s, intrinsics_px, colour_levels)
+            compared.frame(one, other, pose, time_s, intrinsics_px, color_levels)
     if sweeps:
         if len(truth.sweeps) != len(scene.sweeps):
             problems.append(f"{len(scene.sweeps)} sweeps, expected {len(truth.sweeps)}")
@@ -159,7 +159,7 @@ class _Comparison:
         if (off := abs(late_s - self.shift_s)) > time_s:
             self.problems.append(f"{where}: time differs by {off:.3g} s")
 
-    def frame(self, a: Frame, b: Frame, pose: float, time_s: float, intrinsics_px: float, colour_levels: float) -> None:
+    def frame(self, a: Frame, b: Frame, pose: float, time_s: float, intrinsics_px: float, color_levels: float) -> None:
         """An image ``b`` of the scene with its original."""
         where = f"frame {b.id}"
         ca, cb = a.view.camera, b.view.camera
@@ -171,7 +171,7 @@ class _Comparison:
             self.problems.append(f"{where}: intrinsics differ by {off:.3g} px")
         self.posed(where, b.view.world_from_cam, a.view.world_from_cam, b.view.time_s - a.view.time_s, pose, time_s)
         one, other = read_image(self.truth, a).astype(int), read_image(self.scene, b).astype(int)
-        if (mean := float(np.abs(one - other).mean())) > colour_levels:
+        if (mean := float(np.abs(one - other).mean())) > color_levels:
             self.problems.append(f"{where}: colours differ by {mean:.3g} levels on average")
 
     def sweep(self, a: Sweep, b: Sweep, pose: float, time_s: float) -> None:

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from toy_scene import CAR_SIZE_M, ToyStreet
 
-from mudg.base import geometry, store
+from mudg.base import geometry
 from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.palette import ID, UNLABELLED
+from mudg.base.run_folder import RunDir
 from mudg.base.types import EgoPath, Ref, Source, Sweep, View
 from mudg.core.complete import ray_elevation
 from mudg.data.scene import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
@@ -238,7 +239,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     plain = read_scene(tmp_path / "plain")
     settings = to_dict(config)
     settings.pop("processes")
-    begun = store.RunDir.open(tmp_path / "begun", "annotate", settings, annotate.inputs_of(config, tmp_path / "plain"), annotate._VERSION)
+    begun = RunDir.open(tmp_path / "begun", annotate._OUTPUT, settings, annotate.inputs_of(config, tmp_path / "plain"))
     aside = tmp_path / "begun" / "labelled"
     first = [frame.id for frame in plain.frames[:2]]
     assert list(annotate.label_and_put_aside(config, plain, first, aside)) == first

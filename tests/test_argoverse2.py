@@ -108,7 +108,7 @@ BROKEN: dict[str, tuple[str, Callable[[Columns], object], str]] = {
     ),
     "pose not finite": (EGO, lambda c: c["tx_m"].__setitem__(1, np.nan), "not finite"),
     "no mount": (MOUNTS, lambda c: c["sensor_name"].__setitem__(0, "ring_rear_left"), "lacks a sensor"),
-    "no lens": (LENSES, lambda c: c["sensor_name"].__setitem__(0, "ring_rear_left"), "lacks a camera"),
+    "no lens": (LENSES, lambda c: c["sensor_name"].__setitem__(0, "ring_rear_left"), "lacks a sensor"),
     "other image size": (LENSES, lambda c: c["width_px"].__setitem__(0, 97), "camera's size"),
     "length and width swapped": (BOXES, lambda c: c.update(length_m=c["width_m"], width_m=c["length_m"]), "swapped"),
     "size below zero": (BOXES, lambda c: c["height_m"].__setitem__(0, -1.5), "makes no sense"),

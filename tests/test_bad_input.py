@@ -112,8 +112,8 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     "no pose file": ("no vehicle poses", "", lambda r: (r / "derived/poses_velo.txt").unlink()),
     "NaN pose": ("not finite", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "nan", *w[5:]])),
     "text in pose": ("not a number", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "1,5", *w[5:]])),
-    "scaled pose": ("not a rigid motion", "frame 2", lambda r: pose_line(r, 2, scale)),
-    "mirrored pose": ("not a rigid motion", "frame 2", lambda r: pose_line(r, 2, mirror)),
+    "scaled pose": ("is scaled", "frame 2", lambda r: pose_line(r, 2, scale)),
+    "mirrored pose": ("left-handed", "frame 2", lambda r: pose_line(r, 2, mirror)),
     "binary pose file": (
         "not text",
         "poses_velo.txt",
@@ -136,14 +136,14 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         ),
     ),
     "calibration scaled": (
-        "not a rotation",
+        "is scaled",
         "R0_rect",
         lambda r: rewrite(r / "calib.txt", lambda t: t.replace(made.numbers(np.eye(3)), made.numbers(2 * np.eye(3)))),
     ),
     "label columns": ("number of columns", "label_02.txt: line 3", lambda r: label(r, lambda w: w[:-3])),
     "label text": ("not a number", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "left"])),
     "label NaN": ("not finite", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "nan"])),
-    "flat box": ("not positive", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:10], "0", *w[11:]])),
+    "flat box": ("makes no sense", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:10], "0", *w[11:]])),
     "two boxes of one track": (
         "two boxes",
         "label_02.txt",
@@ -271,7 +271,7 @@ def test_scan_with_zero_points(drive: Path, tmp_path: Path) -> None:
     scene, cloud = through(drive, tmp_path)
     assert len(read_points(scene, scene.sweeps[3]).xyz) == 0
     assert len(cloud.static) > 0
-    assert any("no points" in f.words for f in check_scene(scene.root))
+    assert any("no points" in f.message for f in check_scene(scene.root))
 
 
 def test_one_camera_of_several_is_enough(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ CLOUDS: dict[tuple[str, str], tuple[Change, str]] = {
     ("dgp", "wrong checksum"): (flipped(0.5), "cut off"),
     ("custom", "wrong checksum"): (flipped(0.5), "not a readable NPZ"),
     ("pandaset", "wrong checksum"): (lambda c: c[:-8] + bytes([c[-8] ^ 1]) + c[-7:], "damaged"),
-    ("argoverse2", "no table"): (lambda c: b"FEA1" + c[4:], "no Feather table"),
+    ("argoverse2", "no table"): (lambda c: b"FEA1" + c[4:], "table cannot be read"),
 }
 
 
@@ -250,7 +250,7 @@ RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
         only(lambda r: kitti_frame(r, label_number=11)), "class that does not exist", r"instances\[0\]"),
     ("nuscenes", "Windows path"): (nuscenes("sample_data", backslashes), "backslash", "sample_data.json: record"),
     ("nuplan", "Windows path"): (
-        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"), "leads out of", "image at"),
+        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"), "backslash", "image at"),
     ("nuplan", "width and length swapped"): (nuplan("UPDATE lidar_box SET width = length, length = width"), "swapped", "lidar_box"),
     ("dgp", "Windows path"): (
         dgp("scene_abc.json", lambda r: [

@@ -1,4 +1,4 @@
-"""Measurements of the diffusion model: flicker at known values, conditions of the ablation, the command end to end."""
+"""Measurements of the diffusion model: flicker at known values, the command end to end."""
 
 import json
 import math
@@ -9,12 +9,10 @@ import pytest
 import torch
 
 from mudg.base.errors import MudgError, UsageError
-from mudg.bench import mdm_ablation
 from mudg.bench import run as bench
 from mudg.core import flicker
 from mudg.data.clips import from_city
-from mudg.data.clips import shards as clip_shards
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages.config import BenchConfig
@@ -22,6 +20,7 @@ from mudg.stages.config import BenchConfig
 SMALL = MDMConfig(
     widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
     embed_width=16, patch=2, codec=CodecConfig(decoder_width=8, decoder_blocks=1), refine_widths=(8, 16), refine_blocks=(1, 1),
+    window=8, area_px=24576,
 )  # fmt: skip
 
 
@@ -55,38 +54,6 @@ def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
     assert math.isnan(flicker.flicker(made[:1], truth[:1], depth[:1], ids[:1], poses[:1], lens[:1]))
 
 
-@pytest.fixture(scope="module")
-def city(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("clips")
-    rules = from_city.CityClipRules(48, 32, 4, clips=2)
-    from_city.write_city(rules, from_city.DEVELOPMENT[0], folder)
-    return clip_shards.read_batch(folder, [(from_city.DEVELOPMENT[0], 0, range(4))])
-
-
-def test_conditions_of_the_ablation(city):
-    points = mdm_ablation.points_only(city)
-    assert torch.equal(points.color[points.valid.expand_as(points.color)], city.point_color[city.valid.expand_as(city.color)])
-    assert float(points.color[~points.valid.expand_as(points.color)].abs().max()) == 0
-    assert not bool(points.warped.any())
-    assert bool((points.ids == 255).all())
-    nothing = mdm_ablation.nothing_seen(city)
-    assert float(nothing.color.abs().max()) == 0
-    assert not bool(nothing.valid.any())
-    assert torch.equal(nothing.reference, city.reference)
-
-
-def test_concatenated_reference_adds_its_latent_to_every_frame(city):
-    plain = MDMConfig(**{**SMALL.__dict__, "reference": "none"})
-    both = MDMConfig(**{**SMALL.__dict__, "reference": "concatenated"})
-    given = (city.color, city.sparse_depth, city.valid, city.warped, city.backdrop, city.reference, city.ids, city.backdrop_ids)
-    without, within = MDM(plain).encode_planes(*given).planes, MDM(both).encode_planes(*given).planes
-    assert within.shape[2] == without.shape[2] + 4
-    latent = MDM(both).codec.encode_rgb(city.reference)
-    places = [c for c in range(within.shape[2] - 3) if torch.equal(within[0, 0, c : c + 4], latent[0])]
-    assert len(places) == 1
-    assert torch.equal(within[0, -1, places[0] : places[0] + 4], latent[0])
-
-
 def test_reported_and_development_cities_differ():
     assert not set(from_city.REPORTED) & set(from_city.DEVELOPMENT)
     assert min(from_city.REPORTED + from_city.DEVELOPMENT) >= from_city.HELD_OUT
@@ -105,7 +72,7 @@ def test_what_reads_no_model_does_not_depend_on_it(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_measures_a_model(tmp_path):
-    mdm.save(MDM(SMALL), tmp_path / "model", "card", {})
+    files.save(MDM(SMALL), tmp_path / "model", "card", {})
     config = BenchConfig(model=str(tmp_path / "model"), cities="development", count=1, steps=(1,), precision="float32")
     out = bench.run("mdm", config, tmp_path / "out")
     content = json.loads((out / "bench.json").read_text())

@@ -59,7 +59,7 @@ def test_moving_instances_are_those_of_the_generator():
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     judged = set(city_logs.moving_instances(world))
     still = {
-        number for number, mover in enumerate(world.movers, start=1) if np.ptp(mover.keys[:, :2], axis=0).max() == 0
+        number for number, posed in enumerate(world.objects, start=1) if np.ptp(posed.keys[:, :2], axis=0).max() == 0
     }
     assert judged
     assert not judged & still
@@ -70,16 +70,16 @@ def test_moving_instances_are_those_of_the_generator():
 
 def test_variants_change_fields_of_the_fit():
     rows = bench_shift.rows_of(
-        BenchConfig(methods=("mudg_s",), variant=("a=virtual_probability:0.4,densify:none", "b=sh_degree:1"))
+        BenchConfig(methods=("mudg_s",), variant=("a=virtual.probability:0.4,densify.kind:none", "b=sh_degree:1"))
     )
     a, b = rows[-2].fit, rows[-1].fit
-    assert (a.virtual_probability, a.densify, a.iterations) == (0.4, "none", 1000)
+    assert (a.virtual.probability, a.densify.kind, a.iterations) == (0.4, "none", 1000)
     assert dataclasses.replace(b, sh_degree=0) == rows[0].fit
 
 
 @pytest.mark.parametrize(
     "text",
-    ["a", "a=", "a=densify", "=densify:none", "a/b=densify:none", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
+    ["a", "a=", "a=densify", "=densify.kind:none", "a/b=densify.kind:none", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
 )
 def test_a_malformed_variant_is_refused(text):
     with pytest.raises(UsageError):
@@ -90,10 +90,13 @@ def test_ablation_brings_the_rows_it_is_compared_with():
     rows = {r.name: r.fit for r in bench_shift.rows_of(BenchConfig(methods=("mudg_r",), ablation=True))}
     assert list(rows) == ["street_gaussians", "mudg_r", "mudg_s", "only_I", "only_I_D", "only_I_S", "exact"]
     full = rows["mudg_s"]
-    no_depth = {"virtual_depth_weight": 0, "virtual_lidar_weight": 0}
-    assert rows["only_I"] == dataclasses.replace(full, **no_depth, virtual_semantic_weight=0)
-    assert rows["only_I_D"] == dataclasses.replace(full, virtual_semantic_weight=0)
-    assert rows["only_I_S"] == dataclasses.replace(full, **no_depth)
+    no_depth, virtual = {"depth_weight": 0, "lidar_weight": 0}, full.virtual
+    expected = {
+        "only_I": dataclasses.replace(virtual, **no_depth, semantic_weight=0),
+        "only_I_D": dataclasses.replace(virtual, semantic_weight=0),
+        "only_I_S": dataclasses.replace(virtual, **no_depth),
+    }
+    assert all(rows[name] == dataclasses.replace(full, virtual=terms) for name, terms in expected.items())
     assert rows["exact"] == full
 
 
@@ -101,7 +104,7 @@ def test_unknown_methods_and_repeated_names_are_refused():
     with pytest.raises(UsageError, match="unknown method"):
         bench_shift.rows_of(BenchConfig(methods=("nerf",)))
     with pytest.raises(UsageError, match="same name"):
-        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify:none",)))
+        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify.kind:none",)))
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------------
@@ -169,7 +172,11 @@ def test_what_a_log_lacks_is_left_out_and_named():
     assert document["pooled"]["b"]["shifted"]["psnr"]["mean"] == pytest.approx(20.0)
     assert document["pooled"]["a"]["2"]["miou"] == "not produced"
     assert "not produced" in shift_tables.markdown(document)
-    assert "<script>" in shift_page.page(document)
+    evil = "<script>alert(1)</script>"
+    document["methods"][0]["name"], document["pooled"][evil] = evil, document["pooled"]["a"]
+    document["logs"][0] |= {"log": evil, "words": evil, "films": [evil]}
+    page = shift_page.page(document)
+    assert evil not in page and page.count("&lt;script&gt;alert(1)") >= 5
 
 
 # ---- end to end --------------------------------------------------------------------------------------------------------
@@ -206,10 +213,10 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     better = {m: document["pooled"][m]["0"]["psnr"]["mean"] for m in ("nearest_fill", "street_gaussians")}
     assert better["street_gaussians"] > better["nearest_fill"]
     assert (out / log / "film" / "front_shift+3.0.jpg").is_file()
-    assert f'src="{log}/film/front_shift+3.0.mp4"' in (out / "page.html").read_text()
+    assert f'src="{log}/film/front_shift%2B3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
     again = bench_shift.run(
-        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify:none",)), out,
+        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify.kind:none",)), out,
         rules=TINY, distances_m=(3.0,),
     )  # fmt: skip
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
@@ -223,14 +230,14 @@ def test_stored_truth_is_the_drawn_truth(made):
     stored = score_truth.stored_truth(log / "truth")
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     view = read_observations(log / "truth" / "front_shift+3.0").views[2]
-    found, drawn = stored.at(view, None, "front_shift+3.0"), world.render(view)
+    found, drawn = stored.at_view(view, None, "front_shift+3.0"), world.render(view)
     assert np.array_equal(found.seen.semantics.numpy(), drawn.semantics)
     assert float((found.seen.rgb.permute(1, 2, 0).numpy() - drawn.rgb).__abs__().max()) <= 0.5 / 255 + 1e-6
     assert np.array_equal(found.moving[0].numpy(), np.isin(drawn.instance, city_logs.moving_instances(world)))
     with pytest.raises(InputError, match="another view"):
-        stored.at(dataclasses.replace(view, time_s=view.time_s + 0.05), None, "front_shift+3.0")
+        stored.at_view(dataclasses.replace(view, time_s=view.time_s + 0.05), None, "front_shift+3.0")
     with pytest.raises(InputError, match="lacks a trajectory"):
-        stored.at(view, None, "front_shift+9.0")
+        stored.at_view(view, None, "front_shift+9.0")
 
 
 def test_other_settings_in_the_same_folder_are_refused(made):

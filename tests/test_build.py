@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -208,3 +209,13 @@ def test_variants_share_no_function_with_the_rest(mc: ModuleType, tmp_path: Path
         assert any(name in symbol for symbol in kinds)
         assert [s for s, kind in kinds.items() if kind in "WVu"] == []
         assert [s for s in kinds if "GLOBAL__sub_I" in s] == []  # nothing runs when the library is loaded
+
+
+def test_every_file_that_is_no_module_has_a_place_in_the_wheel() -> None:
+    """Package data is listed by pattern: templates and weights that no pattern names would be missing from a wheel."""
+    root = Path(__file__).parent.parent
+    patterns = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["mudg"]
+    package = root / "src" / "mudg"
+    listed = {path for pattern in patterns for path in package.glob(pattern)}
+    templates = {path for path in package.rglob("*") if path.suffix in (".j2", ".css", ".js", ".safetensors")}
+    assert templates and templates <= listed

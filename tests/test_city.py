@@ -337,15 +337,15 @@ def test_traffic_has_all_kinds() -> None:
         labels = [t.label for t in world.tracks()]
         kinds |= set(labels)
         assert len(labels) == len({t.id for t in world.tracks()})
-        for mover, label in zip(world.movers, labels):
-            travelled = np.linalg.norm(np.diff(mover.keys[:, :2], axis=0), axis=1).sum()
-            turned = np.ptp(np.unwrap(mover.keys[:, 3]))
+        for posed, label in zip(world.objects, labels):
+            travelled = np.linalg.norm(np.diff(posed.keys[:, :2], axis=0), axis=1).sum()
+            turned = np.ptp(np.unwrap(posed.keys[:, 3]))
             vehicle = label in ("car", "truck", "bus")
-            oncoming += vehicle and mover.moving and np.cos(mover.keys[0, 3]) < -0.5
+            oncoming += vehicle and posed.moving and np.cos(posed.keys[0, 3]) < -0.5
             turning += vehicle and turned > 0.9
             walking += label == "pedestrian" and travelled > 2
-            parked += label == "car" and not mover.moving
-            if not mover.moving:
+            parked += label == "car" and not posed.moving
+            if not posed.moving:
                 assert travelled == 0
     assert kinds == {"car", "truck", "bus", "pedestrian", "cyclist"}
     assert min(oncoming, walking, parked) >= 9

@@ -32,7 +32,7 @@ def world(scene: Scene) -> CityWorld:
 
 def test_images_and_labels_are_the_truth(scene: Scene, world: CityWorld) -> None:
     assert len(scene.frames) == 2 * CONFIG.n_frames
-    moving = {i + 1 for i, mover in enumerate(world.movers) if mover.moving}
+    moving = {i + 1 for i, posed in enumerate(world.objects) if posed.moving}
     for frame in (scene.frames_of("front")[3], scene.frames_of("front_left")[8]):
         truth = world.render(frame.view, sensor_noise=True)
         np.testing.assert_array_equal(read_image(scene, frame), truth.rgb_u8)

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from mudg.base.errors import InputError
-from mudg.base.types import Camera, Clip, Condition, FusedCloud, PointCloud, Track, View
+from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, Track, View
 from mudg.data.clips import condition as clips
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import ConditionRules, Recorded, Source, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
 RULES = ConditionRules(48, 32, occluder_m=0.0)
@@ -24,11 +24,11 @@ def view_at(x=0.0, y=0.0, time_s=0.0, camera=CAMERA):
     return View(camera, pose, time_s)
 
 
-def wall(x_m, colour_of_y, y_range=(-20, 20), z_range=(-9, 9), step=0.05):
+def wall(x_m, color_of_y, y_range=(-20, 20), z_range=(-9, 9), step=0.05):
     """A wall across the view at x = x_m with colours by lateral position."""
     y, z = np.meshgrid(np.arange(*y_range, step), np.arange(*z_range, step))
     xyz = np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], 1).astype(np.float32)
-    return PointCloud(xyz, colour_of_y(y.ravel()).astype(np.uint8), "world")
+    return PointCloud(xyz, color_of_y(y.ravel()).astype(np.uint8), "world")
 
 
 def stripes(y):
@@ -47,7 +47,7 @@ def image_of_wall(view, x_m):
 def test_warp_of_a_plane_is_exact():
     """A striped wall 10 m ahead, seen from 1.5 m beside: the warped recorded image equals the true one."""
     recorded, target = view_at(), view_at(y=1.5)
-    source = Source(recorded, clips._tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0,
+    source = WarpSource(recorded, clips._tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0,
                     torch.zeros(32, 48, dtype=torch.uint8))  # fmt: skip
     rgb, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
     truth = clips._tensor(image_of_wall(target, 10.0))
@@ -67,7 +67,7 @@ def test_hidden_pixels_are_not_taken():
     rgb = torch.zeros(3, 32, 48)
     surface = torch.full((32, 48), 10.0)
     surface[:, 20:28] = 4.0  # something near stands there in the recorded image
-    source = Source(recorded, rgb, surface, surface < 0, torch.zeros(32, 48, dtype=torch.uint8))
+    source = WarpSource(recorded, rgb, surface, surface < 0, torch.zeros(32, 48, dtype=torch.uint8))
     _, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, surface, 0.08)
     x, _, _ = clips.carry(target, torch.full((1, 32, 48), 10.0), recorded)
     behind = (x[0] > 20.5) & (x[0] < 27.5)
@@ -88,7 +88,7 @@ def test_shine_through_is_removed_and_edges_stay():
 def test_condition_of_a_wall():
     """Shifted view of a striped wall: depth exact where measured, colour near the truth, masks where they should be."""
     cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
-    recorded = [Recorded(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
+    recorded = [Photo(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
     target = view_at(y=2.0, time_s=0.1)
     condition = build_condition(cloud, [], [target], recorded, RULES)
     valid = condition.valid[0, 0]
@@ -106,7 +106,7 @@ def test_condition_of_a_wall():
 
 def test_backdrop_of_the_recorded_view_is_the_image():
     cloud = FusedCloud(wall(12.0, stripes), {})
-    recorded = [Recorded(view_at(), image_of_wall(view_at(), 12.0))]
+    recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
     condition = build_condition(cloud, [], [view_at()], recorded, RULES)
     assert torch.allclose(condition.backdrop[0], clips._tensor(recorded[0].rgb), atol=1e-5)
 
@@ -122,7 +122,7 @@ def test_moving_things_take_no_colour_from_another_time():
     track = Track("car-1", "car", np.array([4.0, 2.0, 1.5]), np.array([0.0, 1.0]), poses)
     static = wall(30.0, lambda y: np.tile([[0, 0, 255]], (len(y), 1)), step=0.1)
     cloud = FusedCloud(static, {"car-1": PointCloud(grid.astype(np.float32), green, "object")})
-    old, fresh = Recorded(view_at(time_s=0.0), red), Recorded(view_at(time_s=1.0), red)
+    old, fresh = Photo(view_at(time_s=0.0), red), Photo(view_at(time_s=1.0), red)
     target = view_at(time_s=1.0)
     car = (slice(14, 18), slice(22, 26))
     held = build_condition(cloud, [track], [target], [old], RULES)
@@ -134,7 +134,7 @@ def test_moving_things_take_no_colour_from_another_time():
 
 def test_published_condition_is_zero_where_nothing_was_seen():
     cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
-    recorded = [Recorded(view_at(), image_of_wall(view_at(), 12.0))]
+    recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
     condition = build_condition(cloud, [], [view_at(y=1.0)], recorded, replace(RULES, published=True))
     hole = ~condition.valid
     assert bool(hole.any())
@@ -155,7 +155,7 @@ def test_nothing_in_view_gives_a_far_grey_nothing_not_an_error():
 def test_sizes_follow_the_rules_and_mixed_image_sizes_work():
     cloud = FusedCloud(wall(12.0, stripes), {})
     big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
-    recorded = [Recorded(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
+    recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
     condition = build_condition(cloud, [], [view_at(y=0.5, camera=big)], recorded, RULES)
     assert condition.views[0].camera.width == 48
     truth = clips._tensor(image_of_wall(view_at(y=0.5), 12.0))
@@ -166,7 +166,7 @@ def test_sizes_follow_the_rules_and_mixed_image_sizes_work():
 def test_fine_grid_gives_the_same_geometry_and_cleaner_colour():
     cloud = FusedCloud(wall(12.0, stripes), {})
     big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
-    recorded = [Recorded(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
+    recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
     target = view_at(y=0.5, camera=big)
     plain = build_condition(cloud, [], [target], recorded, RULES)
     small, fine = clips.build_conditions(cloud, [], [target], recorded, replace(RULES, fine_width=96, fine_height=64))
@@ -201,39 +201,42 @@ def some_clip(frames=3, height=16, width=24):
 
 def test_shards_give_back_what_was_packed(tmp_path):
     clip = some_clip()
-    clip_shards.write_shard(tmp_path, 3, clip_shards.pack_clips([clip, clip], [1.5, 0.0]))
+    clip_shards.write_shard(tmp_path, 3, clip_shards.pack_clips([replace(clip, shift_m=1.5), clip]))
     assert clip_shards.clips_in(tmp_path, 3) == 2
-    batch = clip_shards.read_batch(tmp_path, [(3, 0, [0, 2]), (3, 1, [1, 2])])
-    assert batch.shift_m == (1.5, 0.0)
-    assert torch.allclose(batch.rgb[0], clip.rgb[[0, 2]], atol=0.5 / 255 + 1e-6)
-    assert torch.allclose(batch.color[1], clip.condition.color[[1, 2]], atol=0.5 / 255 + 1e-6)
-    assert torch.equal(batch.valid[0], clip.condition.valid[[0, 2]])
-    assert torch.equal(batch.warped[1], clip.condition.warped[[1, 2]])
-    assert torch.equal(batch.semantics[0], clip.semantics[[0, 2]])
+    first, second = clip_shards.read_clip(tmp_path, 3, 0, [0, 2]), clip_shards.read_clip(tmp_path, 3, 1, [1, 2])
+    assert (first.shift_m, second.shift_m) == (1.5, 0.0)
+    assert torch.allclose(first.rgb, clip.rgb[[0, 2]], atol=0.5 / 255 + 1e-6)
+    assert torch.allclose(second.condition.color, clip.condition.color[[1, 2]], atol=0.5 / 255 + 1e-6)
+    assert torch.equal(first.condition.valid, clip.condition.valid[[0, 2]])
+    assert torch.equal(second.condition.warped, clip.condition.warped[[1, 2]])
+    assert torch.equal(first.semantics, clip.semantics[[0, 2]])
     known = clip.depth_valid[[0, 2]]
-    assert torch.allclose(batch.depth[0][known], clip.depth[[0, 2]][known], rtol=1e-3)
-    assert bool((batch.depth[0][~known] == clip_shards.FAR_M).all())
+    assert torch.allclose(first.depth[known], clip.depth[[0, 2]][known], rtol=1e-3)
+    assert bool((first.depth[~known] == clip_shards.FAR_M).all())
+    for view, original in zip(first.condition.views, (clip.condition.views[0], clip.condition.views[2])):
+        assert np.array_equal(view.world_from_cam, original.world_from_cam)
+        assert replace(view.camera, name="front") == original.camera
 
 
 def test_missing_shard_is_named(tmp_path):
     with pytest.raises(InputError, match="city_0000007"):
-        clip_shards.read_batch(tmp_path, [(7, 0, [0])])
+        clip_shards.read_clip(tmp_path, 7, 0, [0])
 
 
 def test_variation_treats_truth_and_condition_alike(tmp_path):
     clip = some_clip()
     same = replace(clip, condition=replace(clip.condition, color=clip.rgb, backdrop=clip.rgb))
-    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([same], [2.0]))
-    batch = clip_shards.read_batch(tmp_path, [(0, 0, [0, 1, 2])])
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([replace(same, shift_m=2.0)]))
+    read = clip_shards.read_clip(tmp_path, 0, 0, [0, 1, 2])
     flips = set()
     for seed in range(6):
-        varied = clip_shards.vary(batch, np.random.default_rng(seed))
-        assert float((varied.rgb - varied.color).abs().mean()) < 0.04
-        assert torch.equal(varied.semantics.flip(-1), batch.semantics) or torch.equal(varied.semantics, batch.semantics)
+        varied = clip_shards.vary(read, np.random.default_rng(seed))
+        assert float((varied.rgb - varied.condition.color).abs().mean()) < 0.04
+        assert torch.equal(varied.semantics.flip(-1), read.semantics) or torch.equal(varied.semantics, read.semantics)
         flips.add(varied.shift_m)
-        again = clip_shards.vary(batch, np.random.default_rng(seed))
+        again = clip_shards.vary(read, np.random.default_rng(seed))
         assert torch.equal(varied.rgb, again.rgb)
-    assert flips == {(2.0,), (-2.0,)}
+    assert flips == {2.0, -2.0}
 
 
 def test_city_clips_are_a_function_of_seed_and_number():
@@ -244,10 +247,8 @@ def test_city_clips_are_a_function_of_seed_and_number():
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=2, clips=2)
-    first, shifts = from_city.make_clips(rules, 5)
-    again, _ = from_city.make_clips(rules, 5)
-    other, _ = from_city.make_clips(rules, 6)
-    assert len(first) == len(shifts) == 2
+    first, again, other = (from_city.make_clips(rules, city) for city in (5, 5, 6))
+    assert [clip.shift_m for clip in first] == list(from_city.shifts_of(rules, 5)) and len(first) == 2
     for name in ("rgb", "depth", "semantics"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name)), name
     assert torch.equal(first[0].condition.color, again[0].condition.color)

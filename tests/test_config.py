@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from pydantic import Field
@@ -60,3 +61,34 @@ def test_malformed_or_hostile_yaml_is_refused(tmp_path: Path, text: str) -> None
 def test_configurations_are_frozen() -> None:
     with pytest.raises((AttributeError, TypeError)):
         Outer().seed = 3  # type: ignore[misc]
+
+
+@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+class Wheels:
+    kind: str = "steel"
+    count: int = 4
+
+
+@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+class Cart:
+    MOVED: ClassVar = {"wheel_count": "wheels.count", "wheels": "wheels.kind", "horn": None}
+    wheels: Wheels = Field(default_factory=Wheels)
+
+
+@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+class Fleet:
+    cart: Cart = Field(default_factory=Cart)
+
+
+def test_keys_that_moved_are_refused_with_their_new_name(tmp_path):
+    for text, said in (
+        ("wheel_count: 3", "wheel_count is now called wheels.count"), ("wheels: wood", "wheels is now called wheels.kind"),
+        ("horn: true", "horn was removed"),
+    ):  # fmt: skip
+        (tmp_path / "old.yaml").write_text(text + "\n")
+        with pytest.raises(UsageError, match=said):
+            config.load(Cart, yaml_path=tmp_path / "old.yaml")
+    with pytest.raises(UsageError, match=r"cart\.wheel_count is now called cart\.wheels\.count"):
+        config.load(Fleet, overrides={"cart": {"wheel_count": 3}})
+    assert config.load(Cart, overrides={"wheels": {"count": 3}}) == Cart(wheels=Wheels(count=3))
+    assert "MOVED" not in config.dump_yaml(Cart())

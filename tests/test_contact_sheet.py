@@ -10,11 +10,17 @@ import pytest
 from PIL import Image
 from toy_scene import CAR_SIZE_M, ToyStreet
 
-from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project, yaw_matrix
+from mudg.base.geometry import CAM_FROM_EGO_AXES, box_corners, invert, project, transform_points, yaw_matrix
 from mudg.base.types import Camera, View
+from mudg.core.pictures import depth_colors
 from mudg.report import contact_sheet as sheets
+from mudg.report import top_view as above
 
 VIEW = View(Camera("front", 96, 64, 70.0, 70.0, 48.0, 32.0), invert(CAM_FROM_EGO_AXES), 0.0)
+
+
+def box_of(size_m: np.ndarray, world_from_box: np.ndarray) -> np.ndarray:
+    return transform_points(world_from_box, box_corners(size_m))
 
 
 def test_points_are_drawn_where_they_project_and_near_ones_win() -> None:
@@ -23,18 +29,12 @@ def test_points_are_drawn_where_they_project_and_near_ones_win() -> None:
     sheets.draw_points(pixels, VIEW, np.array([far, near, behind]))
     uv, _ = project(VIEW, np.array([near]))
     column, row = uv[0].astype(int)
-    assert (pixels[row, column] == sheets.depth_colours(np.array([10.0]))[0]).all()
+    assert (pixels[row, column] == depth_colors(np.array([10.0]), 3.0, 80.0)[0]).all()
     assert int((pixels.sum(2) > 0).sum()) == 1
 
 
-def test_depth_colours_run_from_warm_to_cold() -> None:
-    colours = sheets.depth_colours(np.array([1.0, 3.0, 15.0, 80.0, 500.0])).astype(int)
-    assert (colours[0] == colours[1]).all() and (colours[3] == colours[4]).all()
-    assert colours[0, 0] > colours[0, 2] and colours[3, 2] > colours[3, 0]
-
-
 def test_edges_of_a_box_in_front_are_its_projected_corners() -> None:
-    corners = sheets.box_corners(CAR_SIZE_M, yaw_matrix(0.4, (12.0, 0.5, 0.0)))
+    corners = box_of(CAR_SIZE_M, yaw_matrix(0.4, (12.0, 0.5, 0.0)))
     uv, z = project(VIEW, corners)
     edges = dict(sheets.visible_edges(VIEW, corners))
     assert len(edges) == 12 and (z > 0).all()
@@ -46,11 +46,11 @@ def test_edges_of_a_box_in_front_are_its_projected_corners() -> None:
 
 def test_a_box_around_the_camera_is_cut_and_one_behind_is_not_drawn() -> None:
     size = np.array([10.0, 3.0, 2.0])
-    around = sheets.visible_edges(VIEW, sheets.box_corners(size, yaw_matrix(0.0)))
+    around = sheets.visible_edges(VIEW, box_of(size, yaw_matrix(0.0)))
     assert 0 < len(around) < 12
     for _, uv in around:
         assert np.isfinite(uv).all()
-    assert sheets.visible_edges(VIEW, sheets.box_corners(size, yaw_matrix(0.0, (-20.0, 0, 0)))) == []
+    assert sheets.visible_edges(VIEW, box_of(size, yaw_matrix(0.0, (-20.0, 0, 0)))) == []
     ends = sheets.cut_near(np.array([[0.0, 0, -1], [0, 0, 2]]))
     assert ends is not None and np.allclose(ends, [[0, 0, sheets.NEAR_M], [0, 0, 2]])
     assert sheets.cut_near(np.array([[0.0, 0, -1], [0, 0, -2]])) is None
@@ -62,8 +62,8 @@ def test_a_sheet_has_a_row_per_camera_and_a_view_from_above(tmp_path: Path) -> N
     with Image.open(path) as image:
         assert image.size == (3 * sheets.TILE_WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
         top = np.array(image)[sheets.TILE_WIDTH_PX // 2 + 20 :]
-    assert (np.abs(top.astype(int) - sheets._BOX_COLOUR).max(2) < 60).any()
-    assert (np.abs(top.astype(int) - sheets._PATH_COLOUR).max(2) < 60).any()
+    assert (np.abs(top.astype(int) - above.VEHICLE_COLOR).max(2) < 60).any()
+    assert (np.abs(top.astype(int) - above.PATH_COLOR).max(2) < 60).any()
 
 
 @pytest.mark.parametrize("lacking", ["sweeps", "tracks", "one frame"])
@@ -88,11 +88,11 @@ def test_single_images_of_several_cameras_share_rows(tmp_path: Path) -> None:
 
 def test_boxes_have_the_colour_of_their_class_also_where_there_are_no_points(tmp_path: Path) -> None:
     scene = ToyStreet(car_start=(40, 0)).write(tmp_path / "scene", labels=False, width=60, height=30)
-    for label, colour in (
-        ("bus", sheets._BOX_COLOUR),
-        ("cyclist", sheets._PEOPLE_COLOUR),
-        ("barrier", sheets._OTHER_COLOUR),
+    for label, color in (
+        ("bus", above.VEHICLE_COLOR),
+        ("cyclist", above.PEOPLE_COLOR),
+        ("barrier", above.OTHER_COLOR),
     ):
         tracks = tuple(replace(track, label=label) for track in scene.tracks)
         top = np.array(sheets.top_view(replace(scene, tracks=tracks, sweeps=()), 400, 300))[20:250]
-        assert (top == colour).all(2).sum() > 20, label
+        assert (top == color).all(2).sum() > 20, label

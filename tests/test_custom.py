@@ -57,7 +57,7 @@ def edit(log: Path, change: Any) -> None:
 
 
 def words_of(log: Path, level: str = "error") -> str:
-    return "\n".join(f"{f.where}: {f.words}" for f in custom.check_log(log) if f.level == level)
+    return "\n".join(f"{f.where}: {f.message}" for f in custom.check_log(log) if f.level == level)
 
 
 # ---- round trips ----

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import pytest
@@ -22,7 +21,8 @@ from mudg.models.scene.densify import (
     rotate,
     shorten_needles,
 )
-from mudg.models.scene.nodes import RigidNode, SceneModel, StaticNode
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode, StaticNode
 from mudg.stages.config import FitConfig
 
 SETTINGS = DensifySettings(
@@ -90,25 +90,6 @@ def test_large_rows_are_split_into_two_smaller_ones():
     third = scene(scale_m=1.0)
     densify(third, stats_for(third, [3]), 20, SETTINGS, 0)
     assert not torch.equal(third.table["means"], model.table["means"])
-
-
-@pytest.mark.parametrize(("scale_m", "loud"), [(0.1, [2, 7, 9]), (1.0, [2, 7, 9])], ids=["cloned", "split"])
-def test_new_rows_inherit_what_only_movers_have(scale_m, loud):
-    """The time-varying colour (a partial column) follows its row; a copy has its parent's, with fresh moments."""
-    model = scene(scale_m=scale_m)
-    given = torch.arange(6, 10.0)[:, None, None].repeat(1, 2, 3)  # the number of the row, as in sh_dc
-    table = Table(
-        {k: v.detach() for k, v in model.table.columns.items()}, model.table.labels, {"sh_time": given + 0.5}
-    )
-    table.moment1["sh_time"] += given
-    model = SceneModel(table, model.nodes, None, (0, 1), 0)
-    densify(model, stats_for(model, loud), 10, dataclasses.replace(SETTINGS, box_margin=99.0), 0)
-    parents = model.table["sh_dc"].detach()[model.table.holders(), 0, 0]
-    assert sorted(parents.tolist()) == [6, 7, 7, 8, 9, 9]
-    found = model.table.partial["sh_time"].detach()
-    assert torch.equal(found, (parents + 0.5)[:, None, None].repeat(1, 2, 3))
-    moments = model.table.moment1["sh_time"][:, 0, 0]
-    assert sorted(moments.tolist()) == ([0, 0, 6, 7, 8, 9] if scale_m < 0.5 else [0, 0, 0, 0, 6, 8])
 
 
 def test_splits_are_drawn_along_the_gaussians_own_axes():
@@ -216,10 +197,11 @@ def test_objects_count_with_their_plain_gradient():
     assert stats.gradient.tolist() == pytest.approx([60.0, 40.0, 30.0])
 
 
-def test_files_that_say_yes_or_no_are_still_read(tmp_path):
-    for text, kind in (("true", "gradient"), ("false", "none"), ("mcmc", "mcmc"), ("none", "none")):
+def test_files_in_which_densify_was_a_plain_value_are_told_its_new_name(tmp_path):
+    for text in ("true", "mcmc"):
         (tmp_path / "fit.yaml").write_text(f"densify: {text}\n")
-        assert configuration.load(FitConfig, None, tmp_path / "fit.yaml").densify == kind
-    (tmp_path / "fit.yaml").write_text("densify: mcm\n")
+        with pytest.raises(UsageError, match=r"densify is now called densify\.kind"):
+            configuration.load(FitConfig, None, tmp_path / "fit.yaml")
+    (tmp_path / "fit.yaml").write_text("densify: {kind: mcm}\n")
     with pytest.raises(UsageError, match="'gradient', 'mcmc' or 'none'"):
         configuration.load(FitConfig, None, tmp_path / "fit.yaml")

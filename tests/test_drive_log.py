@@ -13,10 +13,11 @@ from PIL import Image
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Source, SweepPoints, Track
-from mudg.data.importers import drive_log
+from mudg.data.importers import common
 from mudg.data.importers.box_times import BoxTimes, clip_track, reach_images
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, nearest_index, write_log
+from mudg.data.importers.common import nearest_index
+from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, write_log
 from mudg.data.importers.options import ImportOptions
 
 UP = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
@@ -125,8 +126,8 @@ def test_impossible_motion_is_refused(tmp_path: Path) -> None:
 )
 def test_stamps_in_another_unit_are_refused(stamp: int, per_second: int) -> None:
     with pytest.raises(InputError, match="another unit"):
-        drive_log.check_epoch(np.array([stamp]), per_second, "table")
-    drive_log.check_epoch(np.array([1_532_402_927 * per_second, 1_532_402_947 * per_second]), per_second, "table")
+        common.check_epoch(np.array([stamp]), per_second, "table")
+    common.check_epoch(np.array([1_532_402_927 * per_second, 1_532_402_947 * per_second]), per_second, "table")
 
 
 # --- tracks ---------------------------------------------------------------------------------------------------------
@@ -184,8 +185,8 @@ def test_clip_keeps_one_key_beyond_each_end() -> None:
 
 def test_unknown_categories_keep_their_last_word() -> None:
     boxes = BoxTracks("table", {"vehicle.car": "car"})
-    assert boxes.word("vehicle.hover Craft") == "hover_craft"
-    assert boxes.word("vehicle.car") == "car"
+    assert boxes.label_of("vehicle.hover Craft") == "hover_craft"
+    assert boxes.label_of("vehicle.car") == "car"
     assert boxes.tracks()[1] == ["classes that are not known here keep their names: 'vehicle.hover Craft' (1 boxes)"]
 
 
@@ -209,7 +210,7 @@ def test_boxes_come_to_the_sweeps_times(delays: list[float]) -> None:
     track, sweeps = drawn(10.0, delays)
     times = BoxTimes([track])
     for number, sweep in reversed(list(enumerate(sweeps))):
-        times.see(0.1 * number, np.eye(4), sweep)
+        times.observe(0.1 * number, np.eye(4), sweep)
     (moved,) = times.at_sweep_times()
     assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
     assert np.abs(track.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() > 0.5
@@ -219,7 +220,7 @@ def test_boxes_without_returns_take_the_delay_of_their_neighbours_and_standing_o
     track, sweeps = drawn(10.0, [0.08] * 6)
     standing, _ = drawn(0.5, [0.08] * 6)
     times = BoxTimes([track, standing])
-    times.see(0.2, np.eye(4), sweeps[2])
+    times.observe(0.2, np.eye(4), sweeps[2])
     moved, kept = times.at_sweep_times()
     assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
     assert kept is standing
@@ -228,11 +229,11 @@ def test_boxes_without_returns_take_the_delay_of_their_neighbours_and_standing_o
 def test_a_vehicle_that_slides_is_refused_and_one_that_reverses_is_not(tmp_path: Path) -> None:
     drive = made(tmp_path / "log")
     sliding = EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(0.8))
-    drive_log.check_motion(drive.ego, "log")
+    common.check_motion(drive.ego, "log")
     with pytest.raises(InputError, match="where it looks") as caught:
-        drive_log.check_motion(sliding, "log")
+        common.check_motion(sliding, "log")
     assert "46 degrees" in caught.value.got
-    drive_log.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")
+    common.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")
 
 
 def test_tracks_reach_the_images_at_their_ends() -> None:

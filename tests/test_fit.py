@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg import native
+from mudg.base import config as configuration
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.base.palette import ID
@@ -24,7 +26,8 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_scene
-from mudg.models.scene.nodes import RigidNode, SceneModel
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting import start as fit_start
@@ -50,8 +53,8 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings(method: str = "street_gaussians", **changes) -> FitConfig:
-    small = {"iterations": 24, "initial_gaussians": 900, "max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
-    return FitConfig(method=method, **{**small, **changes})
+    small = {"iterations": 24, "start__gaussians": 900, "densify__max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
+    return fit_config(method=method, **{**small, **changes})
 
 
 def fitted_bytes(folder: Path) -> dict[str, bytes]:
@@ -107,14 +110,14 @@ def test_same_in_same_out(world, tmp_path):
 @pytest.mark.parametrize("densify", ["gradient", "mcmc"])
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, densify):
     """Ctrl-C before and after virtual views join, a densification and an opacity reset; learnt poses and all. Bit for bit."""
-    config = settings("mudg_s", iterations=26, learn_poses=True, densify=densify)
+    config = settings("mudg_s", iterations=26, poses__learn=True, densify__kind=densify)
     schedule, stops = fit.densify_schedule(config), [3, 4, 9, 10, 11, 12, 21]
     if densify == "gradient":
         schedule = dataclasses.replace(schedule, reset_every=12)
         monkeypatch.setattr(fit, "densify_schedule", lambda _config: schedule)
         assert [step for step in range(1, 27) if schedule.reset_due(step)] == [12]
     assert [step for step in range(1, 27) if schedule.due(step)] == ([10] if densify == "gradient" else [10, 20])
-    assert config.virtual_start * config.iterations == pytest.approx(3.9)
+    assert config.virtual.start * config.iterations == pytest.approx(3.9)
     arguments = (config, world["scene"], world["fuse"])
     whole = fit.run(*arguments, tmp_path / "whole", observations=world["virtual"])
 
@@ -137,7 +140,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
 @pytest.mark.parametrize("densify", ["gradient", "mcmc", "none"])
 def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch, densify):
     """Row counts kept between densifications, and any number of threads: the same bytes."""
-    config = settings(iterations=22, densify=densify)
+    config = settings(iterations=22, densify__kind=densify)
     first = fit.run(config, world["scene"], world["fuse"], tmp_path / "a")
 
     def counted_again(model):
@@ -156,9 +159,8 @@ def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_
 
 
 def test_the_kinds_of_densification_differ_and_none_keeps_the_rows(world, tmp_path):
-    config = settings(iterations=44, max_gaussians=1600)
-    made = {kind: fit.run(dataclasses.replace(config, densify=kind), world["scene"], world["fuse"], tmp_path / kind)
-            for kind in ("gradient", "mcmc", "none")}  # fmt: skip
+    configs = {kind: settings(iterations=44, densify__max_gaussians=1600, densify__kind=kind) for kind in ("gradient", "mcmc", "none")}
+    made = {kind: fit.run(config, world["scene"], world["fuse"], tmp_path / kind) for kind, config in configs.items()}
     rows = {kind: len(fit.load_model(folder).table) for kind, folder in made.items()}
     start = len(fit.load_model(fit.run(settings(iterations=1), world["scene"], world["fuse"], tmp_path / "start")).table)
     assert rows["none"] == start
@@ -177,17 +179,17 @@ def test_regularisers_are_means_of_opacity_and_scale():
         torch.zeros(2, 3), torch.ones(2, 4), table, opacity, torch.zeros(2, 1, 3), extra=None, node=one[:, 0].int(), sh_rest=None
     )
     assert fit.regularisers(gaussians, settings()) == {}
-    terms = fit.regularisers(gaussians, settings(opacity_weight=0.5, scale_weight=2.0))
+    terms = fit.regularisers(gaussians, settings(loss__opacity_weight=0.5, loss__scale_weight=2.0))
     assert terms["opacity"].item() == pytest.approx(0.5 * 0.4)
     assert terms["scale"].item() == pytest.approx(2.0 * 0.35)
     terms["opacity"].backward()
     assert opacity.grad.tolist() == [0.25, 0.25]
-    assert set(fit.regularisers(gaussians, settings(densify="mcmc"))) == {"opacity", "scale"}
-    assert set(fit.regularisers(gaussians, settings(densify="mcmc", scale_weight=0.0))) == {"opacity"}
+    assert set(fit.regularisers(gaussians, settings(densify__kind="mcmc"))) == {"opacity", "scale"}
+    assert set(fit.regularisers(gaussians, settings(densify__kind="mcmc", loss__scale_weight=0.0))) == {"opacity"}
 
 
 def test_densification_grows_within_its_cap(world, tmp_path):
-    folder = fit.run(settings(iterations=60, max_gaussians=1600), world["scene"], world["fuse"], tmp_path / "fit")
+    folder = fit.run(settings(iterations=60, densify__max_gaussians=1600), world["scene"], world["fuse"], tmp_path / "fit")
     rows = [line["rows"] for line in map(store.parse_json, (folder / "log.jsonl").read_text().splitlines(), ["log"] * 99) if "rows" in line]
     assert max(rows) > 1500
     assert max(rows) <= 1600
@@ -205,14 +207,14 @@ def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
 
     monkeypatch.setattr(fit, "rasterize", spy)
     monkeypatch.setattr(fit.DensifyStats, "observe", observe)
-    fit.run(settings("mudg_s", virtual_probability=0.5, virtual_start=0.0, checkpoint_every=999), world["scene"], world["fuse"],
+    fit.run(settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999), world["scene"], world["fuse"],
             tmp_path / "fit", observations=world["virtual"])  # fmt: skip
     assert {absgrad for width, absgrad in kinds if width == 30} == {False}
     assert any(absgrad for width, absgrad in kinds if width == SIZE[0])
 
 
 def test_perfect_virtual_views_help_off_the_path(world, tmp_path):
-    arguments = {"iterations": 150, "virtual_probability": 0.4}
+    arguments = {"iterations": 150, "virtual__probability": 0.4}
     plain = fit.run(settings(**arguments), world["scene"], world["fuse"], tmp_path / "plain")
     guided = fit.run(settings("mudg_s", **arguments), world["scene"], world["fuse"], tmp_path / "guided", observations=world["virtual"])
     assert mean_psnr(guided, left_m=2.0) > mean_psnr(plain, left_m=2.0) + 0.3
@@ -246,10 +248,9 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
 def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
     scene = read_scene(world["scene"])
     frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, None)
+    classes = fit_views.classes_of(scene, frames, {})
     stored = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=False)
-    start = fit_start.StartSettings(300, 0.15, 150.0, 0, True, True, False, 0)
-    model = fit_start.start_model(scene, fused_cloud(FRAMES), stored, classes, start)
+    model = fit_start.start_model(scene, fused_cloud(FRAMES), stored, classes, settings(start__gaussians=300))
     model.table["log_scales"].grad = torch.zeros_like(model.table["log_scales"])
     model.table["log_scales"].grad[3, 1] = float("inf")
     with pytest.raises(NumericsError, match=r"gaussians.log_scales, view front/000001, step 9"):
@@ -265,11 +266,33 @@ def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
         fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "empty")
 
 
+def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
+    """The truth that `mudg score` keeps shows held-out frames: nothing may be fitted to it."""
+    sets = tmp_path / "sets"
+    shutil.copytree(world["virtual"], sets)
+    view = view_at(0.9, camera(width=30, height=20))
+    with ObservationWriter(sets / "front_recorded", "front_recorded", "truth", "recorded") as writer:
+        writer.add(replace(truth(view), kind="recorded"))
+    with pytest.raises(InputError, match=r"recorded views[\s\S]*front_recorded[\s\S]*mudg synthesize"):
+        fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=sets)
+    assert not (tmp_path / "fit").exists()
+
+
 def test_another_configuration_in_the_same_folder_is_refused(world, tmp_path):
     fit.run(settings(iterations=2), world["scene"], world["fuse"], tmp_path / "fit")
     assert fit.run(settings(iterations=2), world["scene"], world["fuse"], tmp_path / "fit") == tmp_path / "fit"
     with pytest.raises(UsageError, match="another configuration"):
         fit.run(settings(iterations=3), world["scene"], world["fuse"], tmp_path / "fit")
+
+
+def test_settings_of_older_files_are_refused_with_their_new_place(tmp_path):
+    for old, new in FitConfig.MOVED.items():
+        (tmp_path / "run.yaml").write_text(f"verb: fit\n{old}: 1\n")
+        with pytest.raises(UsageError, match=f"key {old} " + ("was removed" if new is None else f"is now called {new}$|{new}\n")):
+            configuration.load(FitConfig, None, tmp_path / "run.yaml")
+        place = FitConfig()
+        for part in [] if new is None else new.split("."):
+            place = getattr(place, part)
 
 
 def test_unknown_camera_and_no_fit(world, tmp_path):
@@ -300,7 +323,7 @@ class Named:
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def sample(self, unseen=None) -> str:
+    def as_tensors(self) -> str:
         return self.name
 
 
@@ -323,28 +346,6 @@ def test_virtual_views_beside_recorded_ones_take_nothing_from_them():
     assert {len(step) for step in beside} == {1, 2}
 
 
-def test_virtual_views_join_from_near_to_far():
-    views = fit_views.ViewSet(tuple(map(Named, "ab")), tuple(map(Named, "wxyz")), (2.0, 2.01, 3.0, 4.0))
-    draws = lambda reach: {views.choose(3, step, 1.0, reach_m=reach)[0] for step in range(80)}  # noqa: E731
-    assert draws(2.0) == {"w", "x"}
-    assert draws(3.2) == {"w", "x", "y"}
-    assert draws(float("inf")) == set("wxyz")
-    config = settings("mudg_s", iterations=100, virtual_start=0.2, virtual_grow=0.4)
-    reach = [fit._virtual_reach_m(views, config, step) for step in (1, 20, 40, 60, 90)]
-    assert reach == pytest.approx([2.0, 2.0, 3.0, 4.0, 4.0])
-    assert fit._virtual_reach_m(views, settings("mudg_s"), 1) == float("inf")
-
-
-def test_offsets_are_distances_from_the_same_cameras_path():
-    named = lambda x, y, name: SimpleNamespace(  # noqa: E731
-        view=SimpleNamespace(center_world=np.array([x, y, 1.0]), camera=SimpleNamespace(name=name))
-    )
-    recorded = [named(x, 0.0, "front") for x in range(4)] + [named(0.0, 7.0, "left")]
-    virtual = [named(2.0, 3.0, "front"), named(0.0, 8.0, "left"), named(1.0, 2.0, "other")]
-    assert fit_views.offsets_from_path_m(recorded, virtual) == pytest.approx((3.0, 1.0, 2.0))
-    assert fit_views.offsets_from_path_m(recorded, ()) == ()
-
-
 def test_fused_points_give_depth_beside_the_path(world):
     """Drawn at a shifted view, the static points and those of the moving car lie on the exact surfaces."""
     scene = read_scene(world["scene"])
@@ -358,12 +359,12 @@ def test_fused_points_give_depth_beside_the_path(world):
     assert car.sum() > 5 and relative[car].median() < 0.05
 
 
-@pytest.mark.parametrize("changes", [{"virtual_lidar_weight": 0.0}, {"virtual_ssim_weight": 0.0}, {"virtual_densify": True}])
+@pytest.mark.parametrize("changes", [{"lidar_weight": 0.0}, {"ssim_weight": 0.0}, {"densify": True}])
 def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path, changes):
-    usual = settings("mudg_s", iterations=30, max_gaussians=2500, virtual_start=0.0, virtual_probability=0.6)
+    usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
     folders = [
         fit.run(config, world["scene"], world["fuse"], tmp_path / name, observations=world["virtual"])
-        for name, config in (("usual", usual), ("changed", replace(usual, **changes)))
+        for name, config in (("usual", usual), ("changed", replace(usual, virtual=replace(usual.virtual, **changes))))
     ]
     assert fitted_bytes(folders[0]) != fitted_bytes(folders[1])
     model = fit.load_model(folders[1])
@@ -399,7 +400,7 @@ def test_what_only_virtual_views_see():
     witness = np.where(np.abs((column - cam.cx) / cam.fx * 3) < 0.45, 3.0, 6.0).astype(np.float32)
     recorded = fit_trust._Witness(ahead, np.repeat(witness[None], cam.height, 0))
     shown = fit_views.StoredView(
-        "side", side, "virtual", "test", np.zeros((cam.height, cam.width, 3), np.uint8), None, None, None,
+        "side", side, "virtual", np.zeros((cam.height, cam.width, 3), np.uint8),
         depth=np.full((cam.height, cam.width), 6.0, np.float32),
     )  # fmt: skip
     unseen = fit_trust._unseen(shown, [recorded], [])[cam.height // 2]
@@ -419,7 +420,7 @@ def test_what_a_moving_object_shows_is_asked_where_the_object_was():
     now = View(cam, geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
     shape = (cam.height, cam.width)
     black, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 5.2, np.float32)
-    shown = fit_views.StoredView("v", now, "virtual", "test", black, None, None, None, depth=depth)
+    shown = fit_views.StoredView("v", now, "virtual", black, depth=depth)
     witness = fit_trust._Witness(late, np.full(shape, 5.2, np.float32))
     middle = (cam.height // 2, cam.width // 2)
     assert not fit_trust._unseen(shown, [witness], [node])[middle]
@@ -432,18 +433,16 @@ def test_learning_rates_follow_the_length_of_the_run():
     assert fit.learning_rates(2_000, 2_000)["means"] == pytest.approx(0.01 * short["means"], rel=0.01)
 
 
-def test_the_table_of_methods_and_the_recipes_agree():
+def test_the_methods_that_can_be_fitted_are_those_of_the_configuration():
     from typing import get_args, get_type_hints
 
-    from mudg.methods import METHODS, fitted_methods
+    from mudg.methods import METHODS
 
-    assert set(fitted_methods()) == set(fit.RECIPES) == set(get_args(get_type_hints(FitConfig)["method"]))
-    for name in fitted_methods():
-        recipe, row = fit.RECIPES[name], METHODS[name]
-        assert recipe.objects == ("rigid per moving track" in row.nodes)
-        assert recipe.sky == ("sky" in row.nodes) == ("sky" in row.supervision)
-        assert recipe.lidar == ("LiDAR depth" in row.supervision)
-        assert recipe.virtual == ("virtual views of mudg_r" in row.supervision)
+    fitted = {name: row for name, row in METHODS.items() if row.made_by == "render"}
+    assert set(fitted) == set(get_args(get_type_hints(FitConfig)["method"]))
+    for row in fitted.values():
+        assert row.nodes[0] == "static" and row.supervision[0] == "color"
+        assert ("sky" in row.nodes) == ("sky" in row.supervision)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 8, 374, 375])

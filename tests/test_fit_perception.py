@@ -8,8 +8,11 @@ from test_score_metrics import lpips_state
 
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
-from mudg.core import losses, metrics
-from mudg.stages.config import FitConfig
+from mudg.core.metrics import Pair
+from mudg.core.perceptual import lpips_distance, unit_features
+from mudg.models.featnets import CodecFeatures, PerceptualDistance
+from mudg.models.mdm import files
+from mudg.stages.config.fit import VirtualConfig
 from mudg.stages.fitting.perception import perception_of
 
 
@@ -17,25 +20,28 @@ def random(seed: int, *shape: int) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_the_loss_is_the_scorers_distance_where_all_is_certain(weighted):
-    mine, theirs = ([random(s + 9 * k, 4, 6 // (s + 1), 8 // (s + 1)) - 0.3 for s in range(2)] for k in range(2))
-    channels = [random(20 + s, 4) for s in range(2)] if weighted else None
-    loss = losses.unit_feature_distance(mine, theirs, torch.ones(1, 12, 16, dtype=torch.float64), channels)
-    assert loss.item() == pytest.approx(metrics.perceptual_distance(mine, theirs, None, channels), rel=1e-4)
-
-
 def test_gradient_of_the_loss():
     theirs, weight, channels = random(1, 3, 4, 5), random(2, 1, 8, 10), [random(3, 3)]
+    units = unit_features([theirs])
     x = (random(4, 3, 4, 5) + 0.1).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: losses.unit_feature_distance([p], [theirs], weight, channels), (x,))
+    assert torch.autograd.gradcheck(lambda p: lpips_distance([p], units, weight, channels), (x,))
+
+
+def test_the_loss_is_the_scorers_distance_where_all_is_certain():
+    codec = CodecFeatures(files.load("embedded").codec)
+    render, truth = random(5, 3, 24, 32).float(), random(6, 3, 24, 32).float()
+    loss = perception_of(VirtualConfig(perception="codec"))(render, truth, torch.ones(1, 24, 32))
+    pair = Pair(rgb=render, truth_rgb=truth, **dict.fromkeys(
+        ("depth", "semantics", "truth_depth", "truth_depth_valid", "truth_semantics")
+    ))  # fmt: skip
+    assert loss.item() == pytest.approx(PerceptualDistance(codec)(pair), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["filters", "codec", "lpips"])
 def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
     path = tmp_path / "lpips.safetensors"
     store.write_safetensors(path, {key: value.numpy() for key, value in lpips_state().items()})
-    perception = perception_of(FitConfig(virtual_perception=name, lpips_weights=str(path)))
+    perception = perception_of(VirtualConfig(perception=name, lpips_weights=str(path)))
     truth = random(1, 3, 48, 64).float()
     everywhere = torch.ones(1, 48, 64)
     assert perception(truth, truth, everywhere).item() == pytest.approx(0, abs=1e-6)
@@ -50,7 +56,7 @@ def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
 
 def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
     with pytest.raises(UsageError, match="file of its weights"):
-        perception_of(FitConfig(virtual_perception="lpips"))
+        perception_of(VirtualConfig(perception="lpips"))
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
     with pytest.raises(InputError, match="incomplete"):
-        perception_of(FitConfig(virtual_perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))
+        perception_of(VirtualConfig(perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))

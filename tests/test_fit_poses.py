@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
-from mudg.base import geometry, store
+from mudg.base import geometry
 from mudg.base.config import to_dict
+from mudg.base.run_folder import RunDir
 from mudg.bench.poses import pose_errors
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.scene import read_scene
-from mudg.models.scene.nodes import compose
+from mudg.models.scene.model import compose
 from mudg.stages import fit
-from mudg.stages.config import FitConfig
 from mudg.stages.fitting import poses as fit_poses
-from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.objects import outline_mask
 
 SIZE, FRAMES = (96, 64), 6
@@ -28,16 +28,11 @@ def fitted(tmp_path_factory) -> fit.FitState:
     """A toy street fitted with exact boxes."""
     root = tmp_path_factory.mktemp("world")
     scene = read_scene(write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1]).root)
-    config = FitConfig(
-        method="street_gaussians", iterations=60, initial_gaussians=1500, densify=False, semantic_every=999
+    config = fit_config(
+        method="street_gaussians", iterations=60, start__gaussians=1500, densify__kind="none", loss__semantic_every=999
     )
-    frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, None)
-    recorded = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
-    state = fit.start_state(
-        config, fit.RECIPES[config.method], scene, fused_cloud(FRAMES), fit_views.ViewSet(recorded, ()), classes
-    )
-    fit.optimise(state, config, store.RunDir.open(root / "fit", "fit", to_dict(config), {}, 1, False))
+    state = fit.start_state(config, scene, fused_cloud(FRAMES), *fit.recorded_views(config, scene))
+    fit.optimise(state, config, RunDir.open(root / "fit", fit.OUTPUT, to_dict(config), {}))
     return state
 
 
@@ -80,7 +75,7 @@ def test_normal_equations_solve_a_linear_problem_and_bound_outliers():
 
 
 def test_without_evidence_a_clean_track_stays_and_wrong_offsets_go_back(node):
-    nothing = fit_poses.Evidence.none(FRAMES)
+    nothing = fit_poses.PoseEvidence.none(FRAMES)
     assert np.abs(fit_poses._move(node, nothing)).max() < 0.02
     node.add_offsets(np.tile([0.1, 0.05, 0.0], (FRAMES, 1)), np.full(FRAMES, 0.02))
     fit_poses._move(node, nothing)
@@ -88,12 +83,12 @@ def test_without_evidence_a_clean_track_stays_and_wrong_offsets_go_back(node):
 
 
 def test_evidence_between_two_keys_is_shared(node):
-    evidence = fit_poses.Evidence.none(FRAMES)
-    fit_poses._credit(node, 0.375, np.eye(4), np.ones(4), evidence)
+    evidence = fit_poses.PoseEvidence.none(FRAMES)
+    fit_poses._add_to_keys(node, 0.375, np.eye(4), np.ones(4), evidence)
     assert evidence.matrix[1, 0, 0] == pytest.approx(0.75**2)
     assert evidence.matrix[2, 0, 0] == pytest.approx(0.25**2)
     assert evidence.vector[:, 0] == pytest.approx([0, 0.75, 0.25, 0, 0, 0])
-    fit_poses._credit(node, 99.0, np.eye(4), np.ones(4), evidence)
+    fit_poses._add_to_keys(node, 99.0, np.eye(4), np.ones(4), evidence)
     assert evidence.views == 1
 
 
@@ -118,7 +113,9 @@ def test_poses_that_are_not_learnt_stay(fitted):
 
 
 def test_rounds_are_spread_over_the_run():
-    config = FitConfig(method="street_gaussians", iterations=200, learn_poses=True, pose_rounds=4, pose_start=0.25)
+    config = fit_config(
+        method="street_gaussians", iterations=200, poses__learn=True, poses__rounds=4, poses__start=0.25
+    )
     assert [step for step in range(1, 201) if fit.pose_round_due(config, step)] == [50, 90, 130, 170]
-    off = FitConfig(method="street_gaussians", iterations=200, pose_rounds=4)
+    off = fit_config(method="street_gaussians", iterations=200, poses__rounds=4)
     assert not any(fit.pose_round_due(off, step) for step in range(1, 201))

@@ -13,17 +13,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toy_scene import CAR, CAR_SIZE_M, COLOURS, GROUND, PANEL, TRAIN_IDS, WALL_HIGH, WALL_LOW, ToyStreet
+from toy_scene import CAR, CAR_SIZE_M, COLORS, GROUND, PANEL, TRAIN_IDS, WALL_HIGH, WALL_LOW, ToyStreet
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.geometry import invert, yaw_matrix
-from mudg.base.types import FusedCloud, PointCloud, SweepPoints, Track, View
+from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core.fusion import (
     STATIC,
     CloudAccumulator,
     FusionRules,
-    Shot,
     SweepShots,
     fuse_sweeps,
     judge_track,
@@ -50,12 +49,12 @@ def shots_of(
         pose, points, _ = street.sweep(time_s)
         view = street.view(time_s + image_delay_s)
         rgb, ids, _ = street.image(view)
-        yield SweepShots(time_s, pose, points, [Shot(view, rgb, ids if labels else None)])
+        yield SweepShots(time_s, pose, points, [Photo(view, rgb, ids if labels else None)])
 
 
-def colour_share(cloud: PointCloud, chosen: np.ndarray, kind: int) -> float:
+def color_share(cloud: PointCloud, chosen: np.ndarray, kind: int) -> float:
     """Share of the chosen points that have exactly the colour of a thing."""
-    return float((cloud.rgb[chosen] == COLOURS[kind]).all(1).mean())
+    return float((cloud.rgb[chosen] == COLORS[kind]).all(1).mean())
 
 
 # --- movers ---------------------------------------------------------------------------------------------------------
@@ -187,20 +186,20 @@ def test_without_the_test_the_wall_behind_a_panel_takes_its_colour_and_with_it_d
 
     def wrong(cloud: FusedCloud) -> float:
         behind = (np.abs(cloud.static.xyz[:, 1]) < 2) & (cloud.static.xyz[:, 0] > 12)
-        return colour_share(cloud.static, behind, PANEL)
+        return color_share(cloud.static, behind, PANEL)
 
     assert wrong(blind) > 0.15
     assert wrong(tested) < 0.02 * wrong(blind) + 0.004
     assert report.points_hidden > 100
     # what is truly visible keeps its colour: nearly nothing is lost
-    visible = (blind.static.rgb != COLOURS[PANEL]).any(1) | (blind.static.xyz[:, 0] < 9.5)
+    visible = (blind.static.rgb != COLORS[PANEL]).any(1) | (blind.static.xyz[:, 0] < 9.5)
     assert len(tested.static) > 0.985 * visible.sum()
 
 
 def test_a_slanted_road_does_not_hide_itself() -> None:
     cloud, report = fuse_sweeps(shots_of(ToyStreet(wall_x=70.0, times=(0.0,))), (), RULES)
-    assert report.points_hidden < 0.003 * report.points_coloured
-    assert colour_share(cloud.static, cloud.static.xyz[:, 2] < 0.02, GROUND) > 0.99
+    assert report.points_hidden < 0.003 * report.points_colored
+    assert color_share(cloud.static, cloud.static.xyz[:, 2] < 0.02, GROUND) > 0.99
 
 
 def test_colours_and_classes_are_exact_away_from_edges() -> None:
@@ -215,7 +214,7 @@ def test_colours_and_classes_are_exact_away_from_edges() -> None:
         (flat & (xyz[:, 0] < 24), GROUND),
     ):
         assert chosen.sum() > 100
-        assert colour_share(cloud.static, chosen, kind) == 1
+        assert color_share(cloud.static, chosen, kind) == 1
         assert (ids[chosen] == TRAIN_IDS[kind]).all()
 
 
@@ -228,7 +227,7 @@ def test_the_camera_that_looks_straighter_gives_the_colour() -> None:
         np.full((middle.camera.height, middle.camera.width, 3), c, np.uint8) for c in ((255, 0, 0), (0, 0, 255))
     )
     for order in (1, -1):
-        sweep = SweepShots(0.0, pose, points, [Shot(middle, red), Shot(turned, blue)][::order])
+        sweep = SweepShots(0.0, pose, points, [Photo(middle, red), Photo(turned, blue)][::order])
         cloud, _ = fuse_sweeps([sweep], (), replace(RULES, occlusion_test=False))
         cosines = []
         for view in (middle, turned):
@@ -258,10 +257,10 @@ def test_a_movers_motion_until_the_image_is_undone() -> None:
     times = (0.0, 0.1)
     cloud, _ = fuse_sweeps(shots_of(street, times, image_delay_s=0.06), [street.track()], RULES)
     car = cloud.objects["car-1"]
-    assert colour_share(car, np.ones(len(car), bool), CAR) > 0.97
+    assert color_share(car, np.ones(len(car), bool), CAR) > 0.97
     uncompensated, _ = fuse_sweeps(shots_of(street, times, image_delay_s=0.06), (), RULES)
     body = (uncompensated.static.xyz[:, 2] > 0.2) & (uncompensated.static.xyz[:, 0] < 15)
-    assert colour_share(uncompensated.static, body, CAR) < 0.9
+    assert color_share(uncompensated.static, body, CAR) < 0.9
 
 
 def test_object_points_of_all_sweeps_lie_on_one_box() -> None:
@@ -272,7 +271,7 @@ def test_object_points_of_all_sweeps_lie_on_one_box() -> None:
     to_faces = np.abs(np.abs(car.xyz) - CAR_SIZE_M / 2).min(1)
     assert to_faces.max() < 1e-3
     assert report.object_points["car-1"] == len(car) > 500
-    assert colour_share(car, np.ones(len(car), bool), CAR) > 0.97
+    assert color_share(car, np.ones(len(car), bool), CAR) > 0.97
     on_road = (cloud.static.xyz[:, 2] > 0.15) & (cloud.static.xyz[:, 0] < 20)
     assert not on_road.any()  # no trace of the car in the static world
 
@@ -282,7 +281,7 @@ def test_a_parked_car_stays_in_the_static_world() -> None:
     cloud, report = fuse_sweeps(shots_of(street), [street.track()], RULES)
     assert dict(cloud.objects) == {}
     assert not report.verdicts["car-1"].moving
-    assert ((cloud.static.rgb == COLOURS[CAR]).all(1)).sum() > 500
+    assert ((cloud.static.rgb == COLORS[CAR]).all(1)).sum() > 500
 
 
 def test_a_mover_with_few_points_is_left_out_and_so_are_its_points() -> None:
@@ -300,7 +299,7 @@ def test_nothing_to_fuse_is_an_empty_cloud(points: int, shots: int) -> None:
         np.zeros((points, 3), np.float32) + 1, np.zeros(points, np.float32), np.zeros(points, np.float32)
     )
     view = street.view(0.0)
-    given_shots = [Shot(view, street.image(view)[0])] * shots
+    given_shots = [Photo(view, street.image(view)[0])] * shots
     cloud, report = fuse_sweeps([SweepShots(0.0, np.eye(4), empty, given_shots)], (), RULES)
     assert len(cloud.static) == 0
     assert cloud.static.semantics is None
@@ -312,9 +311,9 @@ def test_nothing_to_fuse_is_an_empty_cloud(points: int, shots: int) -> None:
 def test_counts_add_up() -> None:
     street = ToyStreet(panel_x=9.0, car_start=(15, 3), car_velocity=(3, 0))
     _, report = fuse_sweeps(shots_of(street), [street.track()], RULES)
-    assert report.points_in == report.points_coloured + report.points_hidden + report.points_unseen
+    assert report.points_in == report.points_colored + report.points_hidden + report.points_unseen
     assert report.points_in == report.points_static_in + report.points_moving_in
-    assert report.points_coloured == report.points_static + report.object_points["car-1"]
+    assert report.points_colored == report.points_static + report.object_points["car-1"]
 
 
 def test_beam_gap_is_measured() -> None:
@@ -397,7 +396,7 @@ def test_small_training_size_is_fast() -> None:
         xyz = np.stack([reach * np.cos(elevation) * np.cos(azimuth), reach * np.cos(elevation) * np.sin(azimuth),
                         reach * np.sin(elevation)], 1).astype(np.float32)  # fmt: skip
         points = SweepPoints(xyz, np.zeros(60_000, np.float32), np.linspace(-0.05, 0.05, 60_000).astype(np.float32))
-        shots = [Shot(View(view.camera, yaw_matrix(a) @ view.world_from_cam, 0.1 * n), np.zeros((128, 192, 3), np.uint8),
+        shots = [Photo(View(view.camera, yaw_matrix(a) @ view.world_from_cam, 0.1 * n), np.zeros((128, 192, 3), np.uint8),
                       np.zeros((128, 192), np.uint8)) for a in (0.0, 0.8, -0.8)]  # fmt: skip
         sweeps.append(SweepShots(0.1 * n, np.eye(4), points, shots))
     tracks = [
@@ -444,7 +443,7 @@ def test_stage_writes_reuses_and_refuses(tmp_path: Path) -> None:
 def test_stage_uses_held_out_images_only_when_told(tmp_path: Path) -> None:
     ToyStreet().write(tmp_path / "scene")
     plain = read_fused(fuse.run(FuseConfig(), tmp_path / "scene", tmp_path / "a"))
-    more = read_fused(fuse.run(FuseConfig(colour_from_held_out=True), tmp_path / "scene", tmp_path / "b"))
+    more = read_fused(fuse.run(FuseConfig(color_from_held_out=True), tmp_path / "scene", tmp_path / "b"))
     assert len(more.static) > 1.2 * len(plain.static)
 
 
@@ -494,7 +493,7 @@ class KittiCheck:
 
         sweeps = (
             SweepShots(self.scene.sweeps[n].time_s, pose(n), read_points(self.scene, self.scene.sweeps[n]),
-                       [Shot(view(n), self.images[n])])
+                       [Photo(view(n), self.images[n])])
             for n in range(16) if n != 8
         )  # fmt: skip
         cloud, _ = fuse_sweeps(sweeps, self.scene.tracks if mode.endswith("boxes") else (), rules)

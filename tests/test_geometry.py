@@ -24,7 +24,7 @@ CAMERA = Camera("front", 480, 320, 400.0, 410.0, 241.0, 158.5)
 @given(poses, poses, poses)
 @settings(max_examples=50, deadline=None)
 def test_rigid_motions_form_a_group(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
-    assert geometry.is_rigid(a @ b)
+    assert geometry.rigid_problem(a @ b) is None
     np.testing.assert_allclose((a @ b) @ c, a @ (b @ c), atol=1e-9)
     np.testing.assert_allclose(a @ geometry.invert(a), np.eye(4), atol=1e-9)
     np.testing.assert_allclose(geometry.invert(a @ b), geometry.invert(b) @ geometry.invert(a), atol=1e-9)
@@ -118,3 +118,18 @@ def test_rigid_problem_names_the_fault(matrix: np.ndarray, word: str) -> None:
 def test_zero_quaternion_is_refused() -> None:
     with pytest.raises(InputError):
         geometry.matrix_from_quaternion([0, 0, 0, 0])
+
+
+def test_hull_of_a_box_is_cut_at_the_near_plane_and_none_beside_the_image() -> None:
+    view = View(Camera("c", 100, 80, 60.0, 60.0, 50.0, 40.0), geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
+    size_m = [4.0, 2.0, 1.5]
+    ahead = geometry.yaw_matrix(0.7, (12.0, 1.0, 0.2))
+    hull = geometry.box_hull(view, ahead, size_m)
+    uv, _ = geometry.project(view, geometry.transform_points(ahead, geometry.box_corners(size_m)))
+    assert hull is not None and len(hull.points) == 8
+    assert (hull.equations[:, :2] @ uv.T + hull.equations[:, 2:] < 1e-9).all()  # no corner outside
+    cut = geometry.box_hull(view, geometry.yaw_matrix(0.0, (1.0, 0.0, 0.0)), size_m, near_m=0.5)
+    assert cut is not None and len(cut.points) == 8  # four corners ahead, four crossings
+    assert np.abs(cut.points[4:] - [50, 40]).max() == pytest.approx(60 * 1.0 / 0.5)
+    for place in ((-9.0, 0.0, 0.0), (5.0, 80.0, 0.0)):
+        assert geometry.box_hull(view, geometry.yaw_matrix(0.0, place), size_m) is None

@@ -13,7 +13,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, yaw_matrix
 from mudg.base.types import Camera
 from mudg.data.importers import common, images
-from mudg.data.importers.layout import some_numbers
+from mudg.data.importers.layout import number_ranges
 from mudg.data.importers.options import ImportOptions, parse_resolution
 
 CAMERA = Camera("front", 96, 64, 70.0, 72.0, 47.0, 33.0)
@@ -161,7 +161,7 @@ def test_a_lens_that_no_pinhole_fits_is_refused(lens: images.Lens) -> None:
 
 def test_images_that_fit_are_kept_byte_for_byte() -> None:
     fit = images.fit_images(CAMERA, ImportOptions())
-    assert fit.keeps_bytes and fit.camera is CAMERA and fit.words == ""
+    assert fit.keeps_bytes and fit.camera is CAMERA and fit.note == ""
     content = b"not even decoded"
     assert fit.image(content) is content
 
@@ -214,5 +214,5 @@ def test_frame_numbers_in_words() -> None:
         (range(16), "0 to 15"),
         ([1, 2, 4, 5, 6], "1, 2, 4 to 6"),
     ):
-        assert some_numbers(list(numbers)) == words
-    assert some_numbers(list(range(0, 40, 2))) == "0, 2, 4, 6, 8, 10, 12, 14, ... (20 in all)"
+        assert number_ranges(list(numbers)) == words
+    assert number_ranges(list(range(0, 40, 2))) == "0, 2, 4, 6, 8, 10, 12, 14, ... (20 in all)"

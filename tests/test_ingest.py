@@ -15,6 +15,7 @@ from toy_scene import ToyStreet
 from mudg import native
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
+from mudg.base.run_folder import RunDir
 from mudg.data.city import CityConfig
 from mudg.data.importers import IMPORTERS, files_of
 from mudg.data.importers.options import ImportOptions
@@ -152,7 +153,7 @@ def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -
     with pytest.raises(UsageError, match="another configuration") as caught:
         ingest.run(config, root, out)
     assert "input 'source' changed" in caught.value.got
-    listed = files_of("kitti", root, ImportOptions(sequence="0003")).whole
+    listed = files_of("kitti", root, ImportOptions(sequence="0003")).files
     assert {path.relative_to(root).as_posix() for path in listed} == {
         "image_02/0003", "velodyne/0003", "label_02/0003.txt", "calib/0003.txt", "oxts/0003.txt",
     }  # fmt: skip
@@ -168,7 +169,7 @@ def test_of_large_releases_the_tables_and_the_names_of_files_count(tmp_path: Pat
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("[]")
     found = files_of("nuscenes", tmp_path, ImportOptions())
-    assert [path.name for path in found.whole] == ["sample_data.json", "scene.json"]
+    assert [path.name for path in found.files] == ["sample_data.json", "scene.json"]
     assert [path.name for path in found.entries] == ["CAM_FRONT", "LIDAR_TOP"]
     before = ingest.source_digest(tmp_path, "nuscenes", IngestConfig())
     assert ingest.source_digest(tmp_path, "nuscenes", IngestConfig()) == before
@@ -208,7 +209,7 @@ def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) ->
 def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     config, out = IngestConfig(contact_sheet=False), tmp_path / "out"
-    store.RunDir.open(out, "ingest", {"frames": "0:2"}, {"source": "another"}, 1)
+    RunDir.open(out, ingest._OUTPUT, {"frames": "0:2"}, {"source": "another"})
     partial = out / ".scene.999999999-1.part"
     partial.mkdir()
     store.write_json(out / "lock", {"pid": os.getppid(), "host": socket.gethostname()})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -275,7 +276,7 @@ def test_semantics_are_taken_where_there_are_some(source: Path, tmp_path: Path) 
 def boxes_of(tmp_path: Path, *objects: str) -> tuple[list, dict[str, int]]:
     path = tmp_path / "boxes.xml"
     path.write_text('<?xml version="1.0"?>\n<opencv_storage>' + "".join(objects) + "</opencv_storage>")
-    left_out: dict[str, int] = {}
+    left_out: Counter[str] = Counter()
     return list(read_boxes(path, left_out)), left_out
 
 

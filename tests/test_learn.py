@@ -2,17 +2,17 @@
 
 import json
 import signal
-from dataclasses import replace
 
 import pytest
 import torch
-from toy_clips import WINDOW, tiny, write_clips
+from toy_clips import WINDOW, tiny, with_settings, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.data.clips import from_city
 from mudg.data.clips import shards as clip_shards
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import GeneratedClip
+from mudg.models.mdm import files
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import score as learn_score
@@ -24,28 +24,28 @@ def clips(tmp_path_factory):
 
 
 def weights(folder):
-    return mdm.load(folder).state_dict()
+    return files.load(folder).state_dict()
 
 
 def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, tmp_path, monkeypatch):
     config = tiny(clips, checkpoint_every=100)
     whole = learn.run(config, tmp_path / "whole")
-    losses = learn._losses
+    draw = learn.draw_clips
 
-    def stopped_by_the_user(spread, model, config, batch, step, *rest):
-        if step == 1:
+    def stopped_by_the_user(config, folder, step, count, frames, purpose, *rest):
+        if step == 1 and purpose == "batch":
             signal.raise_signal(signal.SIGINT)
-        return losses(spread, model, config, batch, step, *rest)
+        return draw(config, folder, step, count, frames, purpose, *rest)
 
-    monkeypatch.setattr(learn, "_losses", stopped_by_the_user)
+    monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
     with pytest.raises(KeyboardInterrupt):
         learn.run(config, tmp_path / "parts")
-    monkeypatch.setattr(learn, "_losses", losses)
+    monkeypatch.setattr(learn, "draw_clips", draw)
     saved = checkpoint.latest(tmp_path / "parts" / "steps")
     assert saved is not None and saved.step == 2  # the step that was under way was finished
     assert json.loads((tmp_path / "parts" / "run.json").read_text())["state"] == "interrupted"
     assert not (tmp_path / "parts" / "model").exists()
-    parts = learn.run(replace(config, log_every=1), tmp_path / "parts")  # how often is written down may change
+    parts = learn.run(with_settings(config, log_every=1), tmp_path / "parts")  # how often is written down may change
     first, second = weights(whole), weights(parts)
     assert all(torch.equal(first[name], second[name]) for name in first)
     scores = [json.loads((p.parent / "metrics.json").read_text()) for p in (whole, parts)]
@@ -54,7 +54,7 @@ def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, tmp_
 
 def test_outputs_and_reuse(clips, tmp_path):
     out = tmp_path / "run"
-    model_folder = learn.run(tiny(clips, sample_every=4), out)
+    model_folder = learn.run(tiny(clips, score_every=4), out)
     assert (out / "samples" / "0000004.png").stat().st_size > 1000
     assert (out / "loss.png").is_file()
     content = json.loads((model_folder / "model.json").read_text())
@@ -62,7 +62,7 @@ def test_outputs_and_reuse(clips, tmp_path):
     assert content["facts"]["held_out"]["clips"] == 2
     assert "held-out" in (model_folder / "MODEL_CARD.md").read_text().lower()
     before = (model_folder / "model.json").stat().st_mtime_ns
-    assert learn.run(tiny(clips, sample_every=4), out) == model_folder
+    assert learn.run(tiny(clips, score_every=4), out) == model_folder
     assert (model_folder / "model.json").stat().st_mtime_ns == before
     with pytest.raises(UsageError):
         learn.run(tiny(clips, steps=5), out)
@@ -82,8 +82,8 @@ def test_training_continues_from_a_model(clips, tmp_path):
 
 
 def test_class_weights_lift_rare_classes(clips):
-    assert torch.equal(learn.class_weights(clips, 2, 0.0), torch.ones(19))
-    weight = learn.class_weights(clips, 2, 0.5)
+    assert torch.equal(learn_clips.class_weights(clips, 2, 0.0), torch.ones(19))
+    weight = learn_clips.class_weights(clips, 2, 0.5)
     assert float(weight[13]) > float(weight[0])
 
 
@@ -105,11 +105,9 @@ def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
 
 def test_batches_depend_on_step_only(clips):
     config = tiny(clips)
-    first = learn.draw_batch(config, clips, 7, 2, 2, "batch")
-    again = learn.draw_batch(config, clips, 7, 2, 2, "batch")
-    other = learn.draw_batch(config, clips, 8, 2, 2, "batch")
-    assert torch.equal(first.rgb, again.rgb)
-    assert not torch.equal(first.rgb, other.rgb)
+    first, again, other = (learn.draw_clips(config, clips, step, 2, 2, "batch") for step in (7, 7, 8))
+    assert all(torch.equal(one.rgb, two.rgb) for one, two in zip(first, again, strict=True))
+    assert not torch.equal(first[0].rgb, other[0].rgb)
 
 
 def test_schedules(clips):
@@ -118,8 +116,8 @@ def test_schedules(clips):
     assert learn.learning_rate(config, 300) == pytest.approx(1e-3)
     assert learn.learning_rate(config, 750) == pytest.approx(5e-4)
     assert learn.learning_rate(config, 999) == pytest.approx(2e-5)
-    assert learn_clips.cities_at(config, 0) == 1
-    assert learn_clips.cities_at(config, 600) == 3
+    assert learn_clips.cities_in_use(config, 0) == 1
+    assert learn_clips.cities_in_use(config, 600) == 3
     assert [learn.frames_at(config, s) for s in (0, 499, 500)] == [2, 2, 4]
 
 
@@ -129,10 +127,10 @@ def test_clips_that_never_come_are_an_error(tmp_path):
 
 
 def test_perfect_samples_score_perfectly(clips):
-    batch = clip_shards.read_batch(clips, [(from_city.HELD_OUT, 0, range(WINDOW))])
-    depth = batch.depth[0].clamp(max=100.0)
-    sample = mdm.Sample(batch.rgb[0], depth, batch.semantics[0], torch.ones_like(depth), {})
-    row, counts = learn_score.score_clip(batch, sample)
+    clip = clip_shards.read_clip(clips, from_city.HELD_OUT, 0, range(WINDOW))
+    depth = clip.depth.clamp(max=100.0)
+    sample = GeneratedClip(clip.rgb, depth, clip.semantics, torch.ones_like(depth), {})
+    row, counts = learn_score.score_clip(clip, sample)
     assert row["psnr"] == float("inf")
     assert row["abs_rel"] == pytest.approx(0.0, abs=1e-6)
     assert row["sharpness"] == pytest.approx(1.0)

@@ -1,21 +1,24 @@
-"""Settings of training: stages, frozen layers, dropout of the reference, latents on disk, no average."""
+"""Settings of training: stages, frozen layers, dropout of the reference, no average."""
 
 import importlib.util
-import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from toy_clips import WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint
+from mudg.base.config import load
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.models.mdm import model as mdm
-from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm import files
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import learn
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import latents as learn_latents
+from mudg.stages.config import LearnConfig
+from mudg.stages.config.learn import LearnData, LearnNetwork
+from mudg.stages.learning import models as learn_models
+from mudg.stages.learning.state import TrainingState
 
 
 @pytest.fixture(scope="module")
@@ -35,31 +38,18 @@ def stage_one(clips, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def separate(tmp_path_factory):
-    """A model with one pass per modality, in which the modality label matters, and a reference image in the first frame."""
+def unrefined(tmp_path_factory):
+    """A model without refiner, of another network than the settings describe by default."""
     model = MDM(
         MDMConfig(
-            codec=CodecConfig(semantics_code="palette"),
-            joint=False,
-            head="v",
-            copy_condition=False,
-            backdrop=False,
-            mask_planes="none",
-            reference="first_frame",
-            widths=(16, 32),
-            blocks=(1, 1),
-            spatial_attention=(False, True),
-            temporal_attention=(False, True),
-            given_classes=False,
-            refine_widths=(),
-            refine_blocks=(),
-            window=WINDOW,
-        )  # fmt: skip
-    )
-    learn.draw_weights(model.net, 3, "weights")
-    learn.draw_weights(model.codec, 3, "codec")
-    folder = tmp_path_factory.mktemp("separate") / "model"
-    mdm.save(model, folder, "card", {})
+            widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), patch=2,
+            refine_widths=(), refine_blocks=(), window=WINDOW, area_px=192 * 128,
+        )
+    )  # fmt: skip
+    learn_models.draw_weights(model.net, 3, "weights")
+    learn_models.draw_weights(model.codec, 3, "codec")
+    folder = tmp_path_factory.mktemp("unrefined") / "model"
+    files.save(model, folder, "card", {})
     return folder
 
 
@@ -67,11 +57,11 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, sta
     config = tiny(
         large_clips, start=str(stage_one), steps=1, width=96, height=64, frozen="temporal_transformers", average_decay=0
     )
-    begun, fresh = learn.starting_model(config)
-    before, start = mdm.load(stage_one).state_dict(), begun.state_dict()
+    begun, fresh = learn_models.starting_model(config)
+    before, start = files.load(stage_one).state_dict(), begun.state_dict()
     assert not fresh
     assert all(torch.equal(before[name], start[name]) for name in before)
-    after = mdm.load(learn.run(config, tmp_path / "two")).state_dict()
+    after = files.load(learn.run(config, tmp_path / "two")).state_dict()
     kept = {name for name in before if name.startswith("codec.") or ".temporal." in name}
     assert kept > {n for n in before if n.startswith("codec.")}
     assert all(torch.equal(before[name], after[name]) for name in kept)
@@ -80,91 +70,34 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, sta
     assert not list((tmp_path / "two" / "steps").glob("*/average.*"))  # no average was asked for
 
 
-def test_the_modality_embedding_survives_a_change_of_stage(stage_one, separate, clips):
+def test_the_modality_embedding_survives_a_change_of_stage(stage_one, unrefined, clips):
     """It once was overwritten by the time embedding in the published second stage."""
-    for folder, changes in ((stage_one, {}), (stage_one, {"refine_widths": (16, 16)}), (separate, {})):
-        if folder is separate:
-            config = replace(learn.LearnConfig(), start=str(folder), clips=str(clips), window=WINDOW)
+    for folder, changes in ((stage_one, {}), (stage_one, {"refine_widths": (16, 16)}), (unrefined, {})):
+        if folder is unrefined:
+            config = LearnConfig(start=str(folder), data=LearnData(clips=str(clips), window=WINDOW))
         else:
             config = tiny(clips, start=str(folder), **changes)
-        label = mdm.load(folder).net.label.state_dict()
-        begun, _ = learn.starting_model(config)
+        label = files.load(folder).net.label.state_dict()
+        begun, _ = learn_models.starting_model(config)
         assert all(torch.equal(value, begun.net.label.state_dict()[name]) for name, value in label.items())
         assert not torch.equal(label["0.weight"], begun.net.time.state_dict()["0.weight"])
 
 
 def test_frozen_layers_need_some_to_freeze(clips):
-    model = MDM(learn.model_config(tiny(clips, temporal_attention=(False, False))))
+    model = MDM(learn_models.model_config(tiny(clips, temporal_attention=(False, False))))
     with pytest.raises(UsageError, match="nothing to freeze"):
-        learn.freeze(model, "temporal_transformers")
-    other = MDM(learn.model_config(tiny(clips)))
-    count = learn.freeze(other, "temporal_layers")
+        learn_models.freeze(model, "temporal_transformers")
+    other = MDM(learn_models.model_config(tiny(clips)))
+    count = learn_models.freeze(other, "temporal_layers")
     frozen = {n for n, p in other.net.named_parameters() if not p.requires_grad}
     assert frozen == {n for n, _ in other.net.named_parameters() if ".temporal." in n}
     assert count == sum(p.numel() for n, p in other.net.named_parameters() if n in frozen)
 
 
-def test_an_embedded_kind_of_network_need_not_be_described_again(separate, clips, tmp_path):
-    config = replace(
-        tiny(clips, start=str(separate), steps=2, log_every=1, augment=False),
-        **{n: getattr(learn.LearnConfig(), n) for n in ("widths", "blocks", "spatial_attention", "temporal_attention")},
-        refine_widths=learn.LearnConfig().refine_widths, refine_blocks=learn.LearnConfig().refine_blocks,
-    )  # fmt: skip
-    model = mdm.load(learn.run(config, tmp_path / "run"))
-    assert model.config == replace(mdm.load(separate).config, area_px=48 * 32)
-
-
-def test_kept_latents_change_nothing_and_are_made_once(separate, clips, tmp_path, monkeypatch):
-    def losses(name, **changes):
-        config = replace(
-            learn.LearnConfig(), start=str(separate), clips=str(clips), workers=0, cities=3, first_cities=3, held_out=1, steps=3,
-            width=48, height=32, window=WINDOW, batch_frames=8, full_window_share=1.0, augment=False, reference_dropout=0.0,
-            score_steps=1, sample_steps=1, log_every=1, precision="float32", **changes,
-        )  # fmt: skip
-        learn.run(config, tmp_path / name)
-        rows = [json.loads(line) for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
-        return [row["total"] for row in rows if "total" in row]
-
-    encoded = []
-    monkeypatch.setattr(
-        learn_latents, "_of_clip",
-        lambda encode, name, folder, clip, own=learn_latents._of_clip: own(
-            lambda x: encoded.append(name) or encode(x), name, folder, clip
-        ),
-    )  # fmt: skip
-    plain, kept = losses("plain"), losses("kept", cache_latents=True)
-    assert kept == pytest.approx(plain, rel=1e-6)
-    files = list((tmp_path / "kept" / "latents").rglob("*.safetensors"))
-    assert 0 < len(encoded) == len(files) <= 5 * 6  # five encoded maps of at most six clips
-    model = mdm.load(separate)
-    assert {path.parent.parent.name for path in files} == {learn_latents.codec_digest(model.codec)[:16]}
-    with pytest.raises(UsageError, match="latents cannot be kept"):
-        learn.run(tiny(clips, cache_latents=True), tmp_path / "varied")
-
-
-def test_a_latent_belongs_to_its_codec_and_its_pixels(tmp_path):
-    codec, other = (MDM(MDMConfig(widths=(16,), blocks=(1,), spatial_attention=(False,), temporal_attention=(False,))).codec
-                    for _ in range(2))  # fmt: skip
-    with torch.no_grad():
-        other.rgb_scale.mul_(2)
-    generator = torch.Generator().manual_seed(0)
-    clips = torch.rand(2, 3, 3, 8, 8, generator=generator)
-    for module in (codec, other, codec):
-        with learn_latents.cached_latents(module, tmp_path):
-            assert torch.equal(module.encode_rgb(clips), type(module).encode_rgb(module, clips))
-            assert torch.equal(module.encode_rgb(clips.flip(-1)), type(module).encode_rgb(module, clips.flip(-1)))
-        assert "encode_rgb" not in vars(module)
-    assert len(list(tmp_path.rglob("*.safetensors"))) == 8
-
-
-def test_references_are_dropped_as_often_as_asked(clips):
-    def dropped(share):
-        batch = learn_clips.draw_batch(tiny(clips, reference_dropout=share), clips, 1, 40, 2, "batch")
-        return (batch.reference == batch.color[:, 0]).flatten(1).all(1).float().mean().item()
-
-    assert dropped(0.0) == 0.0
-    assert dropped(1.0) == 1.0
-    assert 0.05 < dropped(0.2) < 0.4
+def test_an_embedded_kind_of_network_need_not_be_described_again(unrefined, clips, tmp_path):
+    config = replace(tiny(clips, start=str(unrefined), steps=2, log_every=1, augment=False), network=LearnNetwork())
+    model = files.load(learn.run(config, tmp_path / "run"))
+    assert model.config == replace(files.load(unrefined).config, area_px=48 * 32)
 
 
 def test_constant_rate_and_averages(clips):
@@ -190,8 +123,52 @@ def test_moments_of_another_model_are_refused(clips, stage_one, tmp_path):
     """A checkpoint whose tensors do not fit is named, not half loaded."""
     saved = checkpoint.latest(stage_one.parent / "steps")
     assert saved is not None
-    model = MDM(learn.model_config(tiny(clips, widths=(16, 64))))
+    model = MDM(learn_models.model_config(tiny(clips, widths=(16, 64))))
     trained = model.trained_part()
-    state = learn.TrainingState(trained, torch.optim.AdamW(trained.parameters()), None)
+    state = TrainingState(trained, torch.optim.AdamW(trained.parameters()), None)
     with pytest.raises(checkpoint.IntegrityError, match="does not fit"):
         state.load(saved.path)
+
+
+def recipes(facts):
+    """Every recipe that a shipped model tells of, its predecessors' too."""
+    for name, value in facts.items():
+        if name == "recipe":
+            yield value
+        elif isinstance(value, dict):
+            yield from recipes(value)
+
+
+@pytest.mark.parametrize("name", sorted(files.EMBEDDED))
+def test_the_recipes_of_the_shipped_models_are_settings_files(name, tmp_path):
+    found = list(recipes(files.facts(name)))
+    assert found
+    for recipe in found:
+        (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+        config = load(LearnConfig, None, tmp_path / "recipe.yaml")
+        assert config.steps == recipe["steps"] and config.data.cities == recipe["data"]["cities"]
+    network = learn_models.model_config(config)
+    assert network.widths == files.load(name).config.widths
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [({"lr": 1e-4}, "optimizer.lr"), ({"cities": 3}, "data.cities"), ({"cache_latents": True}, "removed")],
+)
+def test_settings_by_their_old_names_are_refused_with_the_new_ones(old, new, tmp_path):
+    (tmp_path / "old.yaml").write_text(yaml.safe_dump(old))
+    with pytest.raises(UsageError, match=new):
+        load(LearnConfig, None, tmp_path / "old.yaml")
+
+
+def test_old_names_lead_to_settings_that_exist():
+    for new in filter(None, LearnConfig.MOVED.values()):
+        group, name = new.split(".")
+        assert hasattr(getattr(LearnConfig(), group), name), new
+
+
+def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "training.md").read_text()
+    (tmp_path / "stage1.yaml").write_text(text.split("```yaml\n")[1].split("```")[0])
+    config = load(LearnConfig, None, tmp_path / "stage1.yaml")
+    assert config.optimizer.betas == (0.9, 0.999) and config.compute.parallel == "fsdp" and not config.data.augment

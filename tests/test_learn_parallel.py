@@ -15,12 +15,14 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
+from mudg.models.mdm.model import MDM, BatchPart, LossSettings
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import models as learn_models
 from mudg.stages.learning import parallel as learn_parallel
 from mudg.stages.learning.parallel import Ranks
-from mudg.stages.learning.state import RowFiles, TrainingState
+from mudg.stages.learning.state import TrainingState, read_rows
 
 SAME = 2e-6
 """Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows it)."""
@@ -84,7 +86,7 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     off = {step: abs(one[step] - other[step]) / one[step] for step in (3, 4, 5, 6)}
     print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
     assert max(off.values()) < SAME, off
-    first, second = (mdm.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
+    first, second = (files.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
     for name in first:  # stored in half precision
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
@@ -92,13 +94,13 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
 def torchrun(clips, out, **changes):
     """The command that trains on two processes started by torch's launcher."""
     flags = {
-        "clips": clips, "out": out, "cities": 3, "first-cities": 2, "held-out": 1, "workers": 0, "width": WIDTH,
-        "height": HEIGHT, "window": WINDOW, "codec-steps": 2, "codec-batch": 2, "codec-fit-batches": 1, "steps": 2,
-        "batch-frames": 8, "sample-steps": 1, "score-steps": 1, "log-every": 1, "parallel": "fsdp", **changes,
+        "out": out, "steps": 2, "data.clips": clips, "data.cities": 3, "data.first-cities": 2, "data.held-out": 1,
+        "data.width": WIDTH, "data.height": HEIGHT, "data.window": WINDOW, "network.widths": "16 32", "network.blocks": "1 1",
+        "network.spatial-attention": "False True", "network.temporal-attention": "False True", "network.refine-widths": "8 16",
+        "network.refine-blocks": "1 1", "codec.steps": 2, "codec.batch": 2, "codec.fit-batches": 1, "optimizer.batch-frames": 8,
+        "score.steps": 1, "compute.workers": 0, "compute.log-every": 1, "compute.parallel": "fsdp", **changes,
     }  # fmt: skip
-    words = [word for name, value in flags.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    words += ["--widths", "16", "32", "--blocks", "1", "1", "--refine-widths", "8", "16", "--refine-blocks", "1", "1"]
-    words += ["--spatial-attention", "False", "True", "--temporal-attention", "False", "True"]
+    words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
     return [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mudg", "learn", *words,
     ]  # fmt: skip
@@ -109,14 +111,14 @@ def test_torchrun_trains(clips, tmp_path):
     command = torchrun(clips, tmp_path / "out")
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
-    assert mdm.load(tmp_path / "out" / "model").config.widths == (16, 32)
+    assert files.load(tmp_path / "out" / "model").config.widths == (16, 32)
 
 
 @pytest.mark.slow
 def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
     """The terminal sends the signal to all processes, and the launcher sends it on once more."""
     out = tmp_path / "out"
-    command = torchrun(clips, out, steps=5000, checkpoint_every=5000)
+    command = torchrun(clips, out, **{"steps": 5000, "compute.checkpoint-every": 5000})
     process = subprocess.Popen(command, env=environment(), start_new_session=True, stderr=subprocess.PIPE, text=True)
     try:
         deadline = time.monotonic() + 500
@@ -137,34 +139,27 @@ def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
 
 
 def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
-    config = tiny(clips, reference_dropout=0.5)
-    whole = learn_clips.draw_batch(config, clips, 7, 4, 2, "batch")
+    config = tiny(clips)
+    everything = learn_clips.draw_clips(config, clips, 7, 4, 2, "batch")
     for part in (slice(0, 1), slice(1, 3), slice(3, 4)):
-        own = learn_clips.draw_batch(config, clips, 7, 4, 2, "batch", part)
-        assert torch.equal(own.rgb, whole.rgb[part])
-        assert torch.equal(own.ids, whole.ids[part])
-        assert torch.equal(own.reference, whole.reference[part])
-        assert own.shift_m == whole.shift_m[part]
+        for own, clip in zip(
+            learn_clips.draw_clips(config, clips, 7, 4, 2, "batch", part), everything[part], strict=True
+        ):
+            assert torch.equal(own.rgb, clip.rgb)
+            assert torch.equal(own.condition.semantics, clip.condition.semantics)
+            assert torch.equal(own.condition.reference, clip.condition.reference)
+            assert own.shift_m == clip.shift_m
 
 
-@pytest.mark.parametrize("kind", ["joint", "separate"])
-def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips, kind):
-    config = learn.model_config(tiny(clips))
-    if kind == "separate":
-        codec = mdm.CodecConfig(semantics_code="palette")
-        config = mdm.MDMConfig(
-            codec=codec, joint=False, head="v", copy_condition=False, backdrop=False, given_classes=False, widths=(16, 32),
-            blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), refine_widths=(), refine_blocks=(),
-        )  # fmt: skip
-    model = mdm.MDM(config)
-    learn.draw_weights(model.net, 0, "weights")
+def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
+    model = MDM(learn_models.model_config(tiny(clips)))
+    learn_models.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
-    weights = learn_clips.class_weights(clips, 2, 0.5)
+    rules = LossSettings(learn_clips.class_weights(clips, 2, 0.5), refined_share=0.5)
 
     def loss(part, step):
-        batch = learn_clips.draw_batch(settings, clips, step, 4, 2, "batch", part)
-        first = part.start or 0
-        return float(learn._losses(model.loss, model, settings, batch, step, first, 4, weights, False).total.detach())
+        drawn = learn_clips.draw_clips(settings, clips, step, 4, 2, "batch", part)
+        return float(model(drawn, BatchPart(settings.seed, step, part.start or 0, 4), rules).total.detach())
 
     for step in range(3):
         parts = [loss(slice(n, n + 1), step) for n in range(4)]
@@ -194,21 +189,21 @@ def test_rows_of_any_cut_are_put_together(tmp_path):
         store.atomic_write(tmp_path / f"net.{rank:04d}.safetensors", save({"w": value[start:stop].contiguous()}))
         store.write_json(tmp_path / f"net.{rank:04d}.json", {"w": {"shape": [10, 3], "start": start}})
     got = torch.zeros(10, 3)
-    RowFiles(tmp_path, "net").read_into("w", got)
+    read_rows(tmp_path, "net", {"w": got})
     assert torch.equal(got, value)
     with pytest.raises(IntegrityError, match="does not fit"):
-        RowFiles(tmp_path, "net").read_into("w", torch.zeros(9, 3))
+        read_rows(tmp_path, "net", {"w": torch.zeros(9, 3)})
     with pytest.raises(IntegrityError, match="does not fit"):
-        RowFiles(tmp_path, "net").read_into("v", got)
+        read_rows(tmp_path, "net", {"v": got})
     (tmp_path / "net.0001.json").unlink()
     with pytest.raises(IntegrityError, match="rows"):
-        RowFiles(tmp_path, "net").read_into("w", got)
+        read_rows(tmp_path, "net", {"w": got})
 
 
 def test_a_term_that_is_not_finite_is_named():
     with pytest.raises(NumericsError, match=r"depth term of the network(.|\n)*step 4"):
-        learn_parallel.agreed(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
-    assert learn_parallel.agreed(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)
+        learn_parallel.agreed_terms(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
+    assert learn_parallel.agreed_terms(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)
 
 
 def test_blocks_are_what_repeats():

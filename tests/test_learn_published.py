@@ -15,18 +15,21 @@ from toy_published import published_settings, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Condition
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.condition import ConditionRules, build_condition
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
+from mudg.models.mdm.model import BatchPart, LossSettings
+from mudg.models.published import files as published_files
 from mudg.models.published import model as published
 from mudg.models.published.model import PAPER_DROPOUT, RELEASED_DROPOUT, ContextDropout, PublishedMDM
 from mudg.stages import convert, fuse, learn, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import published_model
+from mudg.stages.learning import models as learn_models
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +50,12 @@ def street(tmp_path_factory):
     return root
 
 
-def corner(batch):
+def corner(clip):
     """The upper left 16x16 pixels: enough for a loss."""
-    names = ("rgb", "depth", "semantics", "color", "sparse_depth", "valid", "warped", "reference", "depth_known")
-    return replace(batch, **{name: getattr(batch, name)[..., :16, :16] for name in names})
+    cut = lambda value, *names: {name: getattr(value, name)[..., :16, :16] for name in names}  # noqa: E731
+    given = clip.condition
+    condition = Condition(given.views, **cut(given, "color", "depth", "valid", "reference"))
+    return replace(clip, condition=condition, **cut(clip, "rgb", "depth", "depth_valid", "semantics"))
 
 
 def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
@@ -60,12 +65,12 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     config = published_settings(
         one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
     )
-    begun, fresh = learn.starting_model(config)
-    first, start = (published_model.read(folder).state_dict() for folder in (converted, one))
+    begun, fresh = learn_models.starting_model(config)
+    first, start = (published_files.load(folder).state_dict() for folder in (converted, one))
     assert not fresh
     assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
     two = learn.run(config, tmp_path / "two")
-    last = published_model.read(two)
+    last = published_files.load(two)
     end = last.state_dict()
     trained = {name for name in first if name.startswith(("net.", "image_tokens."))}
     temporal = begun.temporal_parameters("transformers")
@@ -76,7 +81,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
         assert not torch.equal(state["net.label.0.weight"], first["net.label.0.weight"])
         assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
     assert (last.config.width, last.config.height) == (36, 32)
-    assert torch.equal(last.schedule.scale, published_model.read(converted).schedule.scale)
+    assert torch.equal(last.schedule.scale, published_files.load(converted).schedule.scale)
     assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
     assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
     view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
@@ -98,13 +103,13 @@ def test_settings_of_the_frozen_layers_agree_with_the_published_stages():
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     """With dropout inside the network on; terms too, and they have the same names in every part."""
     settings = published_settings(converted, clips)
-    model, _ = learn.starting_model(settings)
+    model, _ = learn_models.starting_model(settings)
     model.trained_part().train()
 
     @torch.no_grad()
     def losses(step, part):
-        batch = corner(learn_clips.draw_batch(settings, clips, step, 2, 4, "batch", part))
-        return learn._losses(model.loss, model, settings, batch, step, part.start, 2, torch.ones(19), False)
+        drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, step, 2, 4, "batch", part)]
+        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings())
 
     for step in range(2):
         whole, parts = losses(step, slice(0, 2)), [losses(step, slice(n, n + 1)) for n in (0, 1)]
@@ -120,14 +125,14 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     settings = published_settings(converted, clips)
-    model, _ = learn.starting_model(settings)
-    batch = corner(learn_clips.draw_batch(settings, clips, 0, 4, 4, "batch"))
-    loss = lambda shown: learn._losses(model.loss, model, settings, shown, 0, 0, 4, torch.ones(19), False)  # noqa: E731
-    nothing = replace(
-        batch, depth_known=torch.zeros_like(batch.depth_known), semantics=torch.full_like(batch.semantics, 255)
-    )
+    model, _ = learn_models.starting_model(settings)
+    drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 4, 4, "batch")]
+    nothing = [
+        replace(clip, depth_valid=torch.zeros_like(clip.depth_valid), semantics=torch.full_like(clip.semantics, 255))
+        for clip in drawn
+    ]
     with torch.no_grad():
-        terms, without = loss(batch).terms, loss(nothing).terms
+        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings()).terms for some in (drawn, nothing))
     assert {"depth", "semantics"} & set(terms)
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 
@@ -159,7 +164,7 @@ def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
     off = {step: abs(one[step] - other[step]) / one[step] for step in (1, 2, 3)}
     print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
     assert max(off.values()) < SAME, off
-    first, second = (published_model.read(tmp_path / name / "model").state_dict() for name in ("one", "both"))
+    first, second = (published_files.load(tmp_path / name / "model").state_dict() for name in ("one", "both"))
     for name in first:
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
@@ -167,18 +172,18 @@ def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
 def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch):
     """By the model itself: clips come with theirs even where all are to go without."""
     given, dropped = [], []
-    encode = PublishedMDM.encode_planes
+    encode = PublishedMDM.encode_condition
 
-    def watched(model, color, depth, valid, reference, *rest):
-        given.append(bool(torch.equal(reference, color[:, 0])))
-        return encode(model, color, depth, valid, reference, *rest)
+    def watched(model, condition, *rest):
+        given.append(bool(torch.equal(condition.reference, condition.color[0])))
+        return encode(model, condition, *rest)
 
     def noted(model, *rest, dropout, **more):
         dropped.append(dropout.both + dropout.reference)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(PublishedMDM, "encode_planes", watched)
-    monkeypatch.setattr(PublishedMDM, "loss", noted)
+    monkeypatch.setattr(PublishedMDM, "encode_condition", watched)
+    monkeypatch.setattr(PublishedMDM, "velocity_loss", noted)
     with pytest.raises(KeyboardInterrupt):
         learn.run(published_settings(converted, clips, reference_dropout=0.8), tmp_path / "run")
     assert given and not any(given)
@@ -190,12 +195,12 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
     for wrong in ({"window": 8}, {"full_window_share": 0.5}):
-        with pytest.raises(UsageError, match=r"exactly the length(.|\n)*--window 4 --full-window-share 1"):
+        with pytest.raises(
+            UsageError, match=r"exactly the length(.|\n)*--data.window 4 --optimizer.full-window-share 1"
+        ):
             learn.run(published_settings(converted, clips, **wrong), tmp_path / "run")
     with pytest.raises(UsageError, match="multiples of 4"):
         learn.run(published_settings(converted, clips, width=50), tmp_path / "run")
-    with pytest.raises(UsageError, match="cannot be kept"):
-        learn.run(published_settings(converted, clips, cache_latents=True), tmp_path / "run")
     with pytest.raises(UsageError, match="cannot be described"):
         learn.run(published_settings(converted, clips, widths=(16, 32, 64)), tmp_path / "run")
     with pytest.raises(UsageError, match="without a refiner"):
@@ -222,12 +227,13 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     for name in ("color", "depth", "valid", "reference"):
         assert torch.equal(getattr(clip.condition, name), getattr(wanted, name)), name
     assert float((clip.condition.reference - clip.rgb[0]).abs().mean()) < 0.03  # frame 0's own image
-    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([clip], [0.0], gaps=True))
-    batch = clip_shards.read_batch(tmp_path, [(0, 0, range(4))])
-    assert torch.allclose(batch.sparse_depth[0], wanted.depth, rtol=1e-3, atol=1e-3)
-    assert bool((batch.sparse_depth == 0).any()) and not bool(batch.warped.any())
-    assert torch.allclose(batch.color[0], wanted.color, atol=1 / 500)
-    assert 0 < float(batch.depth[~batch.depth_known].min()) and float(batch.depth[~batch.depth_known].max()) <= 100
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([clip], gaps=True))
+    read = clip_shards.read_clip(tmp_path, 0, 0, range(4))
+    given, filled = read.condition, read.depth[~read.depth_valid]
+    assert torch.allclose(given.depth, wanted.depth, rtol=1e-3, atol=1e-3)
+    assert bool((given.depth == 0).any()) and not bool(given.warped.any())
+    assert torch.allclose(given.color, wanted.color, atol=1 / 500)
+    assert 0 < float(filled.min()) and float(filled.max()) <= 100
     thinner = from_log.make_clip(log, window, 0)
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
 
@@ -241,17 +247,17 @@ def test_filling_takes_the_nearest_measured_depth():
 def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
     sources = [LogSource(street / "scene", street / "fuse")]
     rules = LogClipRules(width=48, height=32, window=4)
-    from_log.claim(tmp_path, rules, sources)
+    from_log.claim_folder(tmp_path, rules, sources)
     assert "published" not in json.loads((tmp_path / from_log.INDEX).read_text())["rules"]  # as in earlier versions
     with pytest.raises(UsageError, match="other logs or settings"):
-        from_log.claim(tmp_path, replace(rules, published=True), sources)
+        from_log.claim_folder(tmp_path, replace(rules, published=True), sources)
 
 
 def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
     rules = from_city.CityClipRules(width=48, height=32, window=16, clips=1, published=True)
     assert rules.frames == 18 and from_city.CityClipRules().frames == from_city.FRAMES
     log = from_city.make_log(replace(rules, width=24, height=16), 0, rules.frames)
-    (clip,), _ = from_city.make_clips(replace(rules, width=24, height=16), 0, log)
+    (clip,) = from_city.make_clips(replace(rules, width=24, height=16), 0, log)
     condition = clip.condition
     assert len(clip.rgb) == 16 and condition.warped is None
     empty = ~condition.valid

@@ -11,14 +11,16 @@ from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Source
+from mudg.core import losses
 from mudg.data.clips import from_log
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_city import HELD_OUT
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.scene import SceneWriter, read_image, read_label, read_points, read_scene
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm.model import MDM
 from mudg.stages import fuse, learn
 from mudg.stages.config import FuseConfig
+from mudg.stages.learning import models as learn_models
 
 RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
 FRAMES = 16
@@ -72,7 +74,7 @@ def test_windows_to_score_share_no_moment_with_those_to_train_on(log):
     with pytest.raises(InputError, match="too short"):
         from_log.log_windows(scene, LogClipRules(48, 24, window=30))
     with pytest.raises(InputError, match="too short to hold out"):
-        from_log.plan([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
+        from_log.plan_shards([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
 
 
 def test_truth_is_what_was_recorded(measured):
@@ -90,7 +92,7 @@ def test_truth_is_what_was_recorded(measured):
         assert 0.1 < solid.mean() < 1.0
         assert (clip.depth[number, 0].numpy()[known & ~np.isfinite(depth)] >= 100).mean() > 0.9
         assert (clip.semantics[number].numpy() == ids).mean() > 0.97
-    arrays = clip_shards.pack_clips([clip], [0.0], gaps=True)
+    arrays = clip_shards.pack_clips([clip], gaps=True)
     unknown = (arrays["flags"] & clip_shards.FLAG_DEPTH_UNKNOWN) > 0
     assert np.array_equal(unknown[0], ~clip.depth_valid[:, 0].numpy())
     assert float(arrays["depth"][0][unknown[0]].max()) <= 100  # filled, not far away
@@ -117,25 +119,24 @@ def test_a_view_never_sees_its_own_image(log, tmp_path):
 def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
     opened = from_log.OpenLog(measured[1], replace(RULES, width=64, height=32))
     window = from_log.log_windows(opened.scene, RULES)[0]
-    clip_shards.write_shard(
-        tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], [0.0], gaps=True)
-    )
-    model = mdm.MDM(learn.model_config(tiny(tmp_path, width=64, height=32, window=3)))
-    batch = clip_shards.read_batch(tmp_path, [(0, 0, range(3))])
-    assert not bool(batch.depth_known.all())
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], gaps=True))
+    model = MDM(learn_models.model_config(tiny(tmp_path, width=64, height=32, window=3)))
+    clip = clip_shards.read_clip(tmp_path, 0, 0, range(3))
+    assert not bool(clip.depth_valid.all())
 
-    def terms(depth):
-        shown = replace(batch, depth=torch.where(batch.depth_known, batch.depth, depth))
-        truth = model.pixel_truth(shown.rgb, shown.depth, shown.semantics, shown.depth_known)
-        code = truth.depth_code.clone().requires_grad_()
-        made = mdm.Refined(truth.rgb, torch.zeros_like(code), torch.zeros(3, 19, 32, 64), torch.zeros_like(code))
-        return float(mdm.refine_loss(made, truth)["pixel_depth"])
+    def term(depth, known):
+        filled = replace(clip, depth=torch.where(known, clip.depth, depth))
+        truth = model.encode_truth([filled]).pixels
+        return float(
+            losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0)
+        )
 
-    assert terms(torch.tensor(3.0)) == terms(torch.tensor(90.0))
-    mirrored = clip_shards.vary(batch, np.random.Generator(np.random.PCG64(1)))
-    flipped = not torch.equal(mirrored.depth, batch.depth)
-    wanted = batch.depth_known.flip(-1) if flipped else batch.depth_known
-    assert torch.equal(mirrored.depth_known, wanted)
+    assert term(torch.tensor(3.0), clip.depth_valid) == term(torch.tensor(90.0), clip.depth_valid)
+    assert term(torch.tensor(3.0), ~clip.depth_valid) != term(torch.tensor(90.0), ~clip.depth_valid)
+    mirrored = clip_shards.vary(clip, np.random.Generator(np.random.PCG64(1)))
+    flipped = not torch.equal(mirrored.depth, clip.depth)
+    wanted = clip.depth_valid.flip(-1) if flipped else clip.depth_valid
+    assert torch.equal(mirrored.depth_valid, wanted)
 
 
 def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
@@ -146,7 +147,7 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     for name, folder in (("scene", log[1].scene), ("fuse", log[1].fused)):
         (run / name).symlink_to(folder)
     config = tiny(
-        "", start=str(first), scenes=(str(run),), steps=2, sample_every=1, log_every=1, stride=2, held_out_every=4, window=4,
+        "", start=str(first), scenes=(str(run),), steps=2, score_every=1, log_every=1, stride=2, held_out_every=4, window=4,
         width=64, height=32,
     )  # fmt: skip
     made = learn.run(config, tmp_path / "tuned")
@@ -158,8 +159,8 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     assert scores["clips"] >= 1 and scores["average"]["psnr"] > 5
     assert (made.parent / "samples" / "0000001.png").is_file() and (made.parent / "loss.png").is_file()
     facts = json.loads((made / "model.json").read_text())["facts"]
-    assert facts["recipe"]["scenes"] == [str(run)]
+    assert facts["recipe"]["data"]["scenes"] == [str(run)]
     with pytest.raises(UsageError, match="other logs or settings"):
-        from_log.claim(made.parent / "clips", RULES, [log[1]])
+        from_log.claim_folder(made.parent / "clips", RULES, [log[1]])
     with pytest.raises(InputError, match="no scene with a fused cloud"):
         learn.run(tiny("", start=str(first), scenes=(str(tmp_path),)), tmp_path / "none")

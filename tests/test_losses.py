@@ -192,3 +192,43 @@ def test_filter_bank_weight_silences_pixels():
     weight[:, :, :32] = 1.0
     assert losses.feature_distance(bank(a), bank(b), weight).item() < 1e-12
     assert distance(a, b) > 0.05
+
+
+# diffusion model ------------------------------------------------------------------------------------------------------
+
+
+def test_pixel_terms_at_known_values():
+    """Everything right: no error, and the stated scale costs its own logarithm. Colour off by 0.1: L1 and square."""
+    ids = torch.randint(0, 19, (1, 4, 4), generator=torch.Generator().manual_seed(0))
+    scores = 50.0 * torch.nn.functional.one_hot(ids, 19).movedim(-1, 1).float()
+    rgb, code = torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4)
+    weight = 1.0 + 2.0 * (ids == 10).unsqueeze(1)
+    assert float(losses.image_error(rgb, square=2.0, gradient=0.5)) == 0
+    assert float(losses.depth_code_error(code, code, weight, 1.0)) == 0
+    assert float(losses.class_error(scores, ids, None)) == pytest.approx(0, abs=1e-6)
+    assert float(losses.stated_error(torch.full_like(code, -3.0), rgb)) == pytest.approx(-3.0)
+    assert float(losses.image_error(rgb + 0.1, square=2.0, gradient=0.5)) == pytest.approx(0.1 + 2 * 0.01, rel=1e-5)
+    apart = losses.depth_code_error(code + 0.1, code, weight, log_per_code=2.0)
+    assert float(apart) == pytest.approx(5 * float(weight.mean()) * (math.expm1(0.2) - 0.0025), rel=1e-4)
+    assert float(losses.class_error(scores, torch.full_like(ids, 255), None)) == 0
+
+
+def test_latent_terms_at_known_values():
+    truth, weight = torch.zeros(2, 1, 4, 2, 2), torch.tensor([1.0, 5.0]).view(2, 1, 1, 1, 1)
+    assert float(losses.latent_error(truth + 0.1, truth, weight)) == pytest.approx(0.03, rel=1e-5)
+    half = torch.tensor([1.0, 0.0]).view(2, 1, 1, 1, 1)  # the second clip's depth is not known
+    assert float(losses.latent_depth_error(truth + 0.1, truth, weight, half)) == pytest.approx(0.5 * 5 * 0.005, rel=1e-5)
+    shares = torch.zeros(1, 1, 3, 1, 2)
+    shares[:, :, 0, :, 0] = 1.0  # one cell of class 0, one without a class
+    stated = torch.full_like(shares, math.log(1 / 3))
+    assert float(losses.share_cross_entropy(stated, shares, None)) == pytest.approx(math.log(3) / 2, rel=1e-6)
+    weighted = losses.share_cross_entropy(stated, shares, torch.tensor([2.0, 1.0, 1.0]))
+    assert float(weighted) == pytest.approx(math.log(3), rel=1e-6)
+
+
+def test_the_stated_error_does_not_move_the_colour():
+    error = torch.full((1, 3, 4, 4), 0.3, requires_grad=True)
+    log_error = torch.full((1, 1, 4, 4), -1.0, requires_grad=True)
+    losses.stated_error(log_error, error).backward()
+    assert error.grad is None or float(error.grad.abs().sum()) == 0
+    assert float(log_error.grad.sum()) != 0

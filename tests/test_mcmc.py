@@ -22,7 +22,8 @@ from mudg.models.scene.mcmc import (
     stack_of,
     systematic_counts,
 )
-from mudg.models.scene.nodes import RigidNode, SceneModel, StaticNode
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode, StaticNode
 
 SETTINGS = McmcSettings(start=10, stop=100, every=10, max_rows=1000, growth=0.0)
 NOWHERE = -9.0  # a logit of opacity 0.0001
@@ -280,21 +281,3 @@ def test_only_the_nearly_transparent_drift_and_only_their_centres() -> None:
 
 def test_when_it_is_due() -> None:
     assert [step for step in range(1, 130) if SETTINGS.due(step)] == list(range(10, 101, 10))
-
-
-def test_copies_inherit_what_only_movers_have():
-    """The time-varying colour (a partial column) is that of the row copied; all members of a stack have fresh moments."""
-    model = scene(static=8, moving=6, dead=(0, 9, 12))
-    own = torch.arange(8, 14.0)[:, None, None].repeat(1, 2, 3)  # the number of the row, as in sh_dc
-    table = Table({k: v.detach() for k, v in model.table.columns.items()}, model.table.labels, {"sh_time": own + 0.5})
-    table.moment1["sh_time"] += own
-    model = SceneModel(table, model.nodes, None, (0, 1), 0)
-    report = relocate_and_grow(model, 10, SETTINGS, 0)
-    assert report["relocated"] == 3
-    numbers = [n for n, holds in zip(tags(model), model.table.holders().tolist(), strict=True) if holds]
-    assert len(numbers) == 6
-    assert len(set(numbers)) < 6  # some were copied
-    found = model.table.partial["sh_time"].detach()
-    assert found[:, 0, 0].tolist() == [n + 0.5 for n in numbers]
-    moments = model.table.moment1["sh_time"][:, 0, 0].tolist()
-    assert moments == [0.0 if numbers.count(n) > 1 else float(n) for n in numbers]

@@ -1,28 +1,27 @@
 """The diffusion model: shapes, invariances, determinism, what is copied and what is refused."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
 
 from mudg.base.errors import InputError, IntegrityError, UsageError
-from mudg.base.types import Camera, Condition, View
+from mudg.base.types import Camera, Clip, Condition, View
 from mudg.core import noise
-from mudg.models.mdm import codec, unet
+from mudg.models import diffusion
+from mudg.models.diffusion import SampleRequest
+from mudg.models.mdm import codec, files, network
 from mudg.models.mdm import model as mdm
 from mudg.models.mdm.codec import CodecConfig
-from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig
 
 TINY = MDMConfig(
     widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
     embed_width=16, patch=1, codec=CodecConfig(decoder_width=8, decoder_blocks=1), refine_widths=(8, 16), refine_blocks=(1, 1),
+    window=8, area_px=24576,
 )  # fmt: skip
-PLAIN = replace(TINY, given_classes=False, refine_widths=(), refine_blocks=())
-SEPARATE = replace(
-    PLAIN, joint=False, head="v", copy_condition=False, backdrop=False, mask_planes="none", reference="first_frame",
-    codec=CodecConfig(semantics_code="palette", depth_code="linear", decoder_width=8, decoder_blocks=1),
-)  # fmt: skip
+PLAIN = replace(TINY, refine_widths=(), refine_blocks=())
 
 
 def some_condition(frames=3, height=16, width=24, seed=0):
@@ -61,9 +60,9 @@ def randomised(config, seed=0):
 
 def test_sample_shapes_ranges_and_determinism():
     model, condition = randomised(TINY), some_condition()
-    first = model.sample(condition, steps=3, seed=7, index=2)
-    again = model.sample(condition, steps=3, seed=7, index=2)
-    other = model.sample(condition, steps=3, seed=7, index=3)
+    first = model.sample(condition, SampleRequest(3, seed=7, index=2))
+    again = model.sample(condition, SampleRequest(3, seed=7, index=2))
+    other = model.sample(condition, SampleRequest(3, seed=7, index=3))
     assert first.rgb.shape == (3, 3, 16, 24)
     assert first.depth.shape == (3, 1, 16, 24)
     assert first.semantics.shape == (3, 16, 24)
@@ -79,55 +78,27 @@ def test_sample_shapes_ranges_and_determinism():
     assert not torch.equal(first.rgb, other.rgb)
 
 
-def test_separate_modalities_use_their_labels():
-    model, condition = randomised(SEPARATE), some_condition()
-    seen = []
-    forward = model.net.forward
-    model.net.forward = lambda x, t, label: (seen.append((x.shape[2], label.tolist())), forward(x, t, label))[1]
-    sample = model.sample(condition, steps=1, modalities=("rgb", "depth"))
-    assert seen == [(12, [0]), (12, [500])]
-    assert sample.semantics is None
-    assert sample.rgb is not None
-    model.sample(condition, steps=1, modalities=("semantics",))
-    assert seen[-1] == (12, [1])
-
-
-def test_published_reference_replaces_frame_zero_of_the_colour_only():
-    model, condition = MDM(SEPARATE), some_condition()
-    encoded = model.encode_condition(condition)
-    reference = model.codec.encode_rgb(condition.reference)
-    assert torch.equal(encoded.planes[0, 0, :4], reference)
-    assert torch.equal(encoded.planes[0, 1, :4], model.codec.encode_rgb(condition.color[1]))
-    assert torch.equal(encoded.planes[0, 0, 4:8], model.codec.encode_depth(condition.depth[0]))
-    assert encoded.planes.shape[2] == 8
-
-
-def test_a_grown_model_starts_as_the_same_denoiser():
-    """Further inputs and outputs begin at zero: without given classes, nothing changes."""
-    small, condition = randomised(PLAIN), some_condition()
-    big = mdm.grown(small, TINY)
-    condition = replace(condition, semantics=None, backdrop_semantics=None)
-    x = {
-        m: torch.randn(1, 3, c, 8, 12, generator=torch.Generator().manual_seed(1))
-        for m, c in small.codec.channels.items()
-    }
-    with torch.no_grad():
-        before, _ = small.predict(x, small.encode_condition(condition), torch.tensor([600]))
-        after, _ = big.predict(x, big.encode_condition(condition), torch.tensor([600]))
-    for name in before:
-        assert torch.allclose(before[name], after[name], atol=1e-5), name
+def test_a_model_with_a_new_refiner_has_the_same_denoiser_and_codec():
+    small = randomised(PLAIN)
+    big = mdm.extended(small, TINY)
+    state = big.state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in small.state_dict().items())
+    assert any(name.startswith("refiner.") for name in state)
+    refined = randomised(TINY)
+    again = mdm.extended(refined, replace(TINY, area_px=100)).state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in refined.state_dict().items())
     with pytest.raises(UsageError, match="another kind"):
-        mdm.grown(small, replace(TINY, widths=(16, 32)))
+        mdm.extended(small, replace(TINY, widths=(16, 32)))
 
 
 def test_given_classes_are_copied_where_they_are_known():
     """An untrained denoiser and refiner already say what the condition says, and nothing where it says nothing."""
     model, condition = MDM(TINY).eval(), some_condition()
     blocks = condition.semantics[..., ::4, ::4].repeat_interleave(4, -2).repeat_interleave(4, -1)
-    sample = model.sample(replace(condition, semantics=blocks), steps=1)
+    sample = model.sample(replace(condition, semantics=blocks), SampleRequest(1))
     known = (blocks != 255)[:, 0]
     assert float((sample.semantics == blocks[:, 0])[known].float().mean()) > 0.95
-    without = model.sample(replace(condition, semantics=None, backdrop_semantics=None), steps=1)
+    without = model.sample(replace(condition, semantics=None, backdrop_semantics=None), SampleRequest(1))
     assert float((without.semantics == blocks[:, 0])[known].float().mean()) < 0.2
 
 
@@ -158,9 +129,9 @@ def test_class_scores_are_shares():
 
 def test_known_frames_are_kept():
     model, condition = randomised(TINY), some_condition(frames=4)
-    earlier = model.sample(some_condition(frames=4, seed=9), steps=2, seed=1)
+    earlier = model.sample(some_condition(frames=4, seed=9), SampleRequest(2, seed=1))
     known = {m: z[-2:] for m, z in earlier.latents.items()}
-    sample = model.sample(condition, steps=2, seed=1, known=known)
+    sample = model.sample(condition, SampleRequest(2, seed=1, known=known))
     for name, z in sample.latents.items():
         assert torch.allclose(z[:2], known[name], atol=1e-5), name
         assert not torch.allclose(z[2:], earlier.latents[name][2:], atol=1e-3), name
@@ -184,9 +155,9 @@ def test_frames_and_clips_do_not_leak_across_the_batch():
 
 def test_training_and_inference_attention_agree():
     q, k, v = torch.randn(3, 2, 4, 10, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
-    trained = unet.attend(q, k, v)
+    trained = network.attend(q, k, v)
     with torch.no_grad():
-        fused = unet.attend(q, k, v)
+        fused = network.attend(q, k, v)
     assert torch.allclose(trained, fused, atol=1e-5)
 
 
@@ -198,7 +169,7 @@ def test_temporal_shift_moves_one_eighth_each_way():
     assert torch.equal(moved[:, 4:], x[:, 4:])
 
 
-@pytest.mark.parametrize("config", [TINY, SEPARATE])
+@pytest.mark.parametrize("config", [TINY, PLAIN])
 def test_loss_falls_when_a_clip_is_learnt(config):
     torch.manual_seed(0)
     model, condition = MDM(config), some_condition()
@@ -207,14 +178,12 @@ def test_loss_falls_when_a_clip_is_learnt(config):
         condition.depth[None] * 0.5 + 2,
         torch.randint(0, 19, (1, 3, 16, 24)),
     )
-    truth, encoded = model.encode_truth(rgb, depth, ids), model.encode_condition(condition)
-    shares = mdm.truth_shares(ids)
+    clip = Clip(condition, rgb[0], depth[0], torch.ones_like(condition.valid), ids[0])
     optimizer = torch.optim.Adam(learn_part(model), lr=3e-3)
-    pixels = model.pixel_truth(rgb, depth, ids)
     totals = []
     for step in range(40):
         # the same draws at every fourth step: a falling loss cannot come from an easier draw
-        losses = model.loss(truth, encoded, torch.Generator().manual_seed(step % 4), shares=shares, pixels=pixels)
+        losses = model.loss([clip], BatchPart(0, step % 4, 0, 1), LossSettings())
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
@@ -226,11 +195,8 @@ def test_loss_has_gradients_everywhere():
     model = randomised(TINY)
     condition = some_condition()
     ids = torch.randint(0, 19, (1, 3, 16, 24), generator=torch.Generator().manual_seed(0))
-    losses = model.loss(
-        model.encode_truth(condition.color[None], condition.depth[None], ids), model.encode_condition(condition),
-        torch.Generator().manual_seed(0), shares=mdm.truth_shares(ids),
-        pixels=model.pixel_truth(condition.color[None], condition.depth[None], ids),
-    )  # fmt: skip
+    clip = Clip(condition, condition.color, condition.depth, torch.ones_like(condition.valid), ids[0])
+    losses = model.loss([clip], BatchPart(0, 0, 0, 1), LossSettings())
     losses.total.backward()
     trained = [(n, p) for n, p in model.named_parameters() if not n.startswith("codec.")]
     dead = [n for n, p in trained if p.grad is None or not bool(p.grad.abs().sum() > 0)]
@@ -246,31 +212,19 @@ def test_loss_has_gradients_everywhere():
 def test_measured_depth_is_taken():
     condition = some_condition(frames=1)
     depth = torch.full((1, 1, 16, 24), 120.0)
-    settled = mdm.settle_depth(depth, condition, 100.0)
+    settled = diffusion.settle_depth(depth, condition, 100.0)
     assert torch.equal(settled[condition.valid], condition.depth[condition.valid])
     assert bool((settled[~condition.valid] == 100.0).all())
 
 
-@pytest.mark.parametrize("name", sorted(mdm.EMBEDDED))
+@pytest.mark.parametrize("name", sorted(files.EMBEDDED))
 def test_the_shipped_models_load(name):
-    model = mdm.load(name)
+    model = files.load(name)
     assert model.config.window == 8
-    files = list(mdm.EMBEDDED[name].glob("*.safetensors"))
-    assert all(f.stat().st_size < 16 * 1024 * 1024 for f in files)
-    assert sum(f.stat().st_size for f in files) < (8 if "tiny" in name else 40) * 1024 * 1024
-    assert mdm.facts(name)["held_out"]["clips"] == 24
-
-
-def test_a_start_from_the_condition_keeps_more_of_it_the_less_is_run():
-    model, condition = randomised(TINY), some_condition()
-    start = model.condition_latents(condition)
-    passes = []
-    forward = model.net.forward
-    model.net.forward = lambda *given: (passes.append(int(given[1][0])), forward(*given))[1]
-    model.sample(condition, steps=10, start=start, strength=0.3)
-    assert passes == [299, 199, 99]
-    with pytest.raises(UsageError, match="start from"):
-        model.sample(condition, steps=2, strength=0.3)
+    parts = list(files.EMBEDDED[name].glob("*.safetensors"))
+    assert all(f.stat().st_size < 16 * 1024 * 1024 for f in parts)
+    assert sum(f.stat().st_size for f in parts) < (8 if "tiny" in name else 40) * 1024 * 1024
+    assert files.facts(name)["held_out"]["clips"] == 24
 
 
 @pytest.mark.parametrize("sampler", sorted(noise.SAMPLERS))
@@ -279,19 +233,28 @@ def test_every_sampler_costs_one_pass_per_step_and_repeats_itself(sampler):
     passes = []
     forward = model.net.forward
     model.net.forward = lambda *given: (passes.append(1), forward(*given))[1]
-    first = model.sample(condition, steps=3, sampler=sampler)
+    first = model.sample(condition, SampleRequest(3, sampler=sampler))
     assert len(passes) == 3
-    assert torch.equal(first.rgb, model.sample(condition, steps=3, sampler=sampler).rgb)
+    assert torch.equal(first.rgb, model.sample(condition, SampleRequest(3, sampler=sampler)).rgb)
+
+
+def test_a_setting_that_the_sampler_does_not_take_is_refused():
+    model, condition = randomised(TINY), some_condition()
+    with pytest.raises(UsageError, match="dpm_solver does not take the setting eta"):
+        model.sample(condition, SampleRequest(2, sampler="dpm_solver", eta=0.5))
+    plain, half = (model.sample(condition, SampleRequest(3, eta=eta)).rgb for eta in (None, 0.5))
+    assert torch.equal(plain, model.sample(condition, SampleRequest(3, eta=1.0)).rgb)
+    assert not torch.equal(plain, half)
 
 
 def test_depth_that_contradicts_a_measurement_costs_confidence():
     condition = some_condition(frames=1)
-    same = mdm.depth_agreement(condition.depth, condition)
+    same = diffusion.depth_agreement(condition.depth, condition)
     assert torch.allclose(same, torch.ones_like(same))
     valid = torch.zeros_like(condition.valid)
     valid[..., 8, 12] = True
     alone = replace(condition, valid=valid)
-    off = mdm.depth_agreement(condition.depth * 1.5, alone)
+    off = diffusion.depth_agreement(condition.depth * 1.5, alone)
     assert float(off[0, 0, 8, 12]) == pytest.approx(max(0.2, 1.5**-5), rel=1e-4)
     assert float(off[0, 0, 6, 10]) == pytest.approx(float(off[0, 0, 8, 12]))
     assert float(off[0, 0, 0, 0]) == 1.0
@@ -300,17 +263,17 @@ def test_depth_that_contradicts_a_measurement_costs_confidence():
 def test_confidence_falls_with_change_and_distance():
     seen = torch.zeros(1, 1, 8, 16)
     seen[..., :8] = 1
-    still = mdm.confidence_of(seen, torch.zeros_like(seen), 2)
+    still = diffusion.confidence_of(seen, torch.zeros_like(seen), 2)
     assert float(still[0, 0, 0, 0]) == pytest.approx(1.0)
     assert float(still[0, 0, 0, -1]) == pytest.approx(0.35)
-    moving = mdm.confidence_of(seen, torch.full_like(seen, 0.5), 2)
+    moving = diffusion.confidence_of(seen, torch.full_like(seen, 0.5), 2)
     assert bool((moving < still).all())
 
 
 def test_save_and_load_are_inverse(tmp_path):
     model = randomised(TINY)
-    mdm.save(model, tmp_path / "m", "a card", {"note": 1})
-    loaded = mdm.load(tmp_path / "m")
+    files.save(model, tmp_path / "m", "a card", {"note": 1})
+    loaded = files.load(tmp_path / "m")
     assert loaded.config == model.config
     for name, value in model.state_dict().items():
         assert torch.allclose(loaded.state_dict()[name], value, rtol=1e-3, atol=1e-4), name
@@ -318,32 +281,56 @@ def test_save_and_load_are_inverse(tmp_path):
 
 
 def test_damaged_and_foreign_models_are_refused(tmp_path):
-    mdm.save(randomised(TINY), tmp_path / "m", "", {})
+    files.save(randomised(TINY), tmp_path / "m", "", {})
     weights = next((tmp_path / "m").glob("*.safetensors"))
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(bytes(content))
     with pytest.raises(IntegrityError, match="altered"):
-        mdm.load(tmp_path / "m")
+        files.load(tmp_path / "m")
     with pytest.raises(InputError, match="no diffusion model"):
-        mdm.load(tmp_path / "nothing")
+        files.load(tmp_path / "nothing")
 
 
 def test_configuration_is_strict():
-    values = mdm.config_to_dict(TINY)
-    assert mdm.config_from_dict(values) == TINY
+    values = asdict(TINY)
+    assert files.config_from_dict(values) == TINY
     with pytest.raises(InputError, match="patches"):
-        mdm.config_from_dict({**values, "patches": 3})
-    for change in ({"blocks": (1,)}, {"joint": False}, {"head": "v"}, {"widths": (16, 20)}):
+        files.config_from_dict({**values, "patches": 3})
+    for change in ({"blocks": (1,)}, {"widths": (16, 20)}):
         with pytest.raises(UsageError):
             replace(TINY, **change)
+
+
+def test_models_of_variants_that_were_taken_out_are_refused_in_words():
+    """What the shipped models say of themselves is accepted, every other value of a former field is not."""
+    former = files.FORMER_FIELDS
+    values = {**asdict(TINY), **former["top"], "codec": {**asdict(TINY.codec), **former["codec"]}}
+    assert files.config_from_dict(values) == TINY
+    for name in former["top"]:
+        with pytest.raises(InputError, match=f"no longer has[^$]*{name}"):
+            files.config_from_dict({**values, name: "other"})
+    with pytest.raises(InputError, match="no longer has[^$]*semantics_code"):
+        files.config_from_dict({**values, "codec": {**values["codec"], "semantics_code": "palette"}})
 
 
 def test_wrong_requests_are_refused():
     model = MDM(TINY)
     with pytest.raises(UsageError, match="multiples of 4"):
-        model.sample(some_condition(height=18))
+        model.sample(some_condition(height=18), SampleRequest(1))
     with pytest.raises(UsageError, match="sampler"):
-        model.sample(some_condition(), sampler="magic")
-    with pytest.raises(UsageError, match="modality"):
-        model.sample(some_condition(), modalities=("normals",))
+        model.sample(some_condition(), SampleRequest(1, sampler="magic"))
+    with pytest.raises(UsageError, match="guidance"):
+        model.sample(some_condition(), SampleRequest(1, guidance=2.0))
+
+
+def test_image_size_keeps_aspect_and_area():
+    area = 128 * 192
+    assert diffusion.sized_to_area(area, 480 / 320, 16) == (192, 128)
+    assert diffusion.sized_to_area(area, 1920 / 1280, 16) == (192, 128)
+    width, height = diffusion.sized_to_area(area, 1242 / 375, 16)
+    assert width % 16 == height % 16 == 0
+    assert abs(width / height / (1242 / 375) - 1) < 0.1
+    assert abs(width * height / area - 1) < 0.3
+    assert diffusion.sized_to_width(100, 480 / 320, 16) == (96, 64)
+    assert MDM(TINY).image_size(480, 320) == (192, 128)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.core import fused, losses
+from mudg.core import losses, native_ops
 from mudg.core.table import AdamColumn, torch_adam
 
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
@@ -187,7 +187,7 @@ def test_photometric_equals_its_float64_twin(isa: str, shape: tuple[int, int, in
     prediction, target = _images(shape)
     mine = prediction.clone().requires_grad_()
     exact = prediction.double().requires_grad_()
-    got, want = fused.photometric(mine, target, weight), losses.photometric(exact, target.double(), weight)
+    got, want = native_ops.photometric(mine, target, weight), losses.photometric(exact, target.double(), weight)
     assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
     (3 * got).backward()
     (3 * want).backward()
@@ -202,7 +202,7 @@ def test_weighted_photometric_equals_its_float64_twin(isa: str, shape: tuple[int
     weight = torch.rand(shape[1:], generator=torch.Generator().manual_seed(2)) * (torch.arange(shape[2]) % 5 > 0)
     mine = prediction.clone().requires_grad_()
     exact = prediction.double().requires_grad_()
-    got = fused.photometric(mine, target, 0.4, weight)
+    got = native_ops.photometric(mine, target, 0.4, weight)
     want = losses.photometric(exact, target.double(), 0.4, weight.double())
     assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
     got.backward()
@@ -210,15 +210,15 @@ def test_weighted_photometric_equals_its_float64_twin(isa: str, shape: tuple[int
     assert mine.grad is not None
     assert exact.grad is not None
     assert (mine.grad.double() - exact.grad).norm() <= 2e-6 * exact.grad.norm() + 1e-12
-    whole = fused.photometric(prediction, target, 0.4, torch.ones(shape[1:]))
-    assert whole.item() == pytest.approx(fused.photometric(prediction, target, 0.4).item(), rel=1e-6)
+    whole = native_ops.photometric(prediction, target, 0.4, torch.ones(shape[1:]))
+    assert whole.item() == pytest.approx(native_ops.photometric(prediction, target, 0.4).item(), rel=1e-6)
 
 
 @needs_native
 def test_photometric_of_equal_images_is_zero_and_flat() -> None:
     _, target = _images((3, 30, 40))
     image = target.clone().requires_grad_()
-    value = fused.photometric(image, target)
+    value = native_ops.photometric(image, target)
     value.backward()
     assert abs(value.item()) < 1e-6
     assert image.grad is not None
@@ -232,7 +232,7 @@ def test_photometric_does_not_depend_on_the_number_of_threads(pool: Any) -> None
     for threads in (1, 3):
         native.set_threads(threads)
         image = prediction.clone().requires_grad_()
-        value = fused.photometric(image, target)
+        value = native_ops.photometric(image, target)
         value.backward()
         results.append((value.item(), image.grad))
     assert results[0][0] == results[1][0]
@@ -241,11 +241,11 @@ def test_photometric_does_not_depend_on_the_number_of_threads(pool: Any) -> None
 
 def test_photometric_refuses_what_does_not_fit() -> None:
     with pytest.raises(InputError, match="one shape"):
-        fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 5))
+        native_ops.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 5))
     with pytest.raises(InputError, match="every pixel"):
-        fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 0.2, torch.zeros(1, 4, 4))
+        native_ops.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 0.2, torch.zeros(1, 4, 4))
     with pytest.raises(UsageError, match="SSIM"):
-        fused.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 1.5)
+        native_ops.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 1.5)
 
 
 # ---- means over boxes ----------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def test_box_mean_equals_its_float64_twin(isa: str, shape: tuple[int, ...], size
     generator = torch.Generator().manual_seed(4)
     values, upstream = (torch.randn(shape, generator=generator) for _ in range(2))
     mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
-    got, want = fused.box_mean(mine, size), fused.torch_box_mean(exact, size)
+    got, want = native_ops.box_mean(mine, size), native_ops.torch_box_mean(exact, size)
     assert got.shape == values.shape
     assert (got.double() - want).abs().max() < 1e-6
     got.backward(upstream)
@@ -268,24 +268,24 @@ def test_box_mean_equals_its_float64_twin(isa: str, shape: tuple[int, ...], size
 
 
 def test_box_mean_keeps_constants_and_wants_odd_sizes() -> None:
-    torch.testing.assert_close(fused.box_mean(torch.full((2, 6, 7), 3.0), 5), torch.full((2, 6, 7), 3.0))
+    torch.testing.assert_close(native_ops.box_mean(torch.full((2, 6, 7), 3.0), 5), torch.full((2, 6, 7), 3.0))
     with pytest.raises(UsageError, match="odd"):
-        fused.box_mean(torch.zeros(1, 4, 4), 4)
+        native_ops.box_mean(torch.zeros(1, 4, 4), 4)
 
 
 def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     prediction, target = _images((3, 20, 20))
     parameter, gradient = torch.ones(4, 3), torch.full((4, 3), 0.5)
-    with_library = fused.photometric(prediction, target).item()
+    with_library = native_ops.photometric(prediction, target).item()
     monkeypatch.setattr(native, "_loaded", None)
     monkeypatch.setattr(native, "_problem", "not built: test")
-    assert fused.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
-    fused.adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
+    assert native_ops.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
+    native_ops.adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
     torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
-    torch.testing.assert_close(fused.box_mean(prediction, 3), fused.torch_box_mean(prediction, 3))
+    torch.testing.assert_close(native_ops.box_mean(prediction, 3), native_ops.torch_box_mean(prediction, 3))
     cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
-    torch.testing.assert_close(fused.over(prediction, cover, target), fused.torch_over(prediction, cover, target))
-    got = fused.class_loss(prediction, labels, cover[0], 2.0)
+    torch.testing.assert_close(native_ops.over(prediction, cover, target), native_ops.torch_over(prediction, cover, target))
+    got = native_ops.class_loss(prediction, labels, cover[0], 2.0)
     torch.testing.assert_close(got, losses.class_loss(prediction, labels, cover[0], 2.0))
 
 
@@ -307,7 +307,7 @@ def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int
     weight, lift = torch.rand(shape[1:], generator=generator), 9 * torch.rand(shape[1:], generator=generator)
     mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
     channel = shape[0] - 1
-    got = fused.class_loss(mine, target, weight, 7.0, (channel, lift) if lifted else None)
+    got = native_ops.class_loss(mine, target, weight, 7.0, (channel, lift) if lifted else None)
     want = losses.class_loss(exact, target, weight.double(), 7.0, (channel, lift.double()) if lifted else None)
     assert got.item() == pytest.approx(want.item(), rel=2e-6, abs=1e-6)
     (found,), (true,) = _gradients(3 * got, mine), _gradients(3 * want, exact)
@@ -320,7 +320,7 @@ def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int
 def test_class_loss_shows_a_logit_that_is_not_finite(isa: str, bad: float) -> None:
     logits = torch.zeros(6, 20, 20)
     logits[4, 7, 3] = bad
-    assert not math.isfinite(fused.class_loss(logits, torch.zeros(20, 20, dtype=torch.int64), torch.ones(20, 20), 400.0).item())
+    assert not math.isfinite(native_ops.class_loss(logits, torch.zeros(20, 20, dtype=torch.int64), torch.ones(20, 20), 400.0).item())
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_picture_over_the_sky_equals_its_float64_twin(isa: str, sizes: tuple[tup
     inputs = [torch.rand(shape, generator=generator) for shape in ((channels, height, width), (1, height, width), (channels, *small))]
     upstream = torch.randn(channels, height, width, generator=generator)
     mine, exact = [t.clone().requires_grad_() for t in inputs], [t.double().requires_grad_() for t in inputs]
-    got, want = fused.over(*mine), fused.torch_over(*exact)
+    got, want = native_ops.over(*mine), native_ops.torch_over(*exact)
     torch.testing.assert_close(got.double(), want, rtol=1e-6, atol=2e-6)
     for found, true in zip(_gradients((got * upstream).sum(), *mine), _gradients((want * upstream).sum(), *exact), strict=True):
         torch.testing.assert_close(found, true, rtol=2e-5, atol=2e-5)
@@ -348,7 +348,8 @@ def test_class_loss_and_sky_do_not_depend_on_the_number_of_threads(pool: Any) ->
     for threads in (1, 3):
         native.set_threads(threads)
         leaves = [t.clone().requires_grad_() for t in (logits, coarse, rgb, weight)]
-        value = fused.class_loss(leaves[0], target, weight, 10.0) + fused.over(leaves[2], leaves[3][None], leaves[1]).square().sum()
+        sky = native_ops.over(leaves[2], leaves[3][None], leaves[1])
+        value = native_ops.class_loss(leaves[0], target, weight, 10.0) + sky.square().sum()
         results.append([value.item(), *_gradients(value, *leaves)])
     assert results[0][0] == results[1][0]
     assert all(torch.equal(one, other) for one, other in zip(results[0][1:], results[1][1:], strict=True))
@@ -357,11 +358,11 @@ def test_class_loss_and_sky_do_not_depend_on_the_number_of_threads(pool: Any) ->
 def test_class_loss_and_sky_refuse_what_does_not_fit() -> None:
     logits, target, weight = torch.zeros(3, 4, 4), torch.zeros(4, 4, dtype=torch.int64), torch.ones(4, 4)
     with pytest.raises(InputError, match="class loss"):
-        fused.class_loss(logits, target[:3], weight, 1.0)
+        native_ops.class_loss(logits, target[:3], weight, 1.0)
     with pytest.raises(InputError, match="lift"):
-        fused.class_loss(logits, target, weight, 1.0, (3, weight))
+        native_ops.class_loss(logits, target, weight, 1.0, (3, weight))
     with pytest.raises(InputError, match="over"):
-        fused.over(logits, torch.zeros(1, 4, 5), torch.zeros(3, 2, 2))
+        native_ops.over(logits, torch.zeros(1, 4, 5), torch.zeros(3, 2, 2))
 
 
 # ---- Adam ----------------------------------------------------------------------------------------------------------
@@ -377,7 +378,7 @@ def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: 
     exact = [t.double() for t in mine]
     for step in range(1, 6):
         gradient = torch.randn(shape, generator=generator)
-        fused.adam(mine[0], gradient, mine[1], mine[2], 1e-2, step, visible)
+        native_ops.adam(mine[0], gradient, mine[1], mine[2], 1e-2, step, visible)
         torch_adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
     for got, want in zip(mine, exact):
         torch.testing.assert_close(got.double(), want, rtol=2e-6, atol=2e-6)
@@ -393,7 +394,7 @@ def test_sparse_adam_leaves_invisible_rows_and_their_moments_alone(isa: str) -> 
     gradient = torch.randn(300, 7, generator=generator)
     gradient[~visible] = float("nan")  # never looked at
     exact = [t.double() for t in tensors]
-    fused.adam(tensors[0], gradient, tensors[1], tensors[2], 1e-2, 7, visible)
+    native_ops.adam(tensors[0], gradient, tensors[1], tensors[2], 1e-2, 7, visible)
     torch_adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, 7, visible)
     for now, old, want in zip(tensors, before, exact):
         assert torch.equal(now[~visible], old[~visible])
@@ -405,11 +406,11 @@ def test_adam_moves_every_element_alike_wherever_it_lies(pool: Any) -> None:
     """Same history, same result: bit for bit, at any position, number of threads, dense or sparse."""
     native.set_threads(3)
     values = [torch.full((70_001,), x) for x in (0.3, 0.01, 0.02)]
-    fused.adam(values[0], torch.full((70_001,), 0.7), values[1], values[2], 1e-3, 4)
+    native_ops.adam(values[0], torch.full((70_001,), 0.7), values[1], values[2], 1e-3, 4)
     assert all(len(torch.unique(value)) == 1 for value in values)
     rows = [torch.full((701, 5), x) for x in (0.3, 0.01, 0.02)]
     visible = torch.arange(701) % 3 != 0
-    fused.adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4, visible)
+    native_ops.adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4, visible)
     for dense, sparse in zip(values, rows):
         assert (sparse[visible] == dense[0]).all()
 
@@ -425,9 +426,9 @@ def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str, share: float)
         values[1][~visible] = float("nan")
     alone = [[t[visible].clone() for t in values] for values in together]
     before = [[t.clone() for t in values] for values in together]
-    fused.adam_columns([AdamColumn(*values, rate=0.1 * i) for i, values in enumerate(together, 1)], 3, visible)
+    native_ops.adam_columns([AdamColumn(*values, rate=0.1 * i) for i, values in enumerate(together, 1)], 3, visible)
     for i, values in enumerate(alone, 1):
-        fused.adam(values[0], values[1], values[2], values[3], 0.1 * i, 3)
+        native_ops.adam(values[0], values[1], values[2], values[3], 0.1 * i, 3)
     for values, expected, old in zip(together, alone, before):
         for k in (0, 2, 3):
             assert torch.equal(values[k][visible], expected[k])
@@ -438,7 +439,7 @@ def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str, share: float)
 def test_adam_tells_autograd_that_values_have_changed() -> None:
     weight = torch.ones(5, requires_grad=True)
     loss = (weight * weight).sum()
-    fused.adam(weight.detach(), torch.ones(5), torch.zeros(5), torch.zeros(5), 0.1, 1)
+    native_ops.adam(weight.detach(), torch.ones(5), torch.zeros(5), torch.zeros(5), 0.1, 1)
     with pytest.raises(RuntimeError, match="inplace"):
         loss.backward()
 
@@ -446,7 +447,7 @@ def test_adam_tells_autograd_that_values_have_changed() -> None:
 @needs_native
 def test_adam_drops_moments_too_small_to_matter() -> None:
     parameter, first, second = torch.ones(40), torch.full((40,), 1e-37), torch.full((40,), 1e-37)
-    fused.adam(parameter, torch.zeros(40), first, second, 0.1, 500)
+    native_ops.adam(parameter, torch.zeros(40), first, second, 0.1, 500)
     assert first.abs().max() == 0
     assert second.max() == 0
     assert torch.isfinite(parameter).all()
@@ -455,8 +456,8 @@ def test_adam_drops_moments_too_small_to_matter() -> None:
 def test_adam_refuses_what_does_not_fit() -> None:
     a, b = torch.zeros(4, 2), torch.zeros(4, 3)
     with pytest.raises(InputError, match="one shape"):
-        fused.adam(a, b, a, a, 0.1, 1)
+        native_ops.adam(a, b, a, a, 0.1, 1)
     with pytest.raises(InputError, match="visible"):
-        fused.adam(a, a, a, a, 0.1, 1, torch.ones(3, dtype=torch.bool))
+        native_ops.adam(a, a, a, a, 0.1, 1, torch.ones(3, dtype=torch.bool))
     with pytest.raises(UsageError, match="from 1"):
-        fused.adam(a, a, a, a, 0.1, 0)
+        native_ops.adam(a, a, a, a, 0.1, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,11 +15,14 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
-from mudg.core.edit import object_moved, without_tracks
+from mudg.core import native_ops, quaternions
 from mudg.core.raster.request import harmonics
 from mudg.core.table import Table, torch_adam_columns
-from mudg.models.scene import motion, nodes
-from mudg.models.scene.nodes import RigidNode, SceneModel, SkyNode, StaticNode, compose
+from mudg.models.scene import initial, motion, nodes
+from mudg.models.scene import model as scene_model
+from mudg.models.scene.model import SceneModel, compose
+from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
+from mudg.models.scene.sky import SkyNode
 
 
 def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0.0) -> np.ndarray:
@@ -62,7 +66,7 @@ def test_pose_agrees_with_the_track(time_s):
     position, quat = RigidNode.from_track(track()).pose_at(time_s)
     expected = track().pose_at(time_s)
     assert np.abs(position.detach().numpy() - expected[:3, 3]).max() < 1e-5
-    assert np.abs(nodes.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
+    assert np.abs(quaternions.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
 
 
 @pytest.mark.parametrize("time_s", [-0.01, 2.01, 50.0])
@@ -73,7 +77,7 @@ def test_no_pose_outside_the_span(time_s):
 def test_both_neighbours_rotate():
     """Half way between yaw 0.1 and 0.6 the heading is 0.35; a node that uses one key twice gives 0.1 or 0.6."""
     flat = Track("flat", "car", [4, 2, 1.5], [0.0, 1.0], np.stack([pose(0, 0, 0, 0.1), pose(1, 0, 0, 0.6)]))
-    rotation = nodes.rotation_matrix(RigidNode.from_track(flat).pose_at(0.5)[1]).detach().numpy()
+    rotation = quaternions.rotation_matrix(RigidNode.from_track(flat).pose_at(0.5)[1]).detach().numpy()
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.35, abs=1e-6)
 
 
@@ -82,11 +86,11 @@ def test_learnt_yaw_of_either_key_turns_the_pose_between_them():
     node = RigidNode.from_track(flat, learn_pose=True)
     with torch.no_grad():
         node.offsets["yaw"][1] = 0.4
-    rotation = nodes.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
+    rotation = quaternions.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.1, abs=1e-6)
     with torch.no_grad():
         node.offsets["yaw"][0] = 0.2
-    rotation = nodes.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
+    rotation = quaternions.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.25, abs=1e-6)
 
 
@@ -98,7 +102,7 @@ def test_offsets_act_in_the_frame_of_the_box():
     position, quat = node.pose_at(0.5)
     expected = track().world_from_object[1] @ geometry.yaw_matrix(0.3, (1.0, 0.2, -0.1))
     assert np.abs(position.detach().numpy() - expected[:3, 3]).max() < 1e-5
-    assert np.abs(nodes.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
+    assert np.abs(quaternions.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
 
 
 def test_pose_gradient_reaches_both_keys_and_no_others():
@@ -124,7 +128,7 @@ def test_offsets_are_not_learnt_by_gradient_steps_and_moving_them_shows_at_once(
 
 def test_slerp_gradient_is_finite_for_equal_rotations():
     q = torch.tensor([0.6, 0.0, 0.0, 0.8], requires_grad=True)
-    mixed = nodes.slerp(q, q.detach().clone(), 0.3)
+    mixed = quaternions.slerp(q, q.detach().clone(), 0.3)
     mixed.sum().backward()
     assert torch.isfinite(q.grad).all()
 
@@ -149,8 +153,8 @@ def test_left_product_matrix_is_the_rotation_product(values):
     a, b = torch.tensor(values[:4], dtype=torch.float64), torch.tensor(values[4:], dtype=torch.float64)
     if a.norm() < 0.1 or b.norm() < 0.1:
         return
-    product = nodes.left_product_matrix(a) @ b
-    assert torch.allclose(nodes.rotation_matrix(product), nodes.rotation_matrix(a) @ nodes.rotation_matrix(b), atol=1e-10)
+    product = quaternions.left_product_matrix(a) @ b
+    assert torch.allclose(quaternions.rotation_matrix(product), quaternions.rotation_matrix(a) @ quaternions.rotation_matrix(b), atol=1e-10)
 
 
 # ---- composing ------------------------------------------------------------------------------------------------------
@@ -180,9 +184,8 @@ def test_composed_rotations_turn_the_axes_with_the_box():
 
 def test_colour_bands():
     scene = model(degree=2)
-    full, lowest = compose(scene, 0.3), compose(scene, 0.3, sh_degree=0)
-    assert torch.equal(harmonics(full), torch.cat([scene.table["sh_dc"], scene.table["sh_rest"]], 1))
-    assert torch.equal(harmonics(compose(scene, 0.3, sh_degree=1))[:, 1:], scene.table["sh_rest"][:, :3])
+    assert torch.equal(harmonics(compose(scene, 0.3)), torch.cat([scene.table["sh_dc"], scene.table["sh_rest"]], 1))
+    lowest = compose(model(), 0.3)
     assert lowest.sh.shape == (12, 1, 3)
     assert lowest.sh_rest is None
     assert compose(scene, 0.3, semantics=False).extra is None
@@ -200,15 +203,15 @@ def test_gradients_reach_every_column_of_present_rows():
 
 def test_removing_a_track_equals_composing_without_it():
     scene = model()
-    edited = without_tracks(scene, ["car"])
+    edited = scene.without_nodes(["car"])
     assert edited.node_names() == ("van",)
     full, cut = compose(scene, 5.4), compose(edited, 5.4)
     keep = scene.table.labels["node"] != 1
     assert torch.equal(cut.means, full.means[keep])
     assert cut.node.tolist() == [0] * 5 + [1] * 3
     assert len(scene.table) == 12
-    with pytest.raises(UsageError, match="no moving object 'tram'"):
-        without_tracks(scene, ["tram"])
+    with pytest.raises(UsageError, match="no dynamic object 'tram'"):
+        scene.without_nodes(["tram"])
 
 
 # ---- sky ------------------------------------------------------------------------------------------------------------
@@ -217,6 +220,12 @@ def test_removing_a_track_equals_composing_without_it():
 def looking(yaw: float, width: int = 40, height: int = 30) -> View:
     cam = Camera("c", width, height, 30.0, 30.0, width / 2, height / 2)
     return View(cam, geometry.yaw_matrix(yaw, (100.0, -50.0, 2.0)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
+
+
+def sky_picture(sky: SkyNode, view: View) -> torch.Tensor:
+    """The sky [3, H, W] where nothing covers it."""
+    nothing = torch.zeros(3, view.camera.height, view.camera.width)
+    return native_ops.over(nothing, nothing[:1], sky.coarse_picture(view))
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.5, math.pi, -2.0])
@@ -232,7 +241,7 @@ def test_sky_shows_the_colour_of_the_direction(yaw):
     ])  # fmt: skip
     sky.table.columns["panorama"].detach().copy_(torch.from_numpy(painted).float()[None])
     view = looking(yaw)
-    shown = sky.at(view).detach().numpy()
+    shown = sky_picture(sky, view).detach().numpy()
     u, v = np.meshgrid(np.arange(40) + 0.5, np.arange(30) + 0.5)
     rays = np.stack([(u - 20) / 30, (v - 15) / 30, np.ones_like(u)], -1) @ view.world_from_cam[:3, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -245,7 +254,7 @@ def test_sky_does_not_depend_on_where_the_camera_stands():
         sky.table["panorama"].copy_(torch.rand(1, 3, 16, 32, generator=torch.Generator().manual_seed(0)))
     near = looking(0.4)
     far = View(near.camera, geometry.from_rotation_translation(near.world_from_cam[:3, :3], [0.0, 0.0, 0.0]), 3.0)
-    assert torch.equal(sky.at(near), sky.at(far))
+    assert torch.equal(sky_picture(sky, near), sky_picture(sky, far))
 
 
 def test_sky_filled_from_measured_colours():
@@ -255,7 +264,7 @@ def test_sky_filled_from_measured_colours():
     directions[:, 2] = np.abs(directions[:, 2])
     red = directions[:, 1] > 0
     sky.fill(directions, np.where(red[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]).astype(np.float32))
-    left, right = sky.at(looking(math.pi / 2)), sky.at(looking(-math.pi / 2))
+    left, right = sky_picture(sky, looking(math.pi / 2)), sky_picture(sky, looking(-math.pi / 2))
     assert left[0, 5, 20] > 0.95
     assert right[2, 5, 20] > 0.95
 
@@ -265,7 +274,7 @@ def test_semantics_of_uncovered_pixels_are_sky():
     logits = torch.zeros(3, 2, 2)
     logits[0] = 3.0
     alpha = torch.tensor([[[1.0, 0.0], [0.9, 0.1]]])
-    channel = nodes.composite_semantics(scene, logits, alpha).argmax(0)
+    channel = scene_model.composite_semantics(scene, logits, alpha).argmax(0)
     assert [[scene.classes[c] for c in row] for row in channel.tolist()] == [[ID["road"], ID["sky"]], [ID["road"], ID["sky"]]]
 
 
@@ -283,7 +292,7 @@ def test_state_round_trip_keeps_everything():
         before, after = compose(scene, time_s), compose(again, time_s)
         for name in ("means", "quats", "scales", "opacity", "sh", "extra", "node"):
             assert torch.equal(getattr(before, name), getattr(after, name)), name
-    assert torch.equal(scene.sky.at(looking(0.2)), again.sky.at(looking(0.2)))
+    assert torch.equal(sky_picture(scene.sky, looking(0.2)), sky_picture(again.sky, looking(0.2)))
     assert torch.equal(again.table.moment1["means"], scene.table.moment1["means"])
     assert again.nodes[1].learn_pose
     assert again.facts == {"method": "test"}
@@ -373,16 +382,16 @@ def test_sparse_adam_leaves_unseen_rows_alone():
 
 def test_voxel_filter_keeps_one_per_cell():
     xyz = np.array([[0.01, 0, 0], [0.02, 0, 0], [0.2, 0, 0], [-0.01, 0, 0]], np.float32)
-    assert nodes.voxel_filter(xyz, 0.1).tolist() == [0, 2, 3]
-    mixed = nodes.voxel_filter(np.repeat(xyz, 2, 0) + np.array([0, 50.0, 0]), np.array([0.1, 2.0] * 4))
+    assert initial.voxel_filter(xyz, 0.1).tolist() == [0, 2, 3]
+    mixed = initial.voxel_filter(np.repeat(xyz, 2, 0) + np.array([0, 50.0, 0]), np.array([0.1, 2.0] * 4))
     assert 3 < len(mixed) <= 6
 
 
 def test_starting_columns_show_the_points_colours():
     xyz = np.random.Generator(np.random.PCG64(0)).normal(size=(50, 3)).astype(np.float32)
     rgb = np.random.Generator(np.random.PCG64(1)).integers(0, 256, (50, 3)).astype(np.uint8)
-    made = nodes.columns_from_points(xyz, rgb, np.full(50, ID["car"], np.uint8), (ID["road"], ID["car"]), 1)
-    shown = made["sh_dc"][:, 0] * nodes.SH_C0 + 0.5
+    made = initial.columns_from_points(xyz, rgb, np.full(50, ID["car"], np.uint8), (ID["road"], ID["car"]), 1)
+    shown = made["sh_dc"][:, 0] * initial.SH_C0 + 0.5
     assert np.abs(shown.numpy() * 255 - rgb).max() < 1e-3
     assert (made["semantics"].argmax(1) == 1).all()
     assert torch.allclose(torch.sigmoid(made["logits"]), torch.tensor(0.1))
@@ -392,11 +401,11 @@ def test_starting_columns_show_the_points_colours():
 def test_neighbour_scale_of_a_grid_is_its_pitch():
     axis = np.arange(6) * 0.25
     grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
-    assert nodes.neighbour_scale(grid) == pytest.approx(0.25, abs=1e-5)
+    assert initial.neighbour_scale(grid) == pytest.approx(0.25, abs=1e-5)
 
 
 def test_box_grid_lies_on_the_box():
-    xyz, rgb = nodes.box_grid((4.0, 2.0, 1.5), (10, 20, 30))
+    xyz, rgb = initial.box_grid((4.0, 2.0, 1.5), (10, 20, 30))
     assert (np.abs(xyz) <= 0.5 * np.array([4.0, 2.0, 1.5])).all()
     assert (rgb == [10, 20, 30]).all()
 
@@ -488,7 +497,7 @@ def test_pose_matrix_is_the_learnt_pose():
         position, quat = node.pose_at(time_s)
         matrix = node.pose_matrix(time_s)
         assert np.abs(matrix[:3, 3] - position.detach().numpy()).max() < 1e-5
-        assert np.abs(matrix[:3, :3] - nodes.rotation_matrix(quat).detach().numpy()).max() < 1e-5
+        assert np.abs(matrix[:3, :3] - quaternions.rotation_matrix(quat).detach().numpy()).max() < 1e-5
     assert node.pose_matrix(2.5) is None
 
 
@@ -520,9 +529,11 @@ def test_only_those_with_limbs_deform():
 def test_an_undeformed_node_is_a_rigid_one():
     node, local = walker(), columns(6, 0)
     rigid = RigidNode(node.name, node.label, node.size_m, node.times_s, node.world_from_object)
-    for mine, theirs in zip(node.place(local["means"], local["quats"], 0.17), rigid.place(local["means"], local["quats"], 0.17)):
-        assert torch.equal(mine, theirs)
-    assert node.place(local["means"], local["quats"], 3.0) is None
+    rows = NodeRows(local["means"], local["quats"], torch.sigmoid(local["logits"]), local["sh_dc"])
+    mine, theirs = node.at_time(rows, 0.17), rigid.at_time(rows, 0.17)
+    assert torch.equal(mine.means, theirs.means) and torch.equal(mine.quats, theirs.quats)
+    assert mine.opacity is rows.opacity and mine.sh_dc is rows.sh_dc
+    assert node.at_time(rows, 3.0) is None
 
 
 def test_displacement_interpolates_the_grid_in_space_and_time():
@@ -566,134 +577,45 @@ def test_deformation_settles_between_its_neighbours_and_poses_stay():
     assert node.parameters() is node.offsets
 
 
-# ---- colour over time, mirrors, edits ---------------------------------------------------------------------------------
+# ---- time ------------------------------------------------------------------------------------------------------------
 
 
-def with_time_colour(scene: SceneModel, terms: int = 4) -> SceneModel:
-    moving = int((scene.table.labels["node"] > 0).sum())
-    coefficients = torch.randn(moving, terms, 3, generator=torch.Generator().manual_seed(5))
-    table = Table({k: v.detach() for k, v in scene.table.columns.items()}, scene.table.labels, {"sh_time": coefficients})
-    return SceneModel(table, scene.nodes, scene.sky, scene.classes, scene.sh_degree, scene.facts)
+class Flickering(StaticNode):
+    """Gaussians that drift, show around a moment of their own, and redden: every change over time that a node may make."""
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows:
+        """See ``Node``."""
+        apart_s = time_s - rows.own["shows_at_s"]
+        return replace(
+            rows, means=rows.means + apart_s[:, None], opacity=rows.opacity * torch.exp(-(apart_s**2)), sh_dc=rows.sh_dc + time_s
+        )
 
 
-def test_colour_of_objects_follows_its_fourier_terms():
-    scene = with_time_colour(model())
-    coefficients = scene.table.partial["sh_time"].detach()
-    u = 0.3 / 2.0  # the car's track spans 0..2 s
-    weights = torch.tensor([f(2 * math.pi * k * u) for k in (1, 2) for f in (math.sin, math.cos)])
-    sh = compose(scene, 0.3).sh
-    assert torch.equal(sh[:5], scene.table["sh_dc"][:5])
-    assert torch.allclose(sh[5:9, 0], scene.table["sh_dc"][5:9, 0] + torch.einsum("f,nfc->nc", weights, coefficients[:4]), atol=1e-5)
-    assert compose(without_tracks(scene, ["car", "van"]), 0.3).sh.shape == (5, 1, 3)
-    edited = without_tracks(scene, ["car"])
-    assert torch.equal(compose(edited, 5.3).sh[5:], compose(scene, 5.3).sh[9:])
-
-
-def test_time_colour_survives_saving_and_learns():
-    scene = with_time_colour(model())
-    again = SceneModel.from_state(*scene.state())
-    assert torch.equal(compose(again, 0.7).sh, compose(scene, 0.7).sh)
-    compose(scene, 0.7).sh.sum().backward()
-    before = scene.table.partial["sh_time"].detach().clone()
-    scene.table.adam_step(1, {"sh_time": 0.1}, torch_adam_columns)
-    assert "sh_time" in scene.table.gradients()
-    assert (scene.table.partial["sh_time"].detach() - before).abs().max().item() == pytest.approx(0.1, rel=1e-3)
-    scene.table.clear_gradients()
-    assert not scene.table.gradients()
-
-
-def test_one_key_has_no_phase():
-    assert motion.periodic_weights(1.0, 1.0, 1.0, 4).tolist() == [0, 0, 0, 0]
-
-
-def test_reflection_is_an_involution_and_mirrors_covariances():
-    local = columns(8, 4)
-    means, quats = nodes.reflected(local["means"], local["quats"])
-    assert torch.equal(nodes.reflected(means, quats)[0], local["means"])
-    assert torch.equal(nodes.reflected(means, quats)[1], local["quats"])
-    flip = np.diag([1.0, -1.0, 1.0])
-    for before, after, log_scale in zip(local["quats"], quats, local["log_scales"]):
-        shape = np.diag(np.exp(2 * log_scale.double().numpy()))
-        r0, r1 = (geometry.matrix_from_quaternion(q.double().numpy()) for q in (before, after))
-        assert np.abs(r1 @ shape @ r1.T - flip @ r0 @ shape @ r0.T @ flip).max() < 1e-5
-
-
-def test_mirroring_shows_vehicles_reflected_and_nothing_else():
+def test_a_node_may_change_places_opacities_and_colours_by_columns_of_its_own():
     scene = model()
-    plain, mirrored = compose(scene, 0.3), compose(scene, 0.3, mirrored=True)
-    assert torch.equal(mirrored.means[:5], plain.means[:5])
-    local = scene.table["means"][5:9].detach().numpy() * [1, -1, 1]
-    assert np.abs(mirrored.means[5:9].detach().numpy() - geometry.transform_points(track().pose_at(0.3), local)).max() < 1e-5
-    people = SceneModel(scene.table, (scene.nodes[0], walker(), scene.nodes[2]), scene.sky, scene.classes, 0)
-    assert torch.equal(compose(people, 0.3, mirrored=True).means[5:9], compose(people, 0.3).means[5:9])
+    scene.table.columns["shows_at_s"] = torch.linspace(0, 1, len(scene.table)).requires_grad_()
+    plain = compose(scene, 0.3)
+    scene = SceneModel(scene.table, (Flickering(), *scene.nodes[1:]), scene.sky, scene.classes, 0)
+    changed = compose(scene, 0.3)
+    apart_s = 0.3 - scene.table["shows_at_s"][:5]
+    assert torch.allclose(changed.means[:5], plain.means[:5] + apart_s[:, None])
+    assert torch.allclose(changed.opacity[:5], plain.opacity[:5] * torch.exp(-(apart_s**2)))
+    assert torch.allclose(changed.sh[:5], plain.sh[:5] + 0.3)
+    for name in ("means", "quats", "opacity", "sh"):
+        assert torch.equal(getattr(changed, name)[5:], getattr(plain, name)[5:]), name
+    (changed.means.sum() + changed.opacity.sum()).backward()
+    assert (scene.table["shows_at_s"].grad[:5] != 0).all() and not scene.table["shows_at_s"].grad[5:].any()
 
 
-def test_moving_an_object_equals_moving_its_track():
-    """Edit, then compose == compose what was made from the edited track; also with learnt offsets, and back again."""
-    scene = model(learn_poses=True)
-    move = pose(1.0, -2.0, 0.1, 0.4)
-    edited = object_moved(scene, "car", move)
-    other = Track("car", "car", [4.0, 2.0, 1.5], track().times_s, track().world_from_object @ move)
-    rebuilt = SceneModel(scene.table, (scene.nodes[0], RigidNode.from_track(other), scene.nodes[2]), scene.sky, scene.classes, 0)
-    for time_s in (0.0, 0.3, 1.4):
-        assert torch.allclose(compose(edited, time_s).means, compose(rebuilt, time_s).means, atol=1e-5)
-        assert torch.allclose(compose(edited, time_s).quats.abs(), compose(rebuilt, time_s).quats.abs(), atol=1e-5)
-    with torch.no_grad():
-        scene.nodes[1].offsets["shift"].fill_(0.3)
-    back = object_moved(object_moved(scene, "car", move), "car", geometry.invert(move))
-    assert torch.allclose(compose(back, 0.5).means, compose(scene, 0.5).means, atol=1e-5)
-    with pytest.raises(UsageError, match="no moving object"):
-        object_moved(scene, "tram", move)
-    with pytest.raises(InputError, match="not rigid"):
-        object_moved(scene, "car", np.diag([2.0, 1.0, 1.0, 1.0]))
+def test_columns_that_no_node_changes_are_passed_on_without_a_copy():
+    scene = model()
+    assert compose(scene, 0.3).sh is scene.table["sh_dc"]
+    still = scene.without_nodes(["car", "van"])
+    assert compose(still, 0.3).means is still.table["means"]
 
 
-def partly_tagged(owners: list[int]) -> Table:
-    table = tagged_table(len(owners))
-    node = torch.tensor(owners, dtype=torch.int32)
-    tags = torch.arange(len(owners), dtype=torch.float32)[node > 0]
-    table = Table(
-        {name: value.detach() for name, value in table.columns.items()}, {"node": node, "tag": torch.arange(len(owners))},
-        {"part": tags[:, None].repeat(1, 2)},
-    )  # fmt: skip
-    table.moment1["part"] = 10 * tags[:, None].repeat(1, 2)
-    return table
-
-
-def parts_agree(table: Table) -> bool:
-    tags = table.labels["tag"][table.labels["node"] > 0].float()[:, None].expand(-1, 2)
-    return torch.equal(table.partial["part"], tags) and torch.equal(table.moment1["part"], 10 * tags)
-
-
-@settings(max_examples=40)
-@given(st.lists(st.integers(0, 2), min_size=1, max_size=7), st.data())
-def test_partial_columns_move_with_their_rows(owners, data):
-    table = partly_tagged(owners)
-    rows = data.draw(st.lists(st.integers(0, len(owners) - 1), min_size=1, max_size=9))
-    table.take(torch.tensor(rows))
-    assert table.labels["tag"].tolist() == rows
-    assert parts_agree(table)
-    table.take(torch.argsort(table.labels["node"], stable=True))
-    assert parts_agree(table)
-
-
-def test_appended_rows_copy_partial_values_or_start_at_zero():
-    table = partly_tagged([0, 1, 2, 0])
-    rows = torch.tensor([2, 0])
-    columns_, labels = {n: v.detach()[rows] for n, v in table.columns.items()}, {n: v[rows] for n, v in table.labels.items()}
-    table.append(columns_, labels, like=rows)
-    assert table.partial["part"].tolist() == [[1, 1], [2, 2], [2, 2]]
-    assert table.moment1["part"][:, 0].tolist() == [10, 20, 0]
-    table.append(columns_, labels)
-    assert table.partial["part"][-1].tolist() == [0, 0]
-    with pytest.raises(InputError, match="does not fit its rows"):
-        Table({"a": torch.zeros(2)}, {"node": torch.tensor([0, 1])}, {"part": torch.zeros(2, 1)})
-
-
-def test_selective_steps_move_visible_partial_rows_only():
-    table = partly_tagged([0, 1, 2, 1])
-    before = table.partial["part"].detach().clone()
-    table.partial["part"].grad = torch.ones_like(table.partial["part"])
-    table.adam_step(1, {"part": 0.5}, torch_adam_columns, torch.tensor([True, False, True, False]))
-    changed = (table.partial["part"] - before).abs().sum(1) > 0
-    assert changed.tolist() == [False, True, False]
+def test_colours_over_time_of_older_scenes_are_refused():
+    values, groups = model().state()
+    older = {**groups, "gaussians": {**groups["gaussians"], "partial.sh_time": torch.zeros(7, 4, 3)}}
+    with pytest.raises(InputError, match=r"not supported any more[\s\S]*fit it again"):
+        SceneModel.from_state(values, older)

@@ -1,5 +1,6 @@
 """Noise schedule, prediction algebra and samplers against golden numbers and closed forms."""
 
+import inspect
 import math
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mudg.base.errors import NumericsError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.store import read_safetensors
 from mudg.core import noise
 from mudg.core.noise import Schedule, ScheduleConfig
@@ -60,7 +61,7 @@ def test_ddim_equals_the_reference(golden, case):
 
     schedule = Schedule(ScheduleConfig(base_scale=base))
     made = noise.ddim(
-        denoise, golden["x_T"], schedule, noise.trailing_steps(1000, steps), prediction="v", last="first_alpha"
+        denoise, golden["x_T"], schedule, noise.trailing_steps(1000, steps), prediction="v", eta=0.0, last="first_alpha"
     )
     assert float((made - golden[case]).norm() / golden[case].norm()) < 1e-4
 
@@ -75,22 +76,22 @@ def test_trailing_steps():
             noise.trailing_steps(1000, bad)
 
 
-@pytest.mark.parametrize("prediction", ["x0", "v", "eps"])
+@pytest.mark.parametrize("prediction", ["x0", "v"])
 def test_predictions_invert_the_forward_process(prediction):
     schedule = Schedule()
     x0, eps = torch.randn(2, 5, 3, 4, 4, generator=torch.Generator().manual_seed(1)).unbind(0)
     for t in (0, 300, 900):
         index = torch.full((5,), t)
         x = schedule.add_noise(x0, eps, index)
-        output = {"x0": x0, "v": schedule.velocity(x0, eps, index), "eps": eps}[prediction]
-        alpha, sigma = schedule.at(index, x.ndim)
+        output = {"x0": x0, "v": schedule.velocity(x0, eps, index)}[prediction]
+        alpha, sigma = schedule.alpha_sigma(index, x.ndim)
         back_x0, back_eps = noise.x0_and_eps(x, output, alpha, sigma, prediction)
         assert torch.allclose(back_x0, x0, atol=2e-3)
         assert torch.allclose(back_eps, eps, atol=2e-3)
 
 
-def test_noise_prediction_is_refused_without_signal():
-    with pytest.raises(NumericsError):
+def test_an_unknown_prediction_is_refused():
+    with pytest.raises(UsageError, match="prediction"):
         noise.x0_and_eps(torch.zeros(1), torch.zeros(1), torch.zeros(1), torch.ones(1), "eps")
 
 
@@ -122,17 +123,6 @@ def test_sampler_keeps_a_gaussian():
             draw=lambda g=generator: torch.randn(20000, generator=g),
         )  # fmt: skip
         assert float(made.std()) == pytest.approx(spread, abs=tolerance)
-
-
-def test_ancestral_is_ddim_with_eta_one():
-    def once(sampler, **options):
-        generator = torch.Generator().manual_seed(5)
-        start = torch.randn(64, generator=generator)
-        return sampler(lambda x, t: 0.5 * x, start, Schedule(), noise.trailing_steps(1000, 6), prediction="x0",
-                       draw=lambda: torch.randn(64, generator=generator), **options)  # fmt: skip
-
-    assert torch.equal(once(noise.SAMPLERS["ancestral"]), once(noise.SAMPLERS["ddim"], eta=1.0))
-    assert not torch.equal(once(noise.SAMPLERS["ancestral"]), once(noise.SAMPLERS["ddim"]))
 
 
 def test_stochastic_sampling_needs_a_source():
@@ -203,7 +193,8 @@ def test_second_order_solver_comes_nearer_to_the_exact_flow_than_ddim(prediction
         return (alpha * x - x0) / sigma
 
     def error(sampler, steps):
-        made = sampler(denoise, start, schedule, noise.trailing_steps(1000, steps), prediction=prediction)
+        settings = {"eta": 0.0} if sampler is noise.ddim else {}
+        made = sampler(denoise, start, schedule, noise.trailing_steps(1000, steps), prediction=prediction, **settings)
         return float((made - (mean + spread * start)).abs().max())
 
     ours = [error(noise.dpm_solver, n) for n in (20, 80, 250)]
@@ -239,41 +230,30 @@ def test_first_steps_of_the_second_order_solver_are_those_of_ddim():
     seen = {}
     for sampler in (noise.ddim, noise.dpm_solver):
         estimates = []
-        sampler(denoise, start, schedule, indices, on_step=lambda n, x0, kept=estimates: kept.append(x0))
+        settings = {"eta": 0.0} if sampler is noise.ddim else {}
+        watched = lambda x, t, kept=estimates: kept.append(denoise(x, t)) or kept[-1]  # noqa: E731
+        sampler(watched, start, schedule, indices, **settings)
         seen[sampler] = estimates
     for a, b in zip(seen[noise.ddim], seen[noise.dpm_solver]):
         assert torch.allclose(a, b, atol=1e-5)
 
 
-def test_renoise_forgets_a_wrong_first_estimate():
-    """A denoiser that is wrong at the first step only: fresh noise leaves no trace of it, DDIM carries it on."""
-    schedule = Schedule()
-    indices = noise.trailing_steps(1000, 2)
-    truth = torch.full((1, 4), 0.5)
-    generator = torch.Generator().manual_seed(0)
-    draw = lambda: torch.randn(1, 4, generator=generator)  # noqa: E731
-    visited = {}
-
-    def denoise(x, t):
-        visited[t] = x
-        return truth + (3.0 if t == indices[0] else 0.0)
-
-    made = noise.renoise(denoise, torch.zeros(1, 4), schedule, indices, draw=draw)
-    assert torch.equal(made, truth)
-    expected = schedule.alpha[indices[1]] * (truth + 3.0)
-    generator.manual_seed(0)
-    assert torch.allclose(visited[indices[1]], expected + schedule.sigma[indices[1]] * torch.randn(1, 4, generator=generator))
-    with pytest.raises(UsageError):
-        noise.renoise(denoise, torch.zeros(1, 4), schedule, indices)
-
-
-def test_a_start_from_given_data_runs_the_late_steps_only():
-    indices = noise.trailing_steps(1000, 10)
-    assert noise.partial_steps(indices, 1000, 1.0) == indices
-    assert noise.partial_steps(indices, 1000, 0.5) == [499, 399, 299, 199, 99]
-    assert noise.partial_steps(indices, 1000, 0.01) == [99]
-    with pytest.raises(UsageError):
-        noise.partial_steps(indices, 1000, 0.0)
+def test_every_sampler_takes_its_settings_and_no_other():
+    """The table says what the functions take; what it does not list is refused by the table and by the function."""
+    assert set(noise.SAMPLER_SETTINGS) == set(noise.SAMPLERS)
+    every = {name for names in noise.SAMPLER_SETTINGS.values() for name in names}
+    for sampler, function in noise.SAMPLERS.items():
+        own = set(inspect.signature(function).parameters) - {
+            "denoise", "start", "schedule", "step_indices", "prediction"
+        }  # fmt: skip
+        assert own == set(noise.SAMPLER_SETTINGS[sampler])
+        noise.check_sampler(sampler, own)
+        for name in every - own:
+            with pytest.raises(UsageError, match=f"{sampler} does not take the setting {name}") as refused:
+                noise.check_sampler(sampler, [name])
+            assert f"{name} with ddim" in str(refused.value)
+    with pytest.raises(UsageError, match="unknown sampler"):
+        noise.check_sampler("magic")
 
 
 def test_solver_refuses_what_it_does_not_know():

@@ -19,7 +19,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, project, transform_points
 from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.nuscenes.importer import camera_from_intrinsics, point_times, read_scan
+from mudg.data.importers.nuscenes.sensors import camera_from_intrinsics, point_times, read_scan
 from mudg.data.importers.nuscenes.tables import find_records, iter_records
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import read_points
@@ -318,7 +318,7 @@ def test_point_times_follow_columns_or_azimuth(tmp_path: Path) -> None:
 
 
 def test_intrinsics_get_half_a_pixel() -> None:
-    camera = camera_from_intrinsics("front", 1600, 900, [[1266.4, 0, 816.3], [0, 1266.5, 491.5], [0, 0, 1]], "here")
+    camera = camera_from_intrinsics("front", (1600, 900), [[1266.4, 0, 816.3], [0, 1266.5, 491.5], [0, 0, 1]], "here")
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1266.4, 1266.5, 816.8, 492.0)
 
 

@@ -298,7 +298,7 @@ def times_scaled(factor: float) -> Callable[[Path], None]:
         (points_table(lambda t: t.update(t=t["t"] * 1000)), "do not belong to their frame"),
         (points_table(lambda t: t.update(d=t["d"] + 2)), "LiDAR that does not exist"),
         (points_table(lambda t: t["z"].__setitem__(3, np.nan)), "not finite"),
-        (points_table(lambda t: t.update(x=["a"] * 40)), "not of numbers"),
+        (points_table(lambda t: t.update(x=["a"] * 40)), "does not hold numbers"),
         (box_table("dimensions.y", 0.0), "size makes no sense"),
         (box_table("dimensions.y", -3.0), "size makes no sense"),
         (box_table("dimensions.y", 4500.0), "size makes no sense"),
@@ -364,3 +364,24 @@ def test_the_writer_of_these_tests_turns_yaw_as_documented() -> None:
     assert yaw_of(yaw_matrix(np.pi)) == pytest.approx(np.pi)
     heading = pose_entry(yaw_matrix(np.pi / 2))["heading"]
     assert (heading["w"], heading["z"]) == pytest.approx((np.sqrt(0.5), np.sqrt(0.5)))
+
+
+# --- real data --------------------------------------------------------------------------------------------------------
+
+
+def test_real_points_lie_in_the_boxes_of_their_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    source = shared_data("pandaset_002")
+    scene = ingest(source, tmp_path / "out", frames=(32, 35), cameras=("front",), resolution=320)
+    assert len(scene.frames) == 3
+    assert {sweep.sensor for sweep in scene.sweeps} == {"pandar64", "pandar_gt"}
+    world = world_points(scene, "pandar64", 1)
+    within = beside = 0
+    for track in scene.tracks:
+        pose = track.pose_at(scene.frames[1].view.time_s)
+        if pose is not None and track.label in ("car", "truck", "bus"):
+            local = np.abs(transform_points(invert(pose), world))
+            within += int((local <= track.size_m / 2).all(1).sum())
+            beside += int((local <= track.size_m / 2 + 0.3).all(1).sum())
+    assert len(scene.tracks) == 94
+    assert within > 20_000
+    assert within > 0.9 * beside  # a shell of 0.3 m around the boxes holds few points more

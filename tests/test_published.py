@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +17,17 @@ from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.data.observations import read_observations
-from mudg.models.published import clip, video_unet
+from mudg.models.diffusion import SampleRequest
+from mudg.models.published import clip, files, video_unet
 from mudg.models.published import model as published
 from mudg.models.published.clip import ImageTower, TextTower, TowerConfig
 from mudg.models.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
-from mudg.models.published.model import PublishedConfig, Sampling, choose_trainable
+from mudg.models.published.model import PublishedConfig, WorkSplit, choose_trainable
 from mudg.models.published.resampler import Resampler, ResamplerConfig
 from mudg.models.published.video_unet import VideoUNet, VideoUNetConfig
 from mudg.stages import convert, fuse, synthesize
 from mudg.stages.config import ConvertConfig, FuseConfig, SynthesizeConfig
-from mudg.stages.learning import memory_plan, published_model
+from mudg.stages.learning import memory_plan
 
 GOLDEN = Path(__file__).parent / "golden"
 TOLERANCE = 1e-4
@@ -237,11 +238,11 @@ def test_cuts_of_the_work_do_not_change_the_sample(model):
     condition = some_condition()
     samples = []
     for together in (True, False):
-        model.sampling = Sampling(
+        model.split = WorkSplit(
             modalities_together=together, guidance_together=together, frames_at_once=4 if together else 1
         )
-        samples.append(model.sample(condition, steps=3, seed=5, index=1))
-    model.sampling = Sampling()
+        samples.append(model.sample(condition, SampleRequest(3, seed=5, index=1)))
+    model.split = WorkSplit()
     first, second = samples
     for name, z in first.latents.items():
         assert torch.allclose(z, second.latents[name], rtol=1e-3, atol=1e-3), name
@@ -251,39 +252,21 @@ def test_cuts_of_the_work_do_not_change_the_sample(model):
     assert first.depth.shape == (4, 1, 8, 12)
     assert first.semantics.shape == (4, 8, 12)
     assert 0 <= float(first.confidence.min()) <= float(first.confidence.max()) <= 1
-    again = model.sample(condition, steps=3, seed=5, index=1)
+    again = model.sample(condition, SampleRequest(3, seed=5, index=1))
     assert torch.equal(again.rgb, first.rgb)
-    assert not torch.equal(model.sample(condition, steps=3, seed=5, index=2).rgb, first.rgb)
-
-
-def test_sampling_may_start_from_the_condition_and_runs_the_late_steps_only(model):
-    condition = some_condition()
-    seen = []
-    predict = model.predict
-    model.predict = lambda x, planes, t, *rest: (seen.append(int(t[0])), predict(x, planes, t, *rest))[1]
-    try:
-        model.sampling = Sampling(guidance=1.0)
-        start = model.condition_latents(condition)
-        assert {m: tuple(z.shape) for m, z in start.items()} == dict.fromkeys(("rgb", "depth", "semantics"), (4, 4, 4, 6))
-        model.sample(condition, steps=10, start=start, strength=0.3)
-        assert sorted(set(seen), reverse=True) == [299, 199, 99]
-        with pytest.raises(UsageError, match="start from"):
-            model.sample(condition, steps=2, strength=0.5)
-    finally:
-        model.sampling = Sampling()
-        del model.predict
+    assert not torch.equal(model.sample(condition, SampleRequest(3, seed=5, index=2)).rgb, first.rgb)
 
 
 def test_depth_is_aligned_to_the_points_and_more_samples_only_change_the_confidence(model):
     condition = some_condition()
-    plain = model.sample(condition, steps=2, align=False)
-    aligned = model.sample(condition, steps=2)
+    plain = model.sample(condition, SampleRequest(2, align=False))
+    aligned = model.sample(condition, SampleRequest(2))
     assert plain.depth_fits == ()
     assert len(aligned.depth_fits) == 4
     for before, after, fit in zip(plain.depth, aligned.depth, aligned.depth_fits):
         expected = (fit.scale * before + fit.shift_m).clamp(min=0.1) if fit.used else before
         assert torch.allclose(after, expected)
-    several = model.sample(condition, steps=2, n_samples=2)
+    several = model.sample(condition, SampleRequest(2, n_samples=2))
     assert torch.equal(several.rgb, aligned.rgb)
     assert not torch.equal(several.confidence, aligned.confidence)
 
@@ -294,7 +277,7 @@ def test_guidance_is_that_of_the_schedule_module(model):
         encoded = model.encode_condition(some_condition(), torch.Generator().manual_seed(0))
         tokens = model.image_tokens(torch.cat([encoded.features, encoded.grey]))
         x = torch.randn(1, 4, 4, 4, 6, generator=torch.Generator().manual_seed(1))
-        made = model._guided(encoded, ("depth",), tokens)(x, 700)
+        made = model._guided(encoded, ("depth",), tokens, SampleRequest(1))(x, 700)
         inputs, step = torch.cat([x, encoded.planes], 2), torch.tensor([700])
         fixed = (step, torch.tensor([500]), torch.tensor([10]))
         with_context = model.net(inputs, *fixed, model.text[:1], tokens[:1])
@@ -331,7 +314,7 @@ def test_many_sequences_are_attended_in_parts(monkeypatch):
 def test_other_numbers_of_frames_are_refused(model):
     for frames in (1, 3, 5):
         with pytest.raises(UsageError, match="fixed number of frames"):
-            model.sample(some_condition(frames=frames), steps=1)
+            model.sample(some_condition(frames=frames), SampleRequest(1))
     with pytest.raises(UsageError, match="another number of frames"):
         model.net(
             torch.zeros(1, 3, 12, 4, 6),
@@ -340,7 +323,7 @@ def test_other_numbers_of_frames_are_refused(model):
             torch.zeros(1, 4, 2, 16),
         )
     with pytest.raises(UsageError, match="multiples of 4"):
-        model.sample(some_condition(height=10), steps=1)
+        model.sample(some_condition(height=10), SampleRequest(1))
 
 
 # training -------------------------------------------------------------------------------------------------------------
@@ -362,7 +345,7 @@ def test_a_training_step_moves_what_its_stage_says(stage, temporal):
     moving = choose_trainable(model, stage, temporal)
     model.net.train()
     before = {name: value.detach().clone() for name, value in model.named_parameters()}
-    losses = model.loss(truth, encoded, torch.Generator().manual_seed(4))
+    losses = model.velocity_loss(truth, encoded, torch.Generator().manual_seed(4))
     losses.total.backward()
     torch.optim.AdamW(moving, lr=1e-3).step()
     moved = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
@@ -389,12 +372,12 @@ def test_checkpointing_gives_the_same_gradients():
         moving = choose_trainable(model, 1)
         model.net.train()
         model.net.checkpointing = checkpointing
-        model.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+        model.velocity_loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
         gradients.append(torch.cat([p.grad.flatten() for p in moving]))
     assert error(gradients[1], gradients[0]) < 1e-5
     other = tiny_model()
     choose_trainable(other, 1)
-    other.loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
+    other.velocity_loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
     undropped = torch.cat([p.grad.flatten() for p in other.parameters() if p.requires_grad])
     assert error(undropped, gradients[0]) > 1e-2
 
@@ -409,21 +392,21 @@ def test_loss_is_the_velocity_error_and_repeats(model):
         return torch.zeros_like(x)
 
     original, model.predict = model.predict, stand_in
-    losses = model.loss(truth, encoded, torch.Generator().manual_seed(0))
+    losses = model.velocity_loss(truth, encoded, torch.Generator().manual_seed(0))
     model.predict = original
     x0 = torch.stack([truth[m][n] for n, m in enumerate(seen["names"])])
-    alpha, sigma = model.schedule.at(seen["t"], 5)
+    alpha, sigma = model.schedule.alpha_sigma(seen["t"], 5)
     scale = model.schedule.scale[seen["t"]].view(-1, 1, 1, 1, 1)
     eps = (seen["x"] - alpha * scale * x0) / sigma
     wanted = (alpha * eps - sigma * scale * x0).square().mean()
     assert float(losses.total.detach()) == pytest.approx(float(wanted), rel=1e-4)
-    one, two = (float(model.loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2))
+    one, two = (float(model.velocity_loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2))
     assert one == two
 
 
 def test_shares_of_modalities_and_missing_context(model):
     truth, encoded = batch_of(model, 1)
-    many = published.Encoded(
+    many = published.PublishedLatents(
         encoded.planes.expand(4000, -1, -1, -1, -1), encoded.features.expand(4000, -1, -1), encoded.grey, encoded.seen
     )
     small = {m: z[:, :1, :1, :1, :1].expand(4000, -1, -1, -1, -1) for m, z in truth.items()}
@@ -435,7 +418,7 @@ def test_shares_of_modalities_and_missing_context(model):
 
     original, model.predict = model.predict, stand_in
     tower, model.image_tokens = model.image_tokens, torch.nn.Identity()
-    model.loss(small, many, torch.Generator().manual_seed(0))
+    model.velocity_loss(small, many, torch.Generator().manual_seed(0))
     model.predict, model.image_tokens = original, tower
     share = lambda flags: float(torch.tensor(flags).float().mean())  # noqa: E731
     for name, wanted in (("rgb", 0.5), ("semantics", 0.25), ("depth", 0.25)):
@@ -451,12 +434,12 @@ def test_shares_of_modalities_and_missing_context(model):
 
 
 def test_configuration_is_strict():
-    values = json.loads(json.dumps(published.config_to_dict(TINY)))
-    assert published.config_from_dict(values) == TINY
+    values = json.loads(json.dumps(asdict(TINY)))
+    assert files.config_from_dict(values) == TINY
     with pytest.raises(InputError, match="unknown lens"):
-        published.config_from_dict({**values, "lens": 3})
+        files.config_from_dict({**values, "lens": 3})
     with pytest.raises(InputError, match="wrong type"):
-        published.config_from_dict({**values, "fps": "ten"})
+        files.config_from_dict({**values, "fps": "ten"})
     with pytest.raises(UsageError, match="context"):
         replace(TINY, text=TowerConfig(32, 2, 2))
 
@@ -527,9 +510,9 @@ def test_the_reference_fits_only_where_it_was_taken(street):
     view = scene.frames_of("front")[1].view
     moved = view.world_from_cam.copy()
     moved[:3, 3] += [0.0, 1.0, 0.0]
-    assert published_model.reference_fits(view, recorded)
-    assert not published_model.reference_fits(View(view.camera, moved, view.time_s), recorded)
-    assert not published_model.reference_fits(view, [])
+    assert synthesize.taken_there(view, recorded)
+    assert not synthesize.taken_there(View(view.camera, moved, view.time_s), recorded)
+    assert not synthesize.taken_there(view, [])
 
 
 def test_short_trajectories_are_refused_in_words(street, tmp_path):
@@ -544,22 +527,23 @@ def test_short_trajectories_are_refused_in_words(street, tmp_path):
 
 
 def test_models_come_back_as_they_were(street, model):
-    loaded = published_model.read(street / "model")
+    loaded = files.load(street / "model")
     condition = some_condition()
     loaded.text.copy_(model.text)
-    assert torch.equal(loaded.sample(condition, steps=2).rgb, model.sample(condition, steps=2).rgb)
+    assert torch.equal(loaded.sample(condition, SampleRequest(2)).rgb, model.sample(condition, SampleRequest(2)).rgb)
 
 
 def test_full_size_fits_ten_gigabytes():
     """Counted, not run: see docs/published.md for the table."""
     needs = memory_plan.needs_of(PublishedConfig(), 2)
     assert needs.parameters == pytest.approx(4.41e9, rel=0.01)
-    plan = memory_plan.choose(needs, 10_000_000_000)
-    assert plan.peak_bytes <= 10_000_000_000
+    plan, peak_bytes = memory_plan.choose(needs, 10_000_000_000)
+    assert peak_bytes <= 10_000_000_000
     assert (plan.modalities_together, plan.guidance_together) == (False, False)
-    unguided = memory_plan.choose(needs, 15_000_000_000, guidance=False)
-    assert (unguided.modalities_together, unguided.denoise_bytes) == (True, 3 * needs.one_video)
-    roomy = memory_plan.choose(needs, 80_000_000_000)
+    unguided, peak_bytes = memory_plan.choose(needs, 15_000_000_000, guidance=False)
+    assert unguided.modalities_together
+    assert peak_bytes == needs.parameters + 3 * needs.one_video + memory_plan.RESERVE_BYTES
+    roomy, _ = memory_plan.choose(needs, 80_000_000_000)
     assert (roomy.modalities_together, roomy.guidance_together, roomy.frames_at_once) == (True, True, 16)
 
 

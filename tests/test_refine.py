@@ -1,13 +1,11 @@
-"""The pixel-level part of the diffusion model: what is copied, what the loss asks for, shapes."""
-
-import math
+"""The pixel-level part of the diffusion model: what is copied, shapes."""
 
 import pytest
 import torch
 
-from mudg.models.mdm import refine
+from mudg.models.mdm import network
 from mudg.models.mdm.codec import CodecConfig, PatchCodec
-from mudg.models.mdm.refine import ConditionPixels, PixelTruth, Refined, Refiner
+from mudg.models.mdm.network import ConditionPixels, Refiner
 
 
 def some(count=4, height=16, width=24, seed=0):
@@ -34,7 +32,7 @@ def test_open_gates_hand_the_condition_through():
     assert torch.allclose(made.rgb, given.color + torch.sigmoid(torch.tensor(-4.0)) * (given.backdrop - given.color), atol=1e-5)
     shown = given.ids.squeeze(1).long()
     gained = (made.scores - base).gather(1, shown.unsqueeze(1))
-    assert float(gained.min()) > refine.COPY_SCORE - 0.01
+    assert float(gained.min()) > network.COPY_SCORE - 0.01
 
 
 def test_shut_gates_leave_what_the_codec_makes():
@@ -50,7 +48,7 @@ def test_shut_gates_leave_what_the_codec_makes():
 
 def test_shares_of_known_classes():
     ids = torch.tensor([[3, 3, 255, 255], [3, 7, 255, 1]], dtype=torch.uint8).view(1, 1, 2, 4)
-    share = refine.shares(ids)
+    share = network.shares(ids)
     assert share.shape == (1, 19, 1, 2)
     assert share[0, 3, 0].tolist() == [0.75, 0.0]
     assert share[0, 7, 0].tolist() == [0.25, 0.0]
@@ -70,26 +68,6 @@ def test_a_crop_is_refined_as_in_the_whole_image_away_from_its_border():
     assert not torch.allclose(part.rgb[..., :4, :4], whole.rgb[..., 8:12, 8:12], atol=1e-4)
 
 
-def test_loss_terms_at_known_values():
-    """Everything right: no error, and the stated scale costs its own logarithm. Colour off by 0.1: L1 and square."""
-    ids = torch.randint(0, 19, (1, 4, 4), generator=torch.Generator().manual_seed(0))
-    scores = 50.0 * torch.nn.functional.one_hot(ids, 19).movedim(-1, 1).float()
-    rgb, code = torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4)
-    truth = PixelTruth(rgb, code, ids)
-    right = refine.refine_loss(Refined(rgb, code, scores, torch.full_like(code, -3.0)), truth)
-    assert float(right["pixel_rgb"]) == 0
-    assert float(right["pixel_depth"]) == 0
-    assert float(right["pixel_semantics"]) == pytest.approx(0, abs=1e-6)
-    assert float(right["pixel_error"]) == pytest.approx(0.05 * -3.0)
-    off = refine.refine_loss(Refined(rgb + 0.1, code, scores, code), truth)
-    assert float(off["pixel_rgb"]) == pytest.approx(0.1 + 2 * 0.01, rel=1e-5)
-    apart = refine.refine_loss(Refined(rgb, code + 0.1, scores, code), truth, log_per_code=2.0)
-    share = 1 + 2 * float((ids == refine.SKY).float().mean())
-    assert float(apart["pixel_depth"]) == pytest.approx(5 * share * (math.expm1(0.2) - 0.0025), rel=1e-4)
-    unlabelled = refine.refine_loss(Refined(rgb, code, scores, code), PixelTruth(rgb, code, torch.full_like(ids, 255)))
-    assert float(unlabelled["pixel_semantics"]) == 0
-
-
 def test_class_weights_are_taken_back():
     codec, refiner, latents, given = some()
     weights = torch.linspace(0.5, 3.0, 19)
@@ -101,13 +79,3 @@ def test_class_weights_are_taken_back():
     assert torch.allclose(lost, weights.log().view(1, -1, 1, 1).expand_as(lost), atol=1e-5)
     assert torch.equal(before.rgb, after.rgb)
     assert torch.equal(before.depth_code, after.depth_code)
-
-
-def test_the_stated_error_does_not_move_the_colour():
-    rgb = torch.full((1, 3, 4, 4), 0.3, requires_grad=True)
-    log_error = torch.full((1, 1, 4, 4), -1.0, requires_grad=True)
-    ids = torch.zeros(1, 4, 4, dtype=torch.long)
-    made = Refined(rgb, torch.zeros(1, 1, 4, 4), torch.zeros(1, 19, 4, 4), log_error)
-    refine.refine_loss(made, PixelTruth(torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4), ids))["pixel_error"].backward()
-    assert rgb.grad is None or float(rgb.grad.abs().sum()) == 0
-    assert float(log_error.grad.sum()) > 0 or float(log_error.grad.sum()) < 0

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from toy_world import CAR_SIZE, car_pose, fused_cloud, write_scene
 
 from mudg.base import geometry, store
@@ -17,7 +18,7 @@ from mudg.data.exporters.video import read_mp4
 from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scene import read_scene
 from mudg.stages import fit, render
-from mudg.stages.config import FitConfig, RenderConfig
+from mudg.stages.config import RenderConfig
 
 FRAMES = 4
 SHIFTS = (0.0, 2.0, -3.0)
@@ -28,7 +29,7 @@ def world(tmp_path_factory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("world")
     write_scene(root / "scene", frames=FRAMES, cameras=("front", "left"), width=60, height=40)
     write_fused(root / "fuse", fused_cloud(FRAMES), {})
-    config = FitConfig(method="street_gaussians", iterations=60, initial_gaussians=900, max_gaussians=1500)
+    config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
     fit.run(config, root / "scene", root / "fuse", root / "fit")
     return {"scene": root / "scene", "model": root / "fit"}
 
@@ -102,7 +103,7 @@ def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     row, column = int(uv[0, 1]), int(uv[0, 0])
     assert with_car.semantics[row, column] == ID["car"]
     assert seen.semantics[row, column] != ID["car"]
-    with pytest.raises(UsageError, match="no moving object 'tram'"):
+    with pytest.raises(UsageError, match="no dynamic object 'tram'"):
         render.run(RenderConfig(remove_tracks=("tram",)), world["scene"], world["model"], tmp_path / "other")
 
 

@@ -1,4 +1,4 @@
-"""The report page: self-contained, honest words, right pictures."""
+"""The report page: self-contained, escaped, says what the numbers say, right pictures."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import html.parser
 import io
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,12 @@ import numpy as np
 import pytest
 import torch
 import toy_views
+from jinja2 import UndefinedError
 
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
+from mudg.report import html as report_html
 from mudg.report import page as report_page
 from mudg.report import run_report
 from mudg.stages import score
@@ -119,6 +122,41 @@ def test_texts_from_outside_are_escaped(page: str) -> None:
     assert "&lt;toy&gt; &amp; co" in page
 
 
+EVIL = '"><script>alert(1)</script>'
+
+
+def test_names_from_a_scene_cannot_become_tags(tmp_path: Path) -> None:
+    """Names of scenes, cameras, trajectories, methods, metrics and steps come from files of others."""
+    out = finished_run(tmp_path)
+    scores = store.read_json(out / "score" / "metrics.json")
+    method = scores["methods"][0]["name"]
+
+    def renamed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {renamed(k): renamed(v) for k, v in value.items()}
+        if isinstance(value, list):
+            return [renamed(v) for v in value]
+        return value.replace("front", EVIL).replace(method, EVIL) if isinstance(value, str) else value
+
+    spoilt = renamed(scores)
+    spoilt["scene"] |= {"id": EVIL, "dataset": EVIL, "licence": EVIL, "notes": [EVIL]}
+    spoilt["methods"][0]["title"] = spoilt["metrics"][0]["title"] = spoilt["metrics"][0]["unit"] = EVIL
+    video = report_page.TrajectoryVideo(
+        EVIL, EVIL, 2.0, 8, 8, 1, {EVIL: ("rgb",)}, "data:video/mp4;base64,AA==", "data:image/jpeg;base64,AA=="
+    )
+    page = report_page.page(spoilt, {"steps": {EVIL: {"seconds": 1.0}}}, EVIL, [video], [EVIL])
+    outline(page)
+    assert "<script>alert" not in page and page.count("alert(1)") > 10
+    data = re.search(r'<script type="application/json" id="player-data">(.*?)</script>', page, re.S)
+    assert data is not None and json.loads(data[1])["columns"] == [EVIL]
+    assert all("alert" not in (a.get("style") or "") for _, a in outline(page).tags)
+
+
+def test_a_value_that_a_template_lacks_is_an_error() -> None:
+    with pytest.raises(UndefinedError, match="title"):
+        report_html.render("labels.html.j2")
+
+
 def test_videos_hold_all_panels_and_play(page: str) -> None:
     import av
 
@@ -143,20 +181,20 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
     course = next(c for c in scores["trajectories"] if c["shift_m"] == 0)
     columns = run_report._columns(course, folders)
     assert columns.has_truth
-    panels = {c: tuple(run_report._modalities(columns, c)) for c in columns.sets}
+    panels = {c: (run_report._rows(columns, c)) for c in columns.sets}
     assert panels["truth"] == ("rgb", "depth", "semantics")
     assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
     assert "mudg_r" not in panels
-    atlas = next(run_report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
+    atlas = next(run_report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
     h, w = toy_views.HEIGHT, toy_views.WIDTH
-    assert np.array_equal(atlas[:h, :w], toy_views.colours(0))
-    assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colours(0) * 0.8)).max() <= 1
+    assert np.array_equal(atlas[:h, :w], toy_views.colors(0))
+    assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colors(0) * 0.8)).max() <= 1
     assert (atlas[h : 2 * h, :w][np.isnan(toy_views.depths())] == 0).all()
     assert tuple(atlas[2 * h, 0]) == (70, 130, 180)  # sky in the usual colour
     assert (atlas[:h, 2 * w : 3 * w] == 24).all()  # not produced
 
 
-def test_a_shifted_view_of_a_log_shows_the_driven_line_beside_it(tmp_path: Path) -> None:
+def test_a_shifted_view_of_a_log_shows_the_recorded_path_beside_it(tmp_path: Path) -> None:
     out = finished_run(tmp_path)
     scores = store.read_json(out / "score" / "metrics.json")
     folders = run_report._folders(out, scores)
@@ -165,10 +203,10 @@ def test_a_shifted_view_of_a_log_shows_the_driven_line_beside_it(tmp_path: Path)
     assert not columns.has_truth
     assert columns.sets["truth"].trajectory == "front_recorded"
     assert list(columns.indices["truth"]) == [0, 1, 2, 3]
-    panels = {c: tuple(run_report._modalities(columns, c)) for c in columns.sets}
+    panels = {c: (run_report._rows(columns, c)) for c in columns.sets}
     assert all("error" not in rows for rows in panels.values())
-    atlas = next(run_report._atlases(columns, list(folders), panels, toy_views.WIDTH, toy_views.HEIGHT))
-    assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colours(0))
+    atlas = next(run_report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
+    assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colors(0))
 
 
 def run_of(psnr: dict[tuple[str, float], float | str], truth: str = "exact") -> dict[str, Any]:
@@ -196,7 +234,7 @@ def test_headline_says_what_the_numbers_say() -> None:
         {(both[0], 0.0): 20.0, (both[1], 0.0): 21.0, (both[0], 2.0): "no truth", (both[1], 2.0): "no truth"}, "recorded"
     )
     title, words = report_page.headline(recorded)
-    assert "nobody drove" in title
+    assert title == "toy: views off the recorded path"
     assert "21.0 dB with diffusion and 20.0 dB without" in words
 
 

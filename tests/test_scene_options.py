@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base.errors import InputError, NumericsError
@@ -19,19 +20,17 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.cloudfile import write_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import SceneWriter, read_scene
-from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
-from mudg.models.scene.nodes import DeformableNode, compose
+from mudg.models.scene.model import compose
+from mudg.models.scene.nodes import DeformableNode
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
-from mudg.stages.fitting import start as fit_start
 from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.start import mirrored_points
-from mudg.stages.ingest import add_frame_copy, add_rest
 
 SIZE, FRAMES = (60, 40), 6
 EVERYTHING = {
-    "learn_poses": True, "deformable": True, "color_terms": 4, "mirror_start": True, "mirror_probability": 0.3, "exposure": "image",
-    "learn_cameras": True, "virtual_appearance": True, "outlier_deviations": 4.0, "object_weight": 0.1, "pose_start": 0.3,
+    "poses__learn": True, "poses__start": 0.3, "objects__deformable": True, "objects__mirror_start": True,
+    "appearance__exposure": "image", "appearance__cameras": True, "appearance__virtual": True, "loss__object_weight": 0.1,
 }  # fmt: skip
 
 
@@ -49,9 +48,9 @@ def walker_cloud() -> PointCloud:
 
 def with_tracks(scene: Scene, tracks: tuple[Track, ...], out: Path) -> Scene:
     with SceneWriter(out, scene.id, scene.source) as writer:
-        add_rest(writer, replace(scene, tracks=tracks))
+        writer.copy_all_but_frames(replace(scene, tracks=tracks))
         for frame in scene.frames:
-            add_frame_copy(writer, scene, frame)
+            writer.copy_frame(scene, frame)
         return writer.finish()
 
 
@@ -71,9 +70,9 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:
-    small = {"iterations": 30, "initial_gaussians": 700, "max_gaussians": 1200, "checkpoint_every": 1000, "preview_every": 1000,
-             "virtual_probability": 0.4}  # fmt: skip
-    return FitConfig(method=method, **{**small, **EVERYTHING, **changes})
+    small = {"iterations": 30, "start__gaussians": 700, "densify__max_gaussians": 1200, "checkpoint_every": 1000, "preview_every": 1000,
+             "virtual__probability": 0.4}  # fmt: skip
+    return fit_config(method=method, **{**small, **EVERYTHING, **changes})
 
 
 def fitted_bytes(folder: Path) -> dict[str, bytes]:
@@ -108,7 +107,6 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
     walker = next(node for node in model.nodes if node.name == "walker")
     assert isinstance(walker, DeformableNode)
     assert walker.offsets["deform"].detach().abs().max().item() > 0
-    assert model.table.partial["sh_time"].detach().abs().max().item() > 0
     assert model.nodes[1].offsets["shift"].detach().abs().max().item() > 0
 
 
@@ -124,20 +122,6 @@ def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
         assert torch.equal(mine.rgb, theirs.rgb)
 
 
-def test_cloned_and_split_rows_of_objects_stay_aligned(world, tmp_path):
-    """After a densification every partial column still fits, and composing works at every time."""
-    folder = fit.run(
-        settings(iterations=4), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"]
-    )
-    model = fit.load_model(folder)
-    rows = len(model.table)
-    stats = DensifyStats(torch.rand(rows, generator=torch.Generator().manual_seed(0)), torch.ones(rows))
-    densify(model, stats, 10, DensifySettings(1, 10, 1, 0.5, 0.5, 0.05), 0)
-    assert len(model.table) != rows
-    assert len(model.table.partial["sh_time"]) == int((model.table.labels["node"] > 0).sum())
-    assert compose(model, 0.6).sh.shape == (len(model.table), 1, 3)
-
-
 @pytest.mark.slow
 def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(world, tmp_path):
     path = trajectory.shifted(read_scene(world["scene"]), "front", 2.0)
@@ -150,12 +134,11 @@ def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(worl
     for own in (False, True):
         config = settings(
             iterations=150,
-            exposure="none",
-            learn_cameras=False,
-            learn_poses=False,
-            virtual_appearance=own,
-            virtual_seen_weight=1.0,
-            virtual_beside=False,  # where the recorded path gives steps away, it suffers most
+            appearance__exposure="none",
+            appearance__cameras=False,
+            poses__learn=False,
+            appearance__virtual=own,
+            virtual__beside=False,  # where the recorded path gives steps away, it suffers most
         )
         folder = fit.run(config, world["scene"], world["fuse"], tmp_path / str(own), observations=tmp_path / "dark")
         view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
@@ -199,28 +182,25 @@ def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_no_sky_at_all_and_nothing_but_sky(world, share):
     scene = read_scene(world["scene"])
-    frames = fit_views.training_frames(scene, ())
-    classes = fit_views.classes_of(scene, frames, None)
-    views = fit_views.load_recorded(scene, frames, classes, 0, with_lidar=True)
-    views = tuple(replace(view, sky=np.full(view.rgb.shape[:2], share > 0)) for view in views)
     config = settings("street_gaussians", iterations=4)
-    cloud = fused_cloud(FRAMES)
-    state = fit.start_state(config, fit.RECIPES[config.method], scene, cloud, fit_views.ViewSet(views, ()), classes)
+    views, classes = fit.recorded_views(config, scene)
+    recorded = tuple(replace(view, sky=np.full(view.rgb.shape[:2], share > 0)) for view in views.recorded)
+    state = fit.start_state(config, scene, fused_cloud(FRAMES), replace(views, recorded=recorded), classes)
     assert torch.isfinite(state.model.sky.table["panorama"]).all()
-    seen = fit.render_view(state.model, views[0].view, RasterConfig())
+    seen = fit.render_view(state.model, recorded[0].view, RasterConfig())
     assert torch.isfinite(seen.rgb).all()
 
 
 def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
-    sample = fit_views.StoredView.sample
+    sample = fit_views.StoredView.as_tensors
 
-    def poisoned(self, unseen=None):
-        made = sample(self, unseen)
+    def poisoned(self):
+        made = sample(self)
         if made.name == "front/000002":
-            made.observation.rgb[0, 3, 4] = float("nan")
+            made.rgb[0, 3, 4] = float("nan")
         return made
 
-    monkeypatch.setattr(fit_views.StoredView, "sample", poisoned)
+    monkeypatch.setattr(fit_views.StoredView, "as_tensors", poisoned)
     with pytest.raises(NumericsError, match=r"view front/000002, step \d"):
         fit.run(settings("street_gaussians"), world["scene"], world["fuse"], tmp_path / "fit")
 
@@ -246,16 +226,3 @@ def test_mirrored_points_appear_where_nothing_was_measured():
     assert np.allclose(other, side * [1, -1, 1])
     assert len(mirrored_points(np.concatenate([side, other]))[0]) == 0
     assert len(mirrored_points(side[:0])[0]) == 0
-
-
-def test_lonely_points_are_found_and_regular_ones_kept():
-    grid = (
-        np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0], indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
-        * 0.2
-    )
-    jitter = np.random.Generator(np.random.PCG64(0)).normal(0, 0.02, grid.shape).astype(np.float32)
-    far = np.array([[3.0, 3.0, 6.0]], np.float32)
-    found = fit_start._lonely(np.concatenate([grid + jitter, far]), np.array([[3.0, 3.0, 1.5]], np.float32), 6.0)
-    assert found[-1]
-    assert found[:-1].mean() < 0.03
-    assert not fit_start._lonely(grid[:4], grid[:1], 3.0).any()

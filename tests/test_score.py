@@ -14,6 +14,7 @@ import toy_views
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
+from mudg.core.pictures import resize_nearest
 from mudg.report import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
@@ -80,10 +81,10 @@ def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -
 
 
 def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Path) -> None:
-    def colour_only(_index: int, seen: Observation) -> Observation:
+    def color_only(_index: int, seen: Observation) -> Observation:
         return dataclasses.replace(seen, depth=None, semantics=None)
 
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), colour_only)
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), color_only)
     document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
     assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
     assert value(document, "a", "front_recorded", "miou") == "not produced"
@@ -129,15 +130,15 @@ def test_methods_of_other_sizes_are_compared_at_the_cameras_size(tmp_path: Path,
     course = document["trajectories"][0]
     assert (course["width"], course["height"]) == (toy_views.WIDTH, toy_views.HEIGHT)
     assert value(document, "b", "front_recorded", "psnr") == 100.0
-    grey = [np.mean((128 / 255 - toy_views.colours(i) / 255) ** 2) for i in (1, 3)]  # stored as 8 bits: 0.5 becomes 128
+    grey = [np.mean((128 / 255 - toy_views.colors(i) / 255) ** 2) for i in (1, 3)]  # stored as 8 bits: 0.5 becomes 128
     expected = float(np.mean([-10 * math.log10(e) for e in grey]))
     assert value(document, "a", "front_recorded", "psnr") == pytest.approx(expected, abs=1e-3)
 
 
 def test_nearest_resize_mixes_nothing() -> None:
     ids = torch.tensor([[[0, 1], [2, 3]]])
-    assert score.resize_nearest(ids, 4, 4).tolist() == [[[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 3, 3], [2, 2, 3, 3]]]
-    assert score.resize_nearest(torch.arange(16).reshape(1, 4, 4), 2, 2).tolist() == [[[5, 7], [13, 15]]]
+    assert resize_nearest(ids, 4, 4).tolist() == [[[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 3, 3], [2, 2, 3, 3]]]
+    assert resize_nearest(torch.arange(16).reshape(1, 4, 4), 2, 2).tolist() == [[[5, 7], [13, 15]]]
 
 
 def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Path) -> None:

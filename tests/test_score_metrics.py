@@ -1,4 +1,4 @@
-"""Perceptual distance, flicker and movers: order of known degradations, known values, and what the scorer does with them."""
+"""Perceptual distance, flicker and dynamic objects: order of known degradations, known values, and what the scorer does with them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torch.nn import functional
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, View
-from mudg.core import metrics
+from mudg.core import metrics, perceptual
 from mudg.core.metrics import Pair
 from mudg.data.city import CityConfig, CityWorld
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.report import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
@@ -46,8 +46,8 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def distance():
-    perceptual = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
-    return lambda made, truth, mask=None: perceptual(pair(rgb=made, truth_rgb=truth, mask=mask))
+    perceptual_of = PerceptualDistance(CodecFeatures(files.load("embedded").codec))
+    return lambda made, truth, mask=None: perceptual_of(pair(rgb=made, truth_rgb=truth, mask=mask))
 
 
 def blurred(rgb, sigma):
@@ -113,17 +113,45 @@ def test_only_masked_in_pixels_count_and_odd_sizes_work(pictures, distance):
     assert distance(spoilt, truth, mask) < 1e-6 < distance(spoilt, truth)
 
 
-def test_perceptual_distance_by_hand():
+def lpips(prediction, truth, **more):
+    return float(perceptual.lpips_distance(prediction, perceptual.unit_features(truth), **more))
+
+
+def test_lpips_distance_by_hand():
     a, b = torch.tensor([[[3.0, 1.0]], [[4.0, 0.0]]]), torch.tensor([[[6.0, 0.0]], [[8.0, 2.0]]])
     # First place: the same direction; second: right angles, squared distance of unit vectors 2.
-    assert metrics.perceptual_distance([a], [b]) == pytest.approx(1.0, abs=1e-5)
-    assert metrics.perceptual_distance([a, a], [b, a]) == pytest.approx(0.5, abs=1e-5)
-    assert metrics.perceptual_distance([a, a], [b, a], weights=[torch.tensor([1.0, 0.0])] * 2) == pytest.approx(
-        0.5, abs=1e-5
-    )
-    assert metrics.perceptual_distance([a], [b], torch.tensor([[[True, False]]])) == pytest.approx(0.0, abs=1e-5)
+    assert lpips([a], [b]) == pytest.approx(1.0, abs=1e-6)
+    assert lpips([a, a], [b, a]) == pytest.approx(0.5, abs=1e-6)
+    assert lpips([a, a], [b, a], channel_weights=[torch.tensor([1.0, 0.0])] * 2) == pytest.approx(0.5, abs=1e-6)
+    second = torch.tensor([[[False, True]]])
+    assert lpips([a], [b], weight=~second, over_weight=True) == pytest.approx(0.0, abs=1e-6)
+    assert lpips([a], [b], weight=second, over_weight=True) == pytest.approx(2.0, abs=1e-6)
+    assert lpips([a], [b], weight=second) == pytest.approx(1.0, abs=1e-6)  # of two places
+    assert np.isnan(lpips([a], [b], weight=second & ~second, over_weight=True))
     with pytest.raises(InputError, match="shape"):
-        metrics.perceptual_distance([a], [b[..., :1]])
+        lpips([a], [b[..., :1]])
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-9, 1e-12])
+def test_features_are_normalised_as_published(size):
+    """The published formula in float64, also where 1e-10 is not small beside the features."""
+    x, y = (size * torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (0, 1))
+    x[:, 1, 1] = 0
+    units = [v / ((v**2).sum(0, keepdim=True).sqrt() + 1e-10) for v in (x, y)]
+    expected = float(((units[0] - units[1]) ** 2).sum(0).mean())
+    assert lpips([x], [y]) == pytest.approx(expected, rel=1e-12)
+    assert lpips([x.float()], [y.float()]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_places_without_features_pass_a_finite_gradient():
+    y = torch.rand(4, 3, 3, generator=torch.Generator().manual_seed(2))
+    for value in (0.0, 1e-30):  # the square of the second is 0 in float32
+        x = torch.full((4, 3, 3), value)
+        x[:, 0] = 1.0
+        x.requires_grad_()
+        perceptual.lpips_distance([x], perceptual.unit_features([y])).backward()
+        assert bool(torch.isfinite(x.grad).all()) and float(x.grad[:, 0].abs().max()) > 0
+        assert float(x.grad[:, 1:].abs().max()) == 0
 
 
 def lpips_state():
@@ -177,7 +205,7 @@ def test_incomplete_lpips_weights_are_refused_and_named(tmp_path):
         LpipsFeatures(lpips_state())(torch.zeros(3, 20, 64))
 
 
-# ---- flicker and movers ----------------------------------------------------------------------------------------------
+# ---- flicker and dynamic objects ----------------------------------------------------------------------------------------------
 
 
 def still_pair(number, made_noise):
@@ -223,7 +251,7 @@ def test_flicker_of_several_methods_shares_what_the_truth_does():
         motion.between(pair(), pair())
 
 
-def test_psnr_of_movers_counts_their_pixels_only_and_leaves_specks_out():
+def test_psnr_of_dynamic_objects_counts_their_pixels_only_and_leaves_specks_out():
     truth = torch.zeros(3, 40, 50)
     made = truth.clone()
     moving = torch.zeros(1, 40, 50, dtype=torch.bool)
@@ -244,7 +272,7 @@ def test_psnr_of_movers_counts_their_pixels_only_and_leaves_specks_out():
 # ---- in the scorer ---------------------------------------------------------------------------------------------------
 
 
-def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_movers(tmp_path):
+def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_objects(tmp_path):
     scene = toy_views.write_scene(tmp_path / "scene")
 
     def grey(_index, seen):
@@ -262,7 +290,7 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_movers(t
     config = ScoreConfig(perceptual_views=0, lpips_weights=str(tmp_path / "lpips.safetensors"))
     other = store.read_json(score.run(config, scene, views, tmp_path / "other") / "metrics.json")
     values = {r["method"]: r["values"] for r in other["results"]}
-    assert values["a"]["perceptual"] == score_tables.NOT_ASKED
+    assert values["a"]["perceptual"] == score_tables.NOT_REQUESTED
     assert values["a"]["lpips"] == pytest.approx(0.0, abs=1e-6) != values["b"]["lpips"]
 
 

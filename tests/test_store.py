@@ -1,8 +1,7 @@
-"""Nothing half-written, nothing silently wrong: files, manifests, run folders, checkpoints."""
+"""Nothing half-written, nothing silently wrong: files, manifests, checkpoints."""
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 import torch
 
 from mudg.base import checkpoint, errors, store
-from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.errors import InputError, IntegrityError, ResourceError
 
 
 def test_atomic_path_leaves_the_old_file_when_the_writer_fails(tmp_path: Path) -> None:
@@ -83,76 +82,6 @@ def test_manifest_detects_every_single_bit_flip(tmp_path: Path) -> None:
     (tmp_path / "a.safetensors").unlink()
     with pytest.raises(IntegrityError, match="missing"):
         store.verify_manifest(tmp_path)
-
-
-def _run(path: Path, value: int = 1, **kwargs: object) -> store.RunDir:
-    return store.RunDir.open(path, "fit", {"value": value, "nested": {"x": 0.5}}, {"scene": "abc"}, **kwargs)  # type: ignore[arg-type]
-
-
-def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
-    run = _run(tmp_path / "r")
-    assert not run.complete
-    store.write_text(run.path / "out.txt", "result")
-    run.log(step=1, loss=0.5)
-    run.finish({"psnr": 30.0})
-    again = _run(tmp_path / "r")
-    assert again.complete
-    assert again.summary() == {"psnr": 30.0}
-    (run.path / "out.txt").write_text("altered")
-    with pytest.raises(IntegrityError, match="--overwrite"):
-        _run(tmp_path / "r")
-    assert not _run(tmp_path / "r", overwrite=True).complete
-
-
-def test_run_folder_refuses_another_configuration_and_names_the_difference(tmp_path: Path) -> None:
-    _run(tmp_path / "r").finish()
-    with pytest.raises(UsageError, match="value: 1 there, 2 asked"):
-        _run(tmp_path / "r", value=2)
-    with pytest.raises(UsageError, match="scene"):
-        store.RunDir.open(tmp_path / "r", "fit", {"value": 1, "nested": {"x": 0.5}}, {"scene": "xyz"})
-
-
-def test_a_run_that_failed_before_it_made_anything_is_in_nobodys_way(tmp_path: Path) -> None:
-    _run(tmp_path / "r")
-    corrected = _run(tmp_path / "r", value=2)
-    assert not corrected.complete
-    store.write_text(corrected.path / "out.txt", "half")
-    with pytest.raises(UsageError, match="value: 2 there, 1 asked"):
-        _run(tmp_path / "r")
-
-
-def test_run_folder_never_touches_foreign_files(tmp_path: Path) -> None:
-    (tmp_path / "r").mkdir()
-    (tmp_path / "r" / "thesis.tex").write_text("precious")
-    for overwrite in (False, True):
-        with pytest.raises(UsageError, match="something else"):
-            _run(tmp_path / "r", overwrite=overwrite)
-    assert (tmp_path / "r" / "thesis.tex").read_text() == "precious"
-
-
-def test_interrupted_run_continues_and_a_crash_before_the_state_is_not_complete(tmp_path: Path) -> None:
-    run = _run(tmp_path / "r")
-    store.write_text(run.path / "out.txt", "half")
-    run.pause()
-    assert json.loads((tmp_path / "r" / "run.json").read_text())["state"] == "interrupted"
-    again = _run(tmp_path / "r")
-    assert not again.complete
-    store.write_manifest(again.path)  # a crash between manifest and state
-    assert not _run(tmp_path / "r").complete
-
-
-def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_path: Path) -> None:
-    import socket
-
-    run = _run(tmp_path / "r")
-    store.write_json(run.path / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
-    with pytest.raises(ResourceError, match=str(os.getppid())):
-        _run(tmp_path / "r")
-    with pytest.raises(ResourceError, match="another process"):
-        _run(tmp_path / "r", overwrite=True)
-    assert (run.path / "run.json").is_file()
-    store.write_json(run.path / "lock", {"pid": 2**22 + 1, "host": socket.gethostname()})
-    assert not _run(tmp_path / "r").complete
 
 
 def test_checkpoints_keep_two_and_fall_back_past_a_damaged_one(tmp_path: Path) -> None:

@@ -4,20 +4,22 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fit_settings import fit_config
 from scipy import ndimage
 from toy_scene import ToyStreet
 
+from mudg import cli
 from mudg.base.errors import InputError, UsageError
 from mudg.core import trajectory
 from mudg.data.clips.condition import ConditionRules, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import list_observation_sets, read_observations
 from mudg.data.scene import read_scene
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import fit, fuse, synthesize
-from mudg.stages.config import FitConfig, FuseConfig, SynthesizeConfig
+from mudg.stages.config import FuseConfig, SynthesizeConfig
 
 FRAMES = 7
 
@@ -32,10 +34,11 @@ def world(tmp_path_factory):
     model = MDM(
         MDMConfig(
             widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4,
-            embed_width=16, codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+            embed_width=16, codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(64, 128), refine_blocks=(2, 3),
+            area_px=192 * 128,
         )
     )  # fmt: skip
-    mdm.save(model, root / "model", "", {})
+    files.save(model, root / "model", "", {})
     config = SynthesizeConfig(
         cameras=("front",), shifts_m=(1.0,), model=str(root / "model"), steps=2, width_px=48, full_size=False,
         precision="float32", processes=1,
@@ -137,16 +140,6 @@ def test_overlap_must_leave_something_new():
         synthesize.windows(20, 8, 8)
 
 
-def test_model_size_keeps_aspect_and_area():
-    assert synthesize.model_size(480, 320, 16, 128 * 192) == (192, 128)
-    assert synthesize.model_size(1920, 1280, 16, 128 * 192) == (192, 128)
-    width, height = synthesize.model_size(1242, 375, 16, 128 * 192)
-    assert width % 16 == height % 16 == 0
-    assert abs(width / height / (1242 / 375) - 1) < 0.1
-    assert abs(width * height / (128 * 192) - 1) < 0.3
-    assert synthesize.model_size(480, 320, 16, 1, width_px=100) == (96, 64)
-
-
 def test_detail_is_given_back_where_the_sample_agrees(world):
     generator = torch.Generator().manual_seed(0)
     fine = torch.rand(2, 3, 32, 48, generator=generator)
@@ -179,25 +172,38 @@ def test_bad_requests(world, tmp_path):
         made(world, tmp_path / "d", shifts_m=(1.0, 1.01))
 
 
+def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, capsys):
+    """Before any work: neither scene nor cloud is there, and nothing is written."""
+    words = ["synthesize", str(tmp_path / "scene"), "--fused", str(tmp_path / "fused"), "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--sampler", "dpm_solver", "--eta", "0.5"]) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in ("dpm_solver", "eta", "ddim"))
+    assert list(tmp_path.iterdir()) == []
+    for flags, word in ((("--guidance", "3"), "guidance"), (("--memory-budget-gb", "3"), "memory-budget")):
+        assert cli.main([*words, *flags]) == 2
+        assert word in capsys.readouterr().err
+    assert cli.main([*words, "--sampler", "ddim", "--eta", "0.5"]) == 3  # on to the next fault: no such scene
+
+
 def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
-    """Views change where nothing was measured, the scene's class stands there, and its renders may be started from."""
+    """Views change where nothing was measured, and the scene's class stands there."""
     root, config = world
     fitted = fit.run(
-        FitConfig(method="street_gaussians", iterations=4, initial_gaussians=900, max_gaussians=1500), root / "scene", root / "fused",
+        fit_config(method="street_gaussians", iterations=4, start__gaussians=900), root / "scene", root / "fused",
         tmp_path / "fit",
     )  # fmt: skip
     scene, cloud = read_scene(root / "scene"), read_fused(root / "fused")
     view = trajectory.shifted(scene, "front", 1.0).views[2]
     rules = ConditionRules(96, 64)
-    look = synthesize.Renders(fitted)
+    renders = synthesize.Renders(fitted)
     plain = build_conditions(cloud, scene.tracks, [view], [], rules)[0]
-    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=look.at)[0]
+    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=renders.sparse)[0]
     assert bool(helped.valid[plain.valid].all())
     assert int(helped.valid.sum()) > int(plain.valid.sum())
     near = torch.from_numpy(ndimage.binary_dilation(plain.valid[0, 0].numpy(), iterations=rules.measured_reach_px))
     new = helped.valid[0, 0] & ~plain.valid[0, 0]
     assert not bool((new & near).any())
-    shown = look.at(view.resized(96, 64))
+    shown = renders.sparse(view.resized(96, 64))
     assert torch.equal(helped.depth[0, 0][new], shown.depth[new])
     assert torch.equal(helped.semantics[0, 0][new], shown.semantics[new])
     run = lambda name, **more: synthesize.run(  # noqa: E731
@@ -205,9 +211,3 @@ def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
     )
     usual = frames_of(made(world, tmp_path / "plain") / "front_shift+1.0")
     assert not all(torch.equal(a.rgb, b.rgb) for a, b in zip(usual, frames_of(run("helped") / "front_shift+1.0")))
-    assert len(frames_of(run("started", start="render", strength=0.5) / "front_shift+1.0")) == FRAMES
-    model = mdm.load(root / "model")
-    latents = look.latents(model, [view.resized(48, 32)])
-    assert torch.equal(latents["rgb"], model.codec.encode_rgb(look.observation(view.resized(48, 32)).rgb[None]))
-    with pytest.raises(UsageError, match="nothing to start from"):
-        made(world, tmp_path / "refused", start="render")

@@ -1,4 +1,4 @@
-"""Trajectories: which left, exact distances on a curve, side cameras, a standing car, resampling, splines."""
+"""Trajectories: which left, exact distances on a curve, side cameras, a standing car."""
 
 from __future__ import annotations
 
@@ -132,51 +132,6 @@ def test_no_ego_pose_at_a_frame():
     cut = Scene(scene.id, ".", scene.cameras, scene.frames, (), (), short, {}, scene.source)
     with pytest.raises(InputError, match="no ego pose"):
         trajectory.shifted(cut, "front", 1.0)
-
-
-def test_resampling_by_count_and_speed():
-    recorded = trajectory.recorded(circle(21), "front")
-    double = trajectory.resampled(recorded, count=41)
-    assert len(double) == 41
-    for index in (0, 7, 20):
-        assert np.array_equal(double.views[2 * index].world_from_cam, recorded.views[index].world_from_cam)
-    fast = trajectory.resampled(recorded, speed_factor=2.0)
-    assert [view.time_s for view in fast.views] == pytest.approx([view.time_s for view in recorded.views[::2]])
-    slow = trajectory.resampled(recorded, speed_factor=0.5)
-    assert len(slow) == 41
-    assert len(trajectory.resampled(recorded, count=1)) == 1
-    for wrong in ({}, {"count": 2, "speed_factor": 1.0}, {"speed_factor": 0.0}, {"count": 0}):
-        with pytest.raises(UsageError):
-            trajectory.resampled(recorded, **wrong)
-
-
-def test_spline_passes_through_its_keys_and_is_smooth():
-    recorded = trajectory.recorded(circle(6), "front")
-    keys = [view.world_from_cam for view in recorded.views]
-    times = [view.time_s for view in recorded.views]
-    fine = np.linspace(times[0], times[-1], 101)
-    path = trajectory.spline_through(keys, recorded.views[0].camera, times, fine)
-    assert path.origin == "planned"
-    for key, time_s in zip(keys, times):
-        near = path.views[int(round((time_s - times[0]) / (fine[1] - fine[0])))]
-        assert np.abs(near.world_from_cam - key).max() < 1e-9
-    centers = np.stack([view.center_world for view in path.views])
-    turn = np.diff(centers, 2, axis=0)
-    assert np.linalg.norm(np.diff(turn, axis=0), axis=1).max() < 0.05 * np.linalg.norm(np.diff(centers, axis=0), axis=1).mean()
-
-
-def test_spline_of_one_and_two_poses_and_its_refusals():
-    pose = geometry.yaw_matrix(0.2, (1.0, 2.0, 3.0))
-    cam = Camera("c", 8, 8, 8.0, 8.0, 4.0, 4.0)
-    assert len(trajectory.spline_through([pose], cam, [1.0])) == 1
-    middle = trajectory.spline_through([np.eye(4), pose], cam, [0.0, 1.0], [0.5]).views[0]
-    assert np.abs(middle.world_from_cam - geometry.interpolate_pose(np.eye(4), pose, 0.5)).max() < 1e-9
-    with pytest.raises(InputError, match="extrapolated"):
-        trajectory.spline_through([np.eye(4), pose], cam, [0.0, 1.0], [1.5])
-    with pytest.raises(InputError, match="increasing times"):
-        trajectory.spline_through([np.eye(4), pose], cam, [1.0, 1.0])
-    with pytest.raises(InputError, match="not rigid"):
-        trajectory.spline_through([2 * np.eye(4), pose], cam, [0.0, 1.0])
 
 
 @settings(max_examples=30, deadline=None)

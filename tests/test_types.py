@@ -1,4 +1,4 @@
-"""Types refuse what cannot be, in words that name the place."""
+"""Types refuse what cannot be and name the place."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from mudg.base.types import (
     Gaussians,
     Observation,
     PointCloud,
+    Ref,
     Scene,
     Source,
+    Sweep,
     SweepPoints,
     Track,
     View,
@@ -66,6 +68,22 @@ def test_track_refuses_unsorted_times_and_flat_boxes() -> None:
         Track("a", "car", np.ones(3), np.zeros(0), np.zeros((0, 4, 4)))
 
 
+def test_a_pose_that_is_not_rigid_is_named_with_owner_field_and_place() -> None:
+    good, mirrored = np.eye(4), np.diag([1.0, -1.0, 1.0, 1.0])
+    makers = {
+        "view of 'front': world_from_cam": lambda: View(CAMERA, mirrored, 0.0),
+        "sweep 'top/1': world_from_lidar": lambda: Sweep("top/1", "top", 0.0, 2 * good, Ref("a")),
+        "track 'a': world_from_object[1]": lambda: Track("a", "car", np.ones(3), [0.0, 1.0], [good, mirrored]),
+        "ego path: world_from_ego[2]": lambda: EgoPath([0.0, 1.0, 2.0], [good, good, np.full((4, 4), np.nan)]),
+    }
+    for where, make in makers.items():
+        with pytest.raises(InputError, match="not a rigid motion") as caught:
+            make()
+        assert caught.value.where == where
+    with pytest.raises(InputError, match="do not pair up"):
+        EgoPath([0.0, 1.0], [good])
+
+
 def test_point_arrays_are_checked() -> None:
     with pytest.raises(InputError, match="rgb"):
         PointCloud(np.zeros((3, 3), np.float32), np.zeros((2, 3), np.uint8), "world")
@@ -73,7 +91,7 @@ def test_point_arrays_are_checked() -> None:
         SweepPoints(np.zeros((3, 3)), np.zeros(3, np.float32), np.zeros(3, np.float32))
 
 
-def test_tensor_words_check_shapes() -> None:
+def test_tensor_types_check_shapes() -> None:
     t, h, w = 2, 6, 8
     condition = Condition(
         (VIEW, VIEW),

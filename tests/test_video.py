@@ -8,7 +8,6 @@ import av
 import numpy as np
 import pytest
 
-from mudg.base import palette
 from mudg.base.errors import InputError
 from mudg.data.exporters import video
 
@@ -62,20 +61,6 @@ def test_refusals_leave_no_file(tmp_path):
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(InputError, match="not a readable video"):
         video.read_mp4(tmp_path / "text.mp4")
-
-
-def test_depth_colours_are_ordered_and_missing_is_black():
-    depth = np.array([[1.0, 4.0, 15.0, 60.0, 500.0, np.nan, 0.0, -3.0]])
-    colors = video.depth_colors(depth)[0].astype(int)
-    brightness = colors[:5].sum(1)
-    assert (np.diff(brightness) < 0).all()
-    assert (colors[5:] == 0).all()
-    assert brightness[4] > 0
-
-
-def test_semantic_colours():
-    ids = np.array([[palette.ID["road"], palette.UNLABELLED]], np.uint8)
-    assert video.semantic_colors(ids)[0].tolist() == [[128, 64, 128], [0, 0, 0]]
 
 
 def test_side_by_side_places_panels_in_reading_order():

@@ -19,11 +19,10 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.data.city import rig
-from mudg.data.importers.waymo import camera as waymo_camera
-from mudg.data.importers.waymo import proto, tfrecord, tracks
+from mudg.data.importers.waymo import messages, sensors, tfrecord, tracks
+from mudg.data.importers.waymo.parquet import ParquetTable
 from mudg.data.importers.waymo.records import WaymoBox
-from mudg.data.importers.waymo.v1 import TfrecordLog
-from mudg.data.importers.waymo.v2 import Table
+from mudg.data.importers.waymo.tfrecord import TfrecordLog
 from mudg.data.scene import read_image, read_label, read_points
 
 # --- round trips ------------------------------------------------------------------------------------------------------
@@ -233,16 +232,16 @@ def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> N
 
 def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_data: Callable[[str], Path]) -> None:
     path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
-    label = proto.Message(
-        "Label", {**proto.FRAME.fields[6].message.fields}  # type: ignore[union-attr]
+    label = messages.Message(
+        "Label", {**messages.FRAME.fields[6].message.fields}  # type: ignore[union-attr]
     )  # fmt: skip
-    per_camera = proto.Message(
-        "CameraLabels", {1: proto.Field("name", "int"), 2: proto.Field("labels", "messages", label)}
+    per_camera = messages.Message(
+        "CameraLabels", {1: messages.Field("name", "int"), 2: messages.Field("labels", "messages", label)}
     )
-    message = proto.Message("Frame", {9: proto.Field("projected", "messages", per_camera)})
+    message = messages.Message("Frame", {9: messages.Field("projected", "messages", per_camera)})
     (place,) = tfrecord.record_places(path)
     with path.open("rb") as file:
-        projected = proto.parse_message(tfrecord.read_record(file, path, place), message, "real")[
+        projected = messages.parse_message(tfrecord.read_record(file, path, place), message, "real")[
             "projected"
         ]
     log = TfrecordLog(path)
@@ -253,8 +252,8 @@ def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_dat
     for camera in projected:
         name = names[camera["name"]]
         calibration = log.cameras[name]
-        pose, _ = waymo_camera.middle_of_exposure(frame.shots[name])
-        cam_from_vehicle = invert(pose @ waymo_camera.vehicle_from_cam(calibration)) @ frame.global_from_vehicle
+        pose, _ = sensors.middle_of_exposure(frame.shots[name])
+        cam_from_vehicle = invert(pose @ sensors.vehicle_from_cam(calibration)) @ frame.global_from_vehicle
         fx, fy, cx, cy, *lens = calibration.intrinsic
         for item in camera["labels"]:
             box = next(box for key, box in boxes.items() if item["id"].startswith(key))
@@ -289,11 +288,11 @@ def test_the_real_frame_without_images_is_refused_in_words(shared_data: Callable
 
 def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
     pytest.importorskip("pyarrow")
-    table = Table(shared_data("waymo_frame") / "v2_vehicle_pose.parquet")
+    table = ParquetTable(shared_data("waymo_frame") / "v2_vehicle_pose.parquet")
     column = "[VehiclePoseComponent].world_from_vehicle.transform"
     found = table.columns(("key.segment_context_name", "key.frame_timestamp_micros", column))
     assert len(found[column]) == 199
-    assert all(geometry.is_rigid(np.array(values).reshape(4, 4), 1e-6) for values in found[column])
+    assert all(geometry.rigid_problem(np.array(values).reshape(4, 4), 1e-6) is None for values in found[column])
     steps = np.diff(np.array(found["key.frame_timestamp_micros"], np.int64))
     assert ((steps > 90_000) & (steps < 110_000)).all()
     assert np.allclose(table.value(57, column), found[column][57])

@@ -19,7 +19,7 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.data.importers import RECOGNISERS
 from mudg.data.importers.waymo import records as waymo_log
 from mudg.data.importers.waymo import tfrecord as waymo_tfrecord
-from mudg.data.importers.waymo.v2 import Table
+from mudg.data.importers.waymo.parquet import ParquetTable
 from mudg.data.scene import read_points
 
 
@@ -246,7 +246,7 @@ def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monk
     table = root / "lidar" / f"{bare.name}.parquet"
     whole = table.read_bytes()
     table.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="Parquet file cannot be read"):
+    with pytest.raises(InputError, match="table cannot be read"):
         ingest(root, tmp_path / "scene")
     (root / "lidar_box" / f"{bare.name}.parquet").rename(table)
     with pytest.raises(InputError, match="lacks columns"):
@@ -264,11 +264,11 @@ def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monk
     holes = pyarrow.table({"a": [1, None, 3]})
     pytest.importorskip("pyarrow.parquet").write_table(holes, tmp_path / "holes.parquet")
     with pytest.raises(InputError, match="empty value") as hole:
-        Table(tmp_path / "holes.parquet").columns(("a",))
+        ParquetTable(tmp_path / "holes.parquet").columns(("a",))
     assert hole.value.where.endswith("row 1")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ResourceError, match="pyarrow") as caught:
-        Table(pose)
+        ParquetTable(pose)
     assert "mudg[data]" in caught.value.remedy
 
 
@@ -281,7 +281,7 @@ def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -
     with pytest.raises(UsageError, match="several logs") as caught:
         ingest(folder, tmp_path / "scene")
     assert all(name in caught.value.expected for name in names)
-    with pytest.raises(UsageError, match="no logs have such a name"):
+    with pytest.raises(UsageError, match="there is no such log"):
         ingest(folder, tmp_path / "scene", sequence="333")
     assert len(ingest(folder, tmp_path / "scene", sequence="222", frames=(0, 1)).frames) == 2
     assert RECOGNISERS["waymo"](folder)

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, yaw_matrix
-from mudg.data.importers.waymo import camera as waymo_camera
-from mudg.data.importers.waymo import lidar, proto, tfrecord
+from mudg.data.importers.waymo import messages, sensors, tfrecord
 from mudg.data.importers.waymo import tracks as waymo_tracks
 from mudg.data.importers.waymo.records import CameraShot, LaserCalibration, LaserScan, WaymoBox
 
@@ -62,22 +61,22 @@ def test_sparse_multiples_are_multiples_of_the_polynomial(degree: int, lower: tu
 def test_varints_at_once_equal_varints_one_by_one() -> None:
     values = np.concatenate([rng().integers(-(2**40), 2**40, 200), [0, -1, 127, 128, 2**62, -(2**63)], np.arange(300)])
     data = b"".join(made.varint(int(value)) for value in values)
-    assert (proto.unpack_varints(data, "x") == values).all()
+    assert (messages.unpack_varints(data, "x") == values).all()
     with pytest.raises(InputError, match="cut off"):
-        proto.unpack_varints(data + b"\x80", "x")
+        messages.unpack_varints(data + b"\x80", "x")
     with pytest.raises(InputError, match="ten bytes"):
-        proto.unpack_varints(b"\x80" * 10 + b"\x01", "x")
+        messages.unpack_varints(b"\x80" * 10 + b"\x01", "x")
 
 
-INNER = proto.Message(
-    "Inner", {1: proto.Field("values", "doubles"), 3: proto.Field("counts", "ints")}
+INNER = messages.Message(
+    "Inner", {1: messages.Field("values", "doubles"), 3: messages.Field("counts", "ints")}
 )
-OUTER = proto.Message(
+OUTER = messages.Message(
     "Outer",
     {
-        1: proto.Field("name", "text"),
-        2: proto.Field("number", "int"),
-        4: proto.Field("inner", "messages", INNER),
+        1: messages.Field("name", "text"),
+        2: messages.Field("number", "int"),
+        4: messages.Field("inner", "messages", INNER),
     },
 )
 
@@ -87,7 +86,7 @@ def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() 
     plain = made.doubles(1, [1.5, -2]) + made.number(3, 7) + made.number(3, -7)
     skipped = made.double(9, 1.0) + made.single(10, 1.0) + made.number(11, 300) + made.text(12, b"?")
     data = made.text(1, "Straße".encode()) + skipped + made.number(2, -5) + made.text(4, packed) + made.text(4, plain)
-    found = proto.parse_message(data, OUTER, "x")
+    found = messages.parse_message(data, OUTER, "x")
     assert (found["name"], found["number"], len(found["inner"])) == ("Straße", -5, 2)
     for inner in found["inner"]:
         assert inner["values"].tolist() == [1.5, -2]
@@ -104,16 +103,16 @@ def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() 
 )  # fmt: skip
 def test_broken_messages_are_named(data: bytes, word: str) -> None:
     with pytest.raises(InputError, match="message cannot be decoded") as caught:
-        proto.parse_message(data, OUTER, "file: record 3")
+        messages.parse_message(data, OUTER, "file: record 3")
     assert word in caught.value.got
     assert "record 3" in caught.value.where
 
 
 @given(st.binary(max_size=200))
 def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
-    for message in (proto.FRAME, proto.CONTEXT, proto.MATRIX_INT):
+    for message in (messages.FRAME, messages.CONTEXT, messages.MATRIX_INT):
         try:
-            proto.parse_message(data, message, "x")
+            messages.parse_message(data, message, "x")
         except InputError:
             continue
 
@@ -131,7 +130,7 @@ def test_points_equal_the_conversion_pixel_by_pixel(uneven: bool, posed: bool) -
     image = generator.uniform(-2, 60, (rows, columns, 4)).astype(np.float32)
     poses = generator.uniform(-1, 1, (rows, columns, 6)).astype(np.float32) if posed else None
     frame_pose = random_pose(generator)
-    points = lidar.points_of_scan(LaserScan([image], poses), laser, frame_pose, "x")
+    points = sensors.points_of_scan(LaserScan([image], poses), laser, frame_pose, "x")
     expected = []
     heading = np.arctan2(laser.vehicle_from_lidar[1, 0], laser.vehicle_from_lidar[0, 0])
     for row in range(rows):
@@ -159,7 +158,7 @@ def test_points_without_a_pose_are_left_out_and_counted() -> None:
     poses = np.full((2, 8, 6), 0.1, np.float32)
     poses[1, 3:] = 0
     laser = LaserCalibration("top", (), -0.2, 0.1, np.eye(4))
-    points = lidar.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
+    points = sensors.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
     assert (points.without_pose, len(points.xyz)) == (10, 22)
 
 
@@ -172,25 +171,25 @@ def test_the_turn_is_measured_from_pixel_poses(start: float, duration: float) ->
     poses[..., 3:] = place(start + (np.arange(100) + 0.5) / 100 * duration)
     poses[2:, 40:] = 0
     times = np.arange(-0.1, 0.25, 0.0125)
-    found = lidar.measure_turn(poses, 5.0, times + 5.0, place(times))
+    found = sensors.measure_turn(poses, 5.0, times + 5.0, place(times))
     assert found is not None
     assert np.abs(np.array(found) - [start, duration]).max() < 1e-5
-    assert lidar.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
-    nominal = lidar.TurnClock()
-    assert (lidar.median_clock([found]) == nominal) == (start == 0.0)
+    assert sensors.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
+    nominal = sensors.TurnClock()
+    assert (sensors.median_clock([found]) == nominal) == (start == 0.0)
 
 
 def test_a_view_is_that_of_the_middle_of_the_exposure() -> None:
     pose = yaw_matrix(0.4, (5.0, 6.0, 1.0))
     velocity = np.array([10.0, -2.0, 0.5, 0, 0, 0.8])
     shot = CameraShot(pose, 100.0, velocity, 0.002, 99.985, 100.027)
-    moved, time = waymo_camera.middle_of_exposure(shot)
+    moved, time = sensors.middle_of_exposure(shot)
     late = time - 100.0
     assert late == pytest.approx(0.006, abs=1e-9)
     assert np.abs(moved - yaw_matrix(0.4 + 0.8 * late, pose[:3, 3] + velocity[:3] * late)).max() < 1e-12
-    assert waymo_camera.readout_s(shot) == pytest.approx(0.04)
+    assert sensors.readout_s(shot) == pytest.approx(0.04)
     unknown = CameraShot(pose, 100.0, None, 0.002, 99.985, 100.027)
-    assert waymo_camera.middle_of_exposure(unknown) == (pose, 100.0)
+    assert sensors.middle_of_exposure(unknown) == (pose, 100.0)
 
 
 def timed(times: np.ndarray, late: np.ndarray, velocity: np.ndarray, **changes: Any) -> list[waymo_tracks.TimedBoxes]:

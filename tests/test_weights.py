@@ -17,10 +17,10 @@ from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_chec
 from mudg import cli
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.data import weights
+from mudg.models.published import files as published_files
 from mudg.models.published.model import PublishedConfig
 from mudg.stages import convert
 from mudg.stages.config import ConvertConfig
-from mudg.stages.learning import published_model
 
 CONFIG = ConvertConfig(resolution="320x512")
 ENTER = "model.diffusion_model.input_blocks.0.0.weight"
@@ -52,7 +52,7 @@ def saved(tmp_path, content, name="model.ckpt"):
 
 def converted(tmp_path, content, config=CONFIG):
     convert.convert_file(config, saved(tmp_path, content), tmp_path / "out", TINY)
-    return published_model.read(tmp_path / "out")
+    return published_files.load(tmp_path / "out")
 
 
 # names ----------------------------------------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def test_files_without_tensors_are_refused(tmp_path):
 
 
 def test_conversion_keeps_every_value(whole, complete):
-    model = published_model.read(whole)
+    model = published_files.load(whole)
     state = model.state_dict()
     names = weights.published_names(n for n in state if n not in ("text", "scale"))
     assert all(torch.equal(state[ours], complete[theirs]) for ours, theirs in names.items())
@@ -219,7 +219,7 @@ def test_rescale_stays_exact_in_half_precision(tmp_path, complete):
     )
     assert model.dtype == torch.bfloat16
     assert torch.equal(model.schedule.scale, scale_table()[:1000])
-    again = published_model.read(tmp_path / "out", dtype=torch.float16)
+    again = published_files.load(tmp_path / "out", dtype=torch.float16)
     assert again.dtype == torch.float16
     assert torch.equal(again.scale, scale_table())
     assert len(list((tmp_path / "out").glob("weights_*.safetensors"))) > 1
@@ -285,7 +285,7 @@ def test_towers_can_come_from_another_file(tmp_path, whole, complete):
     convert.convert_file(
         ConvertConfig(resolution="320x512", towers=str(path)), saved(tmp_path, without), tmp_path / "b", TINY
     )
-    joined, plain = published_model.read(tmp_path / "b").state_dict(), published_model.read(whole).state_dict()
+    joined, plain = published_files.load(tmp_path / "b").state_dict(), published_files.load(whole).state_dict()
     assert all(torch.equal(value, joined[name]) for name, value in plain.items())
 
 
@@ -293,11 +293,12 @@ def test_conversion_in_its_own_process(tmp_path, complete):
     """The way of the command line: a fresh process with a memory limit."""
     path = saved(tmp_path, {"state_dict": complete}, "512.ckpt")
     assert convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY) == tmp_path / "model"
-    assert published_model.read(tmp_path / "model").config.height == 320
+    assert published_files.load(tmp_path / "model").config.height == 320
     with pytest.raises(UsageError, match="exists"):
         convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
+    (tmp_path / "photos").mkdir()
     with pytest.raises(UsageError, match="something else"):
-        convert.run(ConvertConfig(), path, tmp_path, overwrite=True, network=TINY)
+        convert.run(ConvertConfig(), path, tmp_path / "photos", overwrite=True, network=TINY)
 
 
 @pytest.mark.slow
@@ -346,10 +347,10 @@ def test_altered_model_folders_are_refused(tmp_path, whole):
     content[-1] ^= 1
     part.write_bytes(bytes(content))
     with pytest.raises(IntegrityError, match="altered"):
-        published_model.read(tmp_path / "out")
+        published_files.load(tmp_path / "out")
     description = tmp_path / "out" / "model.json"
     values = json.loads(description.read_text())
     values["config"]["net"]["colour"] = 1
     description.write_text(json.dumps(values))
     with pytest.raises(InputError, match="unknown colour"):
-        published_model.read(tmp_path / "out")
+        published_files.load(tmp_path / "out")

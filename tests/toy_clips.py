@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from mudg.base.types import Camera, Clip, Condition, View
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_city import HELD_OUT
 from mudg.stages.config import LearnConfig
+from mudg.stages.config.learn import LearnCodec
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
 
@@ -21,8 +22,8 @@ def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
     """A clip with structure: a horizon, a box, a noisy half-seen condition."""
     generator = torch.Generator().manual_seed(seed)
     rows = torch.arange(height).view(1, 1, height, 1).expand(WINDOW, 1, height, width)
-    colour = torch.rand(2, 3, 1, 1, generator=generator)
-    rgb = torch.where(rows < 12, colour[0], colour[1])
+    color = torch.rand(2, 3, 1, 1, generator=generator)
+    rgb = torch.where(rows < 12, color[0], color[1])
     depth = torch.where(rows < 12, torch.tensor(1000.0), 200.0 / (rows - 8).clamp(min=1).float())
     ids = torch.where(rows < 12, 10, 0)[:, 0].clone()
     box = int(torch.randint(4, width - 14, (), generator=generator))
@@ -42,7 +43,8 @@ def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, point
     for number in [*range(3), HELD_OUT]:
         made = [made_up_clip(number * 7 + k, width, height) for k in range(2)]
         made = [points_alone(clip) for clip in made[: 1 if number == HELD_OUT else 2]] if points else made
-        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made, [2.0, 0.0][: len(made)]))
+        made = [replace(clip, shift_m=shift) for clip, shift in zip(made, (2.0, 0.0), strict=False)]
+        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made))
     return folder
 
 
@@ -52,13 +54,31 @@ def points_alone(clip: Clip) -> Clip:
     return replace(clip, condition=Condition(c.views, c.color * c.valid, c.depth * c.valid, c.valid, c.reference))
 
 
+def with_settings(config: LearnConfig, **changes: Any) -> LearnConfig:
+    """The configuration with settings changed by their own names, whichever group they are in (group `score`: `score_NAME`)."""
+    for name, value in changes.items():
+        if name in {f.name for f in fields(config)}:
+            config = replace(config, **{name: value})
+            continue
+        group, own = ("score", name[6:]) if name.startswith("score_") else (GROUPS[name], name)
+        config = replace(config, **{group: replace(getattr(config, group), **{own: value})})
+    return config
+
+
+GROUPS = {
+    field.name: group
+    for group in ("data", "network", "optimizer", "loss", "compute")
+    for field in fields(getattr(LearnConfig(), group))
+}
+
+
 def tiny(clips: Path | str, **changes: Any) -> LearnConfig:
     """A run of four steps of a network with a few thousand weights on the clips of `write_clips`."""
-    config = LearnConfig(
-        cities=3, first_cities=2, clips_per_city=2, held_out=1, watched=1, clips=str(clips), workers=0, precision="float32",
-        width=WIDTH, height=HEIGHT, window=WINDOW, widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True),
-        temporal_attention=(False, True), refine_widths=(8, 16), refine_blocks=(1, 1), codec_steps=3, codec_batch=2,
-        codec_fit_batches=1, steps=4, batch_frames=4, full_window_share=0.5, warmup_steps=1, checkpoint_every=2,
-        sample_every=100, sample_steps=1, score_steps=1,
+    config = with_settings(
+        LearnConfig(codec=LearnCodec(steps=3, batch=2, fit_batches=1)), cities=3, first_cities=2, clips_per_city=2, held_out=1,
+        score_watched=1, clips=str(clips), workers=0, precision="float32", width=WIDTH, height=HEIGHT, window=WINDOW,
+        widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), refine_widths=(8, 16),
+        refine_blocks=(1, 1), steps=4, batch_frames=4, full_window_share=0.5, warmup_steps=1, checkpoint_every=2, score_every=100,
+        score_steps=1,
     )  # fmt: skip
-    return replace(config, **changes)
+    return with_settings(config, **changes)

@@ -1,10 +1,10 @@
 """A tiny network of the published kind, and fake checkpoints of it as the training frameworks write them."""
 
 import zlib
-from dataclasses import replace
 
 import numpy as np
 import torch
+from toy_clips import with_settings
 
 from mudg.core.noise import ScheduleConfig
 from mudg.data import weights
@@ -92,13 +92,13 @@ def tiny_model():
 
 def published_settings(start, clips, **changes):
     """A run of two steps of `learn` on clips of points alone that goes on from a folder of the tiny model."""
-    settings = LearnConfig(
-        start=str(start), clips=str(clips), cities=3, first_cities=3, clips_per_city=2, held_out=1, watched=1, workers=0,
-        width=32, height=32, window=4, full_window_share=1.0, steps=2, batch_frames=8, lr=1e-4, last_lr_share=1.0, warmup_steps=0,
-        beta2=0.999, clip_norm=0.5, average_decay=0.0, augment=False, precision="float32", log_every=1, checkpoint_every=100,
-        sample_every=100, sample_steps=1, score_steps=1,
+    settings = with_settings(
+        LearnConfig(start=str(start), steps=2, precision="float32"), clips=str(clips), cities=3, first_cities=3, clips_per_city=2,
+        held_out=1, score_watched=1, workers=0, width=32, height=32, window=4, full_window_share=1.0, batch_frames=8, lr=1e-4,
+        last_lr_share=1.0, warmup_steps=0, betas=(0.9, 0.999), clip_norm=0.5, average_decay=0.0, augment=False, log_every=1,
+        checkpoint_every=100, score_every=100, score_steps=1,
     )  # fmt: skip
-    return replace(settings, **changes)
+    return with_settings(settings, **changes)
 
 
 def write_tiny(folder):

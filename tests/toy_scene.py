@@ -19,7 +19,7 @@ from mudg.data.scene import SceneWriter
 
 Matrix = NDArray[np.float64]
 GROUND, WALL_LOW, WALL_HIGH, PANEL, CAR, SKY = range(6)
-COLOURS = np.array(
+COLORS = np.array(
     [[90, 90, 90], [200, 40, 40], [170, 120, 60], [40, 200, 40], [220, 220, 40], [150, 190, 255]], np.uint8
 )
 TRAIN_IDS = np.array([ID["road"], ID["building"], ID["building"], ID["wall"], ID["car"], ID["sky"]], np.uint8)
@@ -85,7 +85,7 @@ class ToyStreet:
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1).reshape(-1, 3)
         depth, kind = self.cast(view.center_world, rays @ view.world_from_cam[:3, :3].T, view.time_s)
         shape = (camera.height, camera.width)
-        return COLOURS[kind].reshape(*shape, 3), TRAIN_IDS[kind].reshape(shape), depth.reshape(shape)
+        return COLORS[kind].reshape(*shape, 3), TRAIN_IDS[kind].reshape(shape), depth.reshape(shape)
 
     def sweep(self, time_s: float) -> tuple[Matrix, SweepPoints, NDArray[np.intp]]:
         """world_from_lidar, points, and what each point lies on."""

@@ -19,7 +19,7 @@ CAMERA = Camera("front", WIDTH, HEIGHT, 40.0, 40.0, WIDTH / 2, HEIGHT / 2)
 EGO_FROM_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]], np.float64)
 
 
-def colours(index: int) -> np.ndarray:
+def colors(index: int) -> np.ndarray:
     """A smooth picture u8[H, W, 3] that differs from frame to frame and stays within 40..200."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
     waves = [np.sin(x / (7 + c) + 0.4 * index + c) + np.cos(y / (5 + c) - 0.3 * index) for c in range(3)]
@@ -48,7 +48,7 @@ def write_scene(root: Path, *, labels: bool = True, test_every: int = 2, lidar: 
         writer.add_camera(CAMERA)
         for i in range(FRAMES):
             extra = {"depth": depths(), "semantics": classes()} if labels else {}
-            writer.add_frame(f"front/{i:06d}", View(CAMERA, poses[i] @ EGO_FROM_CAM, times[i]), colours(i), extra)
+            writer.add_frame(f"front/{i:06d}", View(CAMERA, poses[i] @ EGO_FROM_CAM, times[i]), colors(i), extra)
             if lidar:
                 y, z = np.meshgrid(np.linspace(-4, 4, 60), np.linspace(-1, 3, 30))
                 wall = np.stack([np.full(y.size, 10.0), y.ravel(), z.ravel()], -1).astype(np.float32)
@@ -73,7 +73,7 @@ def write_views(
             for index, view in enumerate(path.views):
                 seen = Observation(
                     view=view,
-                    rgb=torch.from_numpy(colours(index)).permute(2, 0, 1).float() / 255,
+                    rgb=torch.from_numpy(colors(index)).permute(2, 0, 1).float() / 255,
                     depth=torch.from_numpy(depths())[None],
                     semantics=torch.from_numpy(classes().astype(np.int64)),
                     confidence=torch.ones(1, HEIGHT, WIDTH),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mudg.base.geometry import invert, quaternion_from_matrix, yaw_matrix
 from mudg.base.types import Scene, Track
-from mudg.data.importers.nuscenes.importer import CAMERAS
+from mudg.data.importers.nuscenes.sensors import CAMERAS
 from mudg.data.scene import read_points
 from mudg.data.scene.files import open_files
 

@@ -37,7 +37,7 @@ class Rules:
     no_ground: float = 0.04
     no_kerb: float = 0.1
     kerb_everywhere: float = 0.1
-    recoloured: float = 0.5
+    recolored: float = 0.5
     largest_scale: float = 1.6
 
 
@@ -51,7 +51,7 @@ def varied(
     if rng.random() < rules.no_image:
         rgb = np.broadcast_to(rng.random((1, 1, 3)), rgb.shape) + rng.normal(0, 0.03, rgb.shape)
     else:
-        rgb = coloured(rgb, truth, rng, rules)
+        rgb = colored(rgb, truth, rng, rules)
     return (
         np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32),
         np.ascontiguousarray(planes),
@@ -111,12 +111,12 @@ def _window(evidence: Evidence, window: tuple[slice, slice]) -> Evidence:
     return Evidence(**arrays)
 
 
-def coloured(
+def colored(
     rgb: NDArray[np.float32], truth: NDArray[np.uint8], rng: np.random.Generator, rules: Rules
 ) -> NDArray[np.float32]:
     """Colours f32[h, w, 3] in 0..1 as another camera, light or street might give them."""
     shape = rgb.shape[:2]
-    if rng.random() < rules.recoloured:  # each class its own tint, brightness and pattern
+    if rng.random() < rules.recolored:  # each class its own tint, brightness and pattern
         gain = np.exp(rng.normal(0, 0.35, (256, 1)) + rng.normal(0, 0.15, (256, 3))).astype(np.float32)
         shift = (rng.normal(0, 0.08, (256, 1)) + rng.normal(0, 0.04, (256, 3))).astype(np.float32)
         gain[list(_FLAT)] *= np.exp(rng.normal(0, 0.3, (len(_FLAT), 1)))  # a road in the sun is as bright as any sidewalk

@@ -314,7 +314,7 @@ def temperature(net: StreetNet, options: argparse.Namespace) -> float:
         for number in range(segmenter_data.VIEWS):
             rng = seeds.numpy_rng(options.seed, city, f"segmenter calibration {number}")
             picked = segmenter_data.load(image_file(options.work, city, number))
-            rgb = segmenter_vary.coloured(picked.rgb.astype(np.float32) / 255, picked.truth, rng, rules)
+            rgb = segmenter_vary.colored(picked.rgb.astype(np.float32) / 255, picked.truth, rng, rules)
             rgb = (np.clip(rgb, 0, 1) * 255).astype(np.uint8)
             found = net.probabilities(rgb, encode(segmenter_vary.disturbed(picked.evidence, rng, rules)))
             rows, columns = (rng.integers(size, size=2000) for size in picked.truth.shape)

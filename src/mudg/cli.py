@@ -195,8 +195,8 @@ VERBS: dict[str, Verb] = {
     "learn": Verb(
         "Train a diffusion model on generated cities, or go on with one on your own logs.",
         ("mudg learn --out runs/mdm", "mudg learn --config recipe.yaml --out runs/mdm",
-         "mudg learn --scenes runs/kitti --start embedded --lr 1e-4 --steps 500 --out runs/tuned",
-         "torchrun --nproc-per-node 8 -m mudg learn --parallel fsdp --config recipe.yaml --out runs/mdm"),
+         "mudg learn --data.scenes runs/kitti --start embedded --optimizer.lr 1e-4 --steps 500 --out runs/tuned",
+         "torchrun --nproc-per-node 8 -m mudg learn --compute.parallel fsdp --config recipe.yaml --out runs/mdm"),
         _learn,
     ),
     "convert": Verb(
@@ -228,9 +228,9 @@ VERBS: dict[str, Verb] = {
         _score,
     ),
     "bench": Verb(
-        "Measurements against exact truth: mdm, mdm-ablation, poses, shift.",
-        ("mudg bench mdm --out runs/bench", "mudg bench mdm-ablation --out runs/ablation", "mudg bench poses --out runs/poses",
-         "mudg bench shift --list development --logs 1 --variant strong=virtual_probability:0.4 --out runs/shift"),
+        "Measurements against exact truth: mdm, poses, shift.",
+        ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses",
+         "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift"),
         _bench,
     ),
 }  # fmt: skip

@@ -41,9 +41,10 @@ class Output(Common):
     """Flags of commands that write a folder."""
 
     out: Annotated[Path, arg(metavar="FOLDER")]
-    """Folder to write. A finished result of the same settings and inputs is verified and reused."""
+    """Folder to write, apart from everything that is read. A finished result of the same settings and inputs is verified and reused."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace the result of other settings or inputs in --out instead of refusing."""
+    """Replace the result of other settings or inputs in --out instead of refusing. The new result is made beside the old one and takes
+    its place when it is finished (until then the disk holds both); files that are not of the old result stay."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +52,8 @@ class Many(Common):
     """Flags of commands that go over a list of scenes too."""
 
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace the result of other settings or inputs in the output folder instead of refusing."""
+    """Replace the result of other settings or inputs in the output folder instead of refusing. The new result is made beside the old
+    one and takes its place when it is finished (until then the disk holds both); files that are not of the old result stay."""
     list: Annotated[Path | None, arg(metavar="FILE")] = None
     """Many at once: a file with one source a line (SOURCE [name=NAME] ...), or a folder of them. Each goes to OUT/NAME; the exit
     code is 0, or 10 + the number that failed."""
@@ -111,7 +113,8 @@ class Convert(Common):
     to: Annotated[Path, arg(metavar="FOLDER")]
     """Model folder to write."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace a model that is there already."""
+    """Replace a model that is there already, when the new one is finished (until then the disk holds both); files that are not of the
+    model stay."""
     settings: Annotated[stage_config.ConvertConfig, arg(name="")]
 
 
@@ -166,8 +169,8 @@ class Score(Output):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(Output):
-    """Flags of ``mudg run``."""
+class RunOwn(Output):
+    """Flags of ``mudg run`` without the settings of the steps."""
 
     source: Positional[str]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
@@ -179,12 +182,18 @@ class Run(Output):
     """Cameras to move sideways (not given: the first one)."""
     shifts_m: tuple[float, ...] = ()
     """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(RunOwn):
+    """Flags of ``mudg run``."""
+
     settings: Annotated[stage_config.RunConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Output):
-    """Flags of ``mudg demo``."""
+class DemoOwn(Output):
+    """Flags of ``mudg demo`` without the settings of the steps."""
 
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("mudg_demo")
     """Folder to write. Repeat the same command to continue an interrupted demo."""
@@ -194,6 +203,12 @@ class Demo(Output):
     """Seed of the city and of every random draw in the chain (not given: city 3, draws 0, or what --config says)."""
     shifts_m: tuple[float, ...] = ()
     """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(DemoOwn):
+    """Flags of ``mudg demo``."""
+
     settings: Annotated[stage_config.RunConfig, arg(name="")]
 
 
@@ -202,7 +217,7 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Positional[str]
-    """mdm, mdm-ablation, poses or shift."""
+    """mdm, poses or shift."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")]
 
 
@@ -219,6 +234,9 @@ FLAGS: dict[str, type[Common]] = {
     "convert": Convert, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
 }  # fmt: skip
 
+CHAINS: dict[str, type[Common]] = {"demo": DemoOwn, "run": RunOwn}
+"""Commands that run several steps: what their --help lists. Some 200 settings of the steps are listed by --help-all."""
+
 
 def parse(verb: str, words: Sequence[str], description: str) -> Common:
     """Turn the words after ``mudg VERB`` into that verb's flags.
@@ -227,6 +245,10 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
         UsageError: unknown or invalid setting. InputError: --config cannot be read.
         SystemExit: --help (0), or a flag that does not exist or fit (2); it has been said already.
     """
+    if verb in CHAINS and {"-h", "--help"} & set(words):
+        return _own_help(verb, description)
+    if verb in CHAINS:
+        words = ["--help" if word == "--help-all" else word for word in words]
     flags = FLAGS[verb]
     kind = get_type_hints(flags).get("settings")
     default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(kind, words))
@@ -240,6 +262,16 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
             "a flag's value is not valid", where=f"--{field}", expected=first["msg"], got=repr(first.get("input"))[:120],
             remedy=f"see mudg {verb} --help",
         ) from error  # fmt: skip
+
+
+def _own_help(verb: str, description: str) -> Common:
+    """Print the flags of a chain itself, and where those of its steps are listed."""
+    note = (
+        f"Every setting of a step is a flag, too, with the step's name before it: --fit.iterations 3000, --ingest.resolution 960.\n"
+        f"They are listed by mudg {verb} --help-all, and without that name by mudg fit --help and so on."
+    )
+    _explain(CHAINS[verb], {})
+    return tyro.cli(CHAINS[verb], args=["--help"], prog=f"mudg {verb}", description=f"{description}\n\n{note}")
 
 
 def _settings(kind: type[Any], words: Sequence[str]) -> Any:

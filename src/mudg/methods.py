@@ -15,34 +15,23 @@ class Method:
     """One row.
 
     Args:
-        title: for tables. made_by: the verb that produces its views (``render`` after ``fit``, or ``synthesize``).
-        nodes: what its scene consists of; empty for a method without a scene.
-        supervision: what it learns from in this log. produces: modalities; others are reported "not produced".
+        title: for tables.
+        made_by: the verb that produces its views (``render`` after ``fit``, or ``synthesize``).
+        nodes: what its scene consists of (objects: one rigid or deformable node per dynamic track); empty for a method without a scene.
+        supervision: what its scene learns from; virtual: the views of mudg_r.
     """
 
     title: str
     made_by: Literal["render", "synthesize"]
-    nodes: tuple[str, ...]
-    supervision: tuple[str, ...]
-    produces: tuple[str, ...]
+    nodes: tuple[Literal["static", "objects", "sky"], ...] = ()
+    supervision: tuple[Literal["color", "semantics", "lidar", "sky", "virtual"], ...] = ()
 
+
+_STREET: Final = ("color", "semantics", "lidar", "sky")
 
 METHODS: Final[dict[str, Method]] = {
-    "gs3d": Method(
-        "3D Gaussians, static", "render", ("static",), ("recorded colour", "recorded semantics"), ("rgb", "depth", "semantics")
-    ),
-    "street_gaussians": Method(
-        "Gaussians without diffusion", "render", ("static", "rigid per moving track", "sky"),
-        ("recorded colour", "recorded semantics", "LiDAR depth", "sky"), ("rgb", "depth", "semantics"),
-    ),
-    "mudg_r": Method("Diffusion output", "synthesize", (), (), ("rgb", "depth", "semantics")),
-    "mudg_s": Method(
-        "Gaussians with diffusion", "render", ("static", "rigid per moving track", "sky"),
-        ("recorded colour", "recorded semantics", "LiDAR depth", "sky", "virtual views of mudg_r"), ("rgb", "depth", "semantics"),
-    ),
-}  # fmt: skip
-
-
-def fitted_methods() -> tuple[str, ...]:
-    """Methods that ``mudg fit`` knows."""
-    return tuple(name for name, method in METHODS.items() if method.made_by == "render")
+    "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics")),
+    "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
+    "mudg_r": Method("Diffusion output", "synthesize"),
+    "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
+}

@@ -30,7 +30,7 @@ def frozen(name: str, now: object) -> object:
 
 def help_text(verb: str, capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as stopped:
-        flags.parse(verb, ["--help"], "summary")
+        flags.parse(verb, ["--help-all" if verb in flags.CHAINS else "--help"], "summary")
     assert stopped.value.code == 0
     return capsys.readouterr().out
 
@@ -82,6 +82,17 @@ def test_help_reads_no_source_class_by_class(
     monkeypatch.setattr("inspect.getsource", refuse)
     assert "Optimisation steps" in help_text("fit", capsys)
     assert "Hold out every n-th frame" in help_text("run", capsys)
+
+
+def test_the_help_of_a_chain_is_short_and_says_where_the_rest_is(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in flags.CHAINS:
+        with pytest.raises(SystemExit) as stopped:
+            flags.parse(verb, ["--help"], "summary")
+        assert stopped.value.code == 0
+        text = capsys.readouterr().out
+        assert "--fit.method" not in text
+        assert f"mudg {verb} --help-all" in text.replace("\n", " ")
+        assert "--shifts-m" in text
 
 
 def test_help_lists_only_what_exists() -> None:

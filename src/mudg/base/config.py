@@ -1,9 +1,15 @@
-"""Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name."""
+"""Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name.
+
+A configuration class may say what became of keys that older files use: the class variable ``MOVED`` maps an old key to its new
+dotted one, or to None if it was removed. Such keys are refused with that name; a group's own name may stand there too, for files in
+which it was still a plain value.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,14 +17,15 @@ from typing import Any, TypeVar
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mudg.base.errors import InputError, UsageError
+from mudg.base.records import first_problem
 
 Config = TypeVar("Config")
 
 STRICT = ConfigDict(extra="forbid", defer_build=True)
 """Pass as ``@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)``.
 
-Validators are built at the first use: a command builds those of its own verb only. A default that is itself a configuration
-is therefore a ``default_factory``."""
+Validators are built at their first use: a command builds only those of its own verb. A default that is itself a
+configuration is therefore a ``default_factory``."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -55,19 +62,26 @@ def load(
     return build(config_type, values, str(yaml_path or "configuration"))
 
 
+def nested(dotted: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys such as ``virtual.start`` as mappings in mappings; UsageError if a name is both a value and a group."""
+    tree: dict[str, Any] = {}
+    for key, value in dotted.items():
+        *groups, name = key.split(".")
+        place = tree
+        for group in groups:
+            place = place.setdefault(group, {})
+            if not isinstance(place, dict):
+                raise UsageError("a configuration key is both a value and a group", where=key)
+        place[name] = value
+    return tree
+
+
 def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> Config:
-    """Validate plain values into ``config_type``; UsageError names the first wrong field."""
+    """Validate plain values as a ``config_type``; UsageError names the first wrong field."""
     try:
         return TypeAdapter(config_type).validate_python(dict(values))
     except ValidationError as error:
-        first = error.errors()[0]
-        path = ".".join(str(part) for part in first["loc"])
-        raise UsageError(
-            "a configuration value is not valid",
-            where=f"{where}: {path}",
-            expected=first["msg"],
-            got=repr(first.get("input"))[:120],
-        ) from error
+        raise first_problem(error, f"{where}: ", UsageError) from error
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -90,26 +104,42 @@ def _merge(
     base: dict[str, Any], new: Mapping[str, Any], where: str, config_type: Any, path: str = ""
 ) -> dict[str, Any]:
     known = {f.name: f for f in dataclasses.fields(config_type)} if dataclasses.is_dataclass(config_type) else {}
+    types = typing.get_type_hints(config_type) if known else {}
+    moved: Mapping[str, str | None] = getattr(config_type, "MOVED", {})
     merged = dict(base)
     for name, value in new.items():
+        group = types.get(name)
+        is_group, is_mapping = dataclasses.is_dataclass(group), isinstance(value, Mapping)
+        if name in moved and (name not in known or (is_group and not is_mapping)):
+            raise _moved_error(f"{path}{name}", moved[name], where, path)
         if known and name not in known:
             near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
-            raise UsageError(
-                f"unknown configuration key {path}{name}",
-                where=where,
-                expected="one of " + ", ".join(known),
-                remedy=f"did you mean {path}{near[0]}?" if near else "remove it",
-            )
-        nested = getattr(base.get(name), "items", None) is not None and isinstance(value, Mapping) and known
-        if nested and dataclasses.is_dataclass(field_type(config_type, name)):
-            merged[name] = _merge(base[name], value, where, field_type(config_type, name), f"{path}{name}.")
+            what, expected = f"unknown configuration key {path}{name}", "one of " + ", ".join(known)
+            remedy = f"did you mean {path}{near[0]}?" if near else "remove it"
+            raise UsageError(what, where=where, expected=expected, remedy=remedy)
+        if is_group and is_mapping and isinstance(base.get(name), Mapping):
+            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.")
         else:
             merged[name] = value
     return merged
 
 
-def field_type(config_type: Any, name: str) -> Any:
-    """Resolved type of a field (annotations may be strings)."""
-    import typing
+def _moved_error(old: str, new: str | None, where: str, path: str) -> UsageError:
+    """What to say about a key that a class lists in ``MOVED``."""
+    if new is None:
+        return UsageError(f"the configuration key {old} was removed", where=where, remedy="leave it out")
+    return UsageError(
+        f"the configuration key {old} is now called {path}{new}",
+        where=where,
+        remedy="rename it (a dot is one level of YAML)",
+    )
 
-    return typing.get_type_hints(config_type).get(name)
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        found = []
+        for name in sorted(set(old) | set(new), key=str):
+            found += differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
+        return found
+    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]

@@ -6,6 +6,8 @@ The command line maps each class to an exit code; nothing else in the package kn
 
 from __future__ import annotations
 
+from typing import Self
+
 
 class MudgError(Exception):
     """Base of all errors raised on purpose.
@@ -33,6 +35,10 @@ class MudgError(Exception):
         fields = (("where", self.where), ("expected", self.expected), ("got", self.got), ("what to do", self.remedy))
         lines.extend(f"  {name}: {value}" for name, value in fields if value)
         return "\n".join(lines)
+
+    def located(self, where: str) -> Self:
+        """The same error with another place."""
+        return type(self)(self.what, where=where, expected=self.expected, got=self.got, remedy=self.remedy)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Keep the fields when the error crosses a process boundary."""

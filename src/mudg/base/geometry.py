@@ -20,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from mudg.base.errors import InputError
 
 if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
+
     from mudg.base.types import View
 
 Matrix = NDArray[np.float64]
@@ -29,7 +31,7 @@ CAM_FROM_EGO_AXES.setflags(write=False)
 
 
 def rigid_problem(transform: ArrayLike, tolerance: float = 1e-4) -> str | None:
-    """Say in words why ``transform`` is not a rigid 4x4 motion, or return None if it is one."""
+    """Say why ``transform`` is not a rigid 4x4 motion within ``tolerance``, or return None if it is one."""
     matrix = np.asarray(transform)
     if matrix.shape != (4, 4):
         return f"shape {matrix.shape} instead of (4, 4)"
@@ -49,7 +51,7 @@ def rigid_problem(transform: ArrayLike, tolerance: float = 1e-4) -> str | None:
 
 
 def all_rigid(transforms: Matrix, tolerance: float = 1e-4) -> bool:
-    """Whether every one of f64[N, 4, 4] is rigid: ``rigid_problem`` for many at once, without the words."""
+    """Whether every one of f64[N, 4, 4] is rigid: ``rigid_problem`` for many at once, without the reason."""
     rotation = transforms[:, :3, :3]
     if not np.isfinite(transforms).all() or (np.abs(transforms[:, 3] - [0, 0, 0, 1]) > tolerance).any():
         return False
@@ -57,13 +59,8 @@ def all_rigid(transforms: Matrix, tolerance: float = 1e-4) -> bool:
     return not (error > tolerance).any() and not (np.linalg.det(rotation) < 0).any()
 
 
-def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
-    """Whether ``transform`` is a finite, right-handed rigid 4x4 matrix within ``tolerance``."""
-    return rigid_problem(transform, tolerance) is None
-
-
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
-    """4x4 matrix from a 3x3 rotation and a translation of 3 metres-components."""
+    """f64[4, 4] from a rotation [3, 3] and a translation [3] in metres."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = translation
@@ -71,7 +68,7 @@ def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Ma
 
 
 def invert(transform: Matrix) -> Matrix:
-    """Inverse of rigid motions ``[..., 4, 4]``."""
+    """Inverse of rigid motions f64[..., 4, 4]."""
     rotation_t = np.swapaxes(transform[..., :3, :3], -1, -2)
     inverse = np.zeros_like(transform, dtype=np.float64)
     inverse[..., :3, :3] = rotation_t
@@ -90,7 +87,7 @@ def transform_points(a_from_b: Matrix, xyz_b: NDArray[Floating]) -> NDArray[Floa
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
-    """Rotation ``[3, 3]`` (or a rigid ``[4, 4]``) to a unit quaternion (w, x, y, z) with w >= 0."""
+    """Unit quaternion f64[4] (w, x, y, z) with w >= 0 of a rotation [3, 3] or a rigid motion [4, 4]."""
     r = np.asarray(rotation, np.float64)[:3, :3]
     four_squares = np.array(
         [1 + r[0, 0] + r[1, 1] + r[2, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2],
@@ -109,7 +106,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Matrix:
-    """Quaternion (w, x, y, z), normalised here, to a 3x3 rotation. A zero quaternion raises InputError."""
+    """Rotation f64[3, 3] of a quaternion (w, x, y, z), which is normalised here. InputError if it is zero or not finite."""
     q = np.asarray(quaternion, np.float64)
     norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or norm < 1e-12:
@@ -123,7 +120,7 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Matrix:
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, u: float) -> Matrix:
-    """Spherical interpolation of unit quaternions along the shorter arc; u = 0 gives q0, u = 1 gives +-q1."""
+    """Spherical interpolation f64[4] of quaternions along the shorter arc; u = 0 gives q0, u = 1 gives q1 or -q1."""
     a = np.asarray(q0, np.float64) / np.linalg.norm(q0)
     b = np.asarray(q1, np.float64) / np.linalg.norm(q1)
     cosine = float(a @ b)
@@ -137,13 +134,13 @@ def slerp(q0: ArrayLike, q1: ArrayLike, u: float) -> Matrix:
 
 
 def interpolate_pose(a_from_b0: Matrix, a_from_b1: Matrix, u: float) -> Matrix:
-    """Pose at fraction ``u`` in [0, 1] between two rigid poses: slerp of rotation, straight line of translation."""
+    """Pose f64[4, 4] at fraction ``u`` in [0, 1] between two rigid poses: slerp of rotation, linear in translation."""
     rotation = matrix_from_quaternion(slerp(quaternion_from_matrix(a_from_b0), quaternion_from_matrix(a_from_b1), u))
     return from_rotation_translation(rotation, (1 - u) * a_from_b0[:3, 3] + u * a_from_b1[:3, 3])
 
 
 def pose_at(times_s: NDArray[np.float64], poses: Matrix, time_s: float, tolerance_s: float = 1e-6) -> Matrix | None:
-    """Interpolate sorted pose keys at ``time_s``; None outside the span (never extrapolated), exact at the keys."""
+    """Interpolate pose keys f64[T, 4, 4] at ``time_s``; exact at the keys, None outside their span (never extrapolated)."""
     if len(times_s) == 0 or time_s < times_s[0] - tolerance_s or time_s > times_s[-1] + tolerance_s:
         return None
     after = int(np.searchsorted(times_s, time_s))
@@ -156,7 +153,7 @@ def pose_at(times_s: NDArray[np.float64], poses: Matrix, time_s: float, toleranc
 
 
 def yaw_matrix(yaw_rad: float, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
-    """4x4 rotation about z (counter-clockwise seen from above) followed by a translation in metres."""
+    """f64[4, 4]: a rotation about z (counter-clockwise seen from above), then a translation in metres."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return from_rotation_translation([[c, -s, 0], [s, c, 0], [0, 0, 1]], translation)
 
@@ -193,3 +190,37 @@ def unproject(view: View, uv_px: NDArray[np.floating], depth_m: NDArray[np.float
     uv, z = np.asarray(uv_px, np.float64), np.asarray(depth_m, np.float64)
     xyz_cam = np.stack([(uv[:, 0] - camera.cx) / camera.fx * z, (uv[:, 1] - camera.cy) / camera.fy * z, z], 1)
     return transform_points(view.world_from_cam, xyz_cam)
+
+
+def box_corners(size_m: ArrayLike) -> Matrix:
+    """Corners f64[8, 3] of a box in its own frame; the bits of a corner's number: 4 = front, 2 = left, 1 = top."""
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
+    return signs * np.asarray(size_m, np.float64)
+
+
+def box_hull(view: View, world_from_box: Matrix, size_m: ArrayLike, near_m: float = 0.3) -> ConvexHull | None:
+    """Convex outline, in pixels, of what a view shows of a box: that part of it which is at least ``near_m`` ahead.
+
+    Returns:
+        The hull of the projected corners (of a cut box also of the points where its edges cross the near plane), or None if it lies
+        outside the image.
+    """
+    from scipy.spatial import ConvexHull, QhullError  # late: most of what imports this module needs no scipy
+
+    camera = view.camera
+    corners = transform_points(view.cam_from_world @ world_from_box, box_corners(size_m))
+    front = corners[:, 2] >= near_m
+    points = [corners[front]]
+    for i in range(8):
+        for j in (i ^ 1, i ^ 2, i ^ 4):
+            if front[i] and not front[j]:
+                u = (near_m - corners[i, 2]) / (corners[j, 2] - corners[i, 2])
+                points.append(corners[i : i + 1] + u * (corners[j : j + 1] - corners[i : i + 1]))
+    kept = np.concatenate(points)
+    uv = np.c_[camera.fx * kept[:, 0] / kept[:, 2] + camera.cx, camera.fy * kept[:, 1] / kept[:, 2] + camera.cy]
+    if not len(uv) or (uv.max(0) < 0).any() or uv[:, 0].min() > camera.width or uv[:, 1].min() > camera.height:
+        return None
+    try:
+        return ConvexHull(np.clip(uv, -1e5, 1e5))
+    except QhullError:
+        return None

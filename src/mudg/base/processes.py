@@ -6,6 +6,7 @@
     Interruption        Ctrl-C and SIGTERM wait for the end of a step
     one_torch_thread    results that do not depend on how many cores are free
     child_environment   threads of processes that are started meanwhile
+    process_alive       whether a process still runs
 
 Children are spawned, never forked. What parent and child tell each other beside arguments and results is JSON text.
 """
@@ -76,6 +77,22 @@ def child_environment(threads: int, torch_threads: int = 1) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+# ---- other processes ------------------------------------------------------------------------------------------------
+
+
+def process_alive(pid: int) -> bool:
+    """Whether a process with this id runs on this machine; True where there is no harmless way to ask (Windows)."""
+    if os.name == "nt":
+        return True  # signal 0 would end the process there
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return pid > 0
 
 
 # ---- interrupts ------------------------------------------------------------------------------------------------------

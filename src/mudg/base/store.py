@@ -1,7 +1,6 @@
 """Everything that writes to disk goes through here: temporary name, fsync, rename; sha256 when read back.
 
-A reader sees an old complete file or a new complete file. A verb's output folder is finished when its manifest
-verifies and its key (verb, version, configuration, input hashes) is the one asked for.
+A reader sees an old complete file or a new complete file. The output folder of a verb is ``base/run_folder.py``.
 """
 
 from __future__ import annotations
@@ -12,19 +11,16 @@ import json
 import math
 import os
 import shutil
-import socket
 import tempfile
 import threading
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
-from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.errors import InputError, IntegrityError, ResourceError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,14 +28,13 @@ if TYPE_CHECKING:
 MANIFEST = "manifest.json"
 _MAX_JSON_BYTES = 512 * 1024 * 1024
 _CHUNK = 1 << 20
-_OWN_FILES = frozenset({"run.json", "run.yaml", "lock"})
-"""What a run folder holds before anything is made."""
 
 
 # single files ---------------------------------------------------------------------------------------------------------
 
 
-def _fsync_directory(path: Path) -> None:
+def fsync_directory(path: Path) -> None:
+    """Wait until the names in a folder are on the disk, where the file system can do that."""
     with contextlib.suppress(OSError):  # some file systems refuse to sync a directory; the rename is still atomic
         fd = os.open(path, os.O_RDONLY)
         try:
@@ -93,7 +88,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             os.fsync(handle.fileno())
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
-        _fsync_directory(path.parent)
+        fsync_directory(path.parent)
     except OSError as error:
         raise ResourceError(
             "writing failed", where=str(path), got=str(error), remedy="free disk space or choose another --out"
@@ -133,7 +128,7 @@ def sync_tree(folder: Path) -> None:
     try:
         for path in sorted(Path(folder).rglob("*")):
             if path.is_dir():
-                _fsync_directory(path)
+                fsync_directory(path)
             elif path.is_file():
                 with path.open("rb+") as handle:
                     os.fsync(handle.fileno())
@@ -141,7 +136,7 @@ def sync_tree(folder: Path) -> None:
         raise ResourceError(
             "writing failed", where=str(folder), got=str(error), remedy="free disk space or choose another --out"
         ) from error
-    _fsync_directory(folder)
+    fsync_directory(folder)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -256,7 +251,7 @@ def parse_safetensors(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     from safetensors.numpy import load as load_numpy
 
     try:
-        return load_numpy(content)
+        return dict(sorted(load_numpy(content).items()))  # the library hands them out in any order
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise InputError("not a valid safetensors file", where=where, got=str(error)) from error
 
@@ -289,7 +284,17 @@ def atomic_directory(path: Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
     else:
         partial.rename(path)
-    _fsync_directory(path.parent)
+    fsync_directory(path.parent)
+
+
+def staging_path(folder: Path) -> Path:
+    """Where the new content of a folder is made while the old one still stands."""
+    return folder.parent / f".{folder.name}.new.part"
+
+
+def retired_path(folder: Path) -> Path:
+    """Where the old content of a folder lies from the moment the new one takes its place until it is removed."""
+    return folder.parent / f".{folder.name}.old.part"
 
 
 def list_files(folder: Path) -> list[str]:
@@ -304,12 +309,11 @@ def list_files(folder: Path) -> list[str]:
     return sorted(names)
 
 
-def write_manifest(folder: Path, exclude: tuple[str, ...] = ()) -> str:
-    """Record size and sha256 of every file below ``folder``; return the digest of the record itself."""
+def write_manifest(folder: Path, names: Sequence[str] | None = None) -> str:
+    """Record size and sha256 of files below ``folder`` (None: of every file); return the digest of the record itself."""
     files = {}
-    for name in list_files(folder):
-        if name not in exclude:
-            files[name] = {"bytes": (folder / name).stat().st_size, "sha256": sha256_file(folder / name)}
+    for name in list_files(folder) if names is None else names:
+        files[name] = {"bytes": (folder / name).stat().st_size, "sha256": sha256_file(folder / name)}
     write_json(folder / MANIFEST, {"schema": 1, "files": files})
     return sha256_file(folder / MANIFEST)
 
@@ -341,7 +345,8 @@ def digest(path: Path) -> str:
     """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest."""
     path = Path(path)
     if not path.exists():
-        raise InputError("no such file or folder", where=str(path))
+        remedy = "repeat the command that wrote it: it was stopped while it replaced it" if retired_path(path).exists() else ""
+        raise InputError("no such file or folder", where=str(path), remedy=remedy)
     if path.is_file():
         return sha256_file(path)
     if (path / MANIFEST).is_file():
@@ -350,208 +355,3 @@ def digest(path: Path) -> str:
     for name in list_files(path):
         total.update(f"{name}\0{sha256_file(path / name)}\n".encode())
     return total.hexdigest()
-
-
-# a verb's output folder -----------------------------------------------------------------------------------------------
-
-
-class RunDir:
-    """The output folder of one verb: resolved configuration, state, log, manifest, lock.
-
-    ``run.yaml`` is enough to repeat the run; ``run.json`` names verb, key, inputs and state.
-    """
-
-    def __init__(self, path: Path, verb: str, key: str, inputs: Mapping[str, str], complete: bool) -> None:
-        self.path = path
-        self.verb = verb
-        self.key = key
-        self.inputs = dict(inputs)
-        self.complete = complete
-        self._started_s = time.monotonic()
-
-    @classmethod
-    def open(
-        cls,
-        path: Path,
-        verb: str,
-        config: Mapping[str, Any],
-        inputs: Mapping[str, str],
-        version: int = 1,
-        overwrite: bool = False,
-    ) -> RunDir:
-        """Open ``path`` for this verb, configuration and inputs.
-
-        ``complete`` is True when an earlier run with the same key finished and its manifest verifies: the verb then
-        returns at once. An unfinished run with the same key is continued.
-
-        Raises:
-            UsageError: the folder holds the output of another verb or configuration, or foreign files.
-            ResourceError: it cannot be written, or another live process is working in it.
-        """
-        path = Path(path)
-        key = hashlib.sha256(json_text([verb, version, dict(config), dict(inputs)], indent=None).encode()).hexdigest()
-        if overwrite and path.exists():
-            cls._refuse_foreign(path)
-            cls._refuse_while_others_work(path / "lock")
-            shutil.rmtree(path)
-        state_file = path / "run.json"
-        if state_file.is_file():
-            state = read_json(state_file)
-            # A run that failed before it made anything (a mistyped flag) is in nobody's way.
-            other = state.get("key") != key
-            if other and (state.get("state") == "complete" or any(entry.name not in _OWN_FILES for entry in path.iterdir())):
-                cls._refuse_other(path, verb, config, inputs, state)
-            if state.get("state") == "complete":
-                cls._verify_finished(path)
-                return cls(path, verb, key, inputs, complete=True)
-        elif path.exists() and any(path.iterdir()):
-            cls._refuse_foreign(path)
-        run = cls(path, verb, key, inputs, complete=False)
-        if not path.is_dir():
-            _make_parent(path / "x")
-        run._lock()
-        import yaml
-
-        write_text(
-            path / "run.yaml", yaml.safe_dump({"verb": verb, **json.loads(json_text(dict(config)))}, sort_keys=False)
-        )
-        run._write_state("running", {})
-        return run
-
-    @staticmethod
-    def _verify_finished(path: Path) -> None:
-        try:
-            verify_manifest(path)
-        except IntegrityError as error:
-            remedy = "add --overwrite to make it again, or choose another --out"
-            raise IntegrityError(
-                error.what, where=error.where, expected=error.expected, got=error.got, remedy=remedy
-            ) from error
-
-    @staticmethod
-    def _refuse_foreign(path: Path) -> None:
-        if not (path / "run.json").is_file():
-            raise UsageError(
-                "the output folder holds files of something else", where=str(path), remedy="choose an empty --out"
-            )
-
-    @staticmethod
-    def _refuse_other(
-        path: Path, verb: str, config: Mapping[str, Any], inputs: Mapping[str, str], state: Mapping[str, Any]
-    ) -> None:
-        import yaml
-
-        found = []
-        if state.get("verb") != verb:
-            found.append(f"verb {state.get('verb')!r} instead of {verb!r}")
-        old_inputs = state.get("inputs", {})
-        found += [f"input {name!r} changed" for name in inputs if old_inputs.get(name) != inputs[name]]
-        with contextlib.suppress(OSError, yaml.YAMLError):
-            old = yaml.safe_load((path / "run.yaml").read_text()) or {}
-            new = json.loads(json_text(dict(config)))
-            found += differences(old, {"verb": verb, **new})
-        raise UsageError(
-            "the output folder holds the result of another configuration",
-            where=str(path),
-            got="; ".join(found[:8]) or "another program version",
-            remedy="choose another --out, or add --overwrite to replace it",
-        )
-
-    @staticmethod
-    def _refuse_while_others_work(lock: Path) -> None:
-        if not lock.is_file():
-            return
-        try:
-            owner = read_json(lock)
-            pid, host = int(owner["pid"]), str(owner["host"])
-        except (InputError, KeyError, TypeError, ValueError):
-            return
-        if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
-            raise ResourceError(
-                "another process is working in this folder",
-                where=str(lock.parent),
-                got=f"pid {pid} on {host}",
-                remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}",
-            )
-
-    def _lock(self) -> None:
-        lock = self.path / "lock"
-        self._refuse_while_others_work(lock)
-        write_json(lock, {"pid": os.getpid(), "host": socket.gethostname()})
-
-    def _write_state(self, state: str, summary: Mapping[str, Any]) -> None:
-        from mudg.base.versions import environment
-
-        seconds = self.seconds_before() + time.monotonic() - self._started_s
-        write_json(
-            self.path / "run.json",
-            {
-                "schema": 1,
-                "verb": self.verb,
-                "key": self.key,
-                "inputs": self.inputs,
-                "state": state,
-                "seconds": round(seconds, 3),
-                "environment": environment(),
-                "summary": dict(summary),
-            },
-        )
-
-    def seconds_before(self) -> float:
-        """Seconds that earlier, interrupted runs of this same key have taken."""
-        if not hasattr(self, "_seconds_before"):
-            self._seconds_before = 0.0
-            state_file = self.path / "run.json"
-            if state_file.is_file():
-                state = read_json(state_file)
-                if state.get("key") == self.key:
-                    self._seconds_before = float(state.get("seconds", 0.0))
-        return self._seconds_before
-
-    def log(self, **fields: Any) -> None:
-        """Append one JSON line to log.jsonl."""
-        append_line(self.path / "log.jsonl", json_text(fields, indent=None))
-
-    def pause(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Record an interruption: time spent so far is kept, the lock released; the same command continues."""
-        self._write_state("interrupted", summary or {})
-        (self.path / "lock").unlink(missing_ok=True)
-
-    def finish(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Mark the folder complete: hash every file, write the manifest, release the lock."""
-        write_manifest(self.path, exclude=("log.jsonl", "run.json"))
-        self._write_state("complete", summary or {})
-        (self.path / "lock").unlink(missing_ok=True)
-        self.complete = True
-
-    def summary(self) -> dict[str, Any]:
-        """The summary that ``finish`` recorded."""
-        return read_json(self.path / "run.json").get("summary", {})
-
-    def reused(self) -> Path:
-        """Say that an earlier result is used again, and return its path."""
-        log.info(f"{self.verb}: reused {self.path} (verified)")
-        return self.path
-
-
-def process_alive(pid: int) -> bool:
-    """Whether a process with this id runs on this machine; True where there is no harmless way to ask (Windows)."""
-    if os.name == "nt":
-        return True  # signal 0 would end the process there
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return pid > 0
-
-
-def differences(old: Any, new: Any, path: str = "") -> list[str]:
-    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        found = []
-        for name in sorted(set(old) | set(new), key=str):
-            found += differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
-        return found
-    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]

@@ -1,23 +1,25 @@
-"""The words of the package: frozen dataclasses, checked when they are made.
+"""The types of the package: frozen dataclasses, checked when they are made.
 
-Facts about the world are numpy and live on disk; what is computed on is torch. This module imports no torch, so that
-facts can be read without it.
+A constructor is the one place where a pose is proved rigid; what is refused names its owner and field, as in
+``view of 'front': world_from_cam``. Facts about the world are numpy and live on disk; what is computed on is torch. This
+module imports no torch, so that facts can be read without it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import geometry
+from mudg.base import checks, geometry
 from mudg.base.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 Matrix = NDArray[np.float64]
@@ -25,64 +27,10 @@ TrajectoryOrigin = Literal["recorded", "shifted", "planned"]
 ObservationKind = Literal["recorded", "virtual"]
 
 
-def _rigid(value: Any, where: str) -> Matrix:
-    matrix = np.array(value, np.float64)
-    problem = geometry.rigid_problem(matrix)
-    if problem:
-        raise InputError("a pose is not a rigid motion", where=where, expected="finite rigid 4x4 matrix", got=problem)
-    matrix.setflags(write=False)
-    return matrix
-
-
-def _finite(value: float, where: str) -> float:
-    number = float(value)
-    if not np.isfinite(number):
-        raise InputError("a number is not finite", where=where, got=str(value))
-    return number
-
-
-def _pose_keys(times_s: Any, poses: Any, where: str) -> tuple[NDArray[np.float64], Matrix]:
-    """Check and freeze interpolation keys: increasing finite times, one rigid pose each."""
-    times = np.array(times_s, np.float64).reshape(-1)
-    matrices = np.array(poses, np.float64)
-    if matrices.shape != (len(times), 4, 4):
-        raise InputError(
-            "pose keys do not match their times", where=where, expected=f"({len(times)}, 4, 4)", got=str(matrices.shape)
-        )
-    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise InputError("times must be finite and strictly increasing", where=f"{where}.times_s", got=_some(times))
-    if not geometry.all_rigid(matrices):
-        for index, matrix in enumerate(matrices):
-            _rigid(matrix, f"{where}[{index}]")
-    times.setflags(write=False)
-    matrices.setflags(write=False)
-    return times, matrices
-
-
-def _some(values: NDArray[Any]) -> str:
-    text = np.array2string(np.asarray(values), threshold=6, edgeitems=3, precision=6)
-    return text if len(text) < 200 else text[:200] + "..."
-
-
-def _check_array(value: Any, where: str, shape: tuple[int | None, ...], dtype: type[np.generic]) -> None:
-    got = getattr(value, "shape", None)
-    fits = got is not None and len(got) == len(shape) and all(w in (None, g) for g, w in zip(got, shape, strict=True))
-    if not fits or not np.issubdtype(value.dtype, dtype):
-        expected = f"{np.dtype(dtype).name if dtype is not np.integer else 'integer'} {shape}".replace("None", "N")
-        raise InputError(
-            "an array has the wrong shape or type",
-            where=where,
-            expected=expected,
-            got=f"{getattr(value, 'dtype', type(value).__name__)} {got}",
-        )
-
-
-def _check_tensor(value: Any, where: str, shape: tuple[int | None, ...]) -> None:
-    got = tuple(getattr(value, "shape", ()))
-    if len(got) != len(shape) or any(w is not None and g != w for g, w in zip(got, shape, strict=True)):
-        raise InputError(
-            "a tensor has the wrong shape", where=where, expected=str(shape).replace("None", "N"), got=str(got)
-        )
+def _moved(value: Any, device: torch.device) -> dict[str, Tensor]:
+    """The tensors among the fields of a dataclass, on a device."""
+    given = {f.name: getattr(value, f.name) for f in fields(value)}
+    return {name: tensor.to(device) for name, tensor in given.items() if hasattr(tensor, "device")}
 
 
 def _freeze(mapping: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -115,17 +63,17 @@ class Camera:
     readout_s: float = 0.0
 
     def __post_init__(self) -> None:
-        where = f"camera {self.name!r}"
+        owner = f"camera {self.name!r}"
         if self.width < 1 or self.height < 1:
-            raise InputError("image size must be positive", where=where, got=f"{self.width}x{self.height}")
+            raise InputError("image size must be positive", where=owner, got=f"{self.width}x{self.height}")
         for name in ("fx", "fy", "cx", "cy", "readout_s"):
-            _finite(getattr(self, name), f"{where}.{name}")
+            checks.finite(getattr(self, name), f"{owner}.{name}")
         if self.fx <= 0 or self.fy <= 0:
-            raise InputError("focal lengths must be positive", where=where, got=f"fx={self.fx}, fy={self.fy}")
+            raise InputError("focal lengths must be positive", where=owner, got=f"fx={self.fx}, fy={self.fy}")
         if self.readout_s < 0:
-            raise InputError("readout time cannot be negative", where=where, got=f"{self.readout_s} s")
+            raise InputError("readout time cannot be negative", where=owner, got=f"{self.readout_s} s")
         if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):
-            raise InputError("principal point is far outside the image", where=where, got=f"cx={self.cx}, cy={self.cy}")
+            raise InputError("principal point is far outside the image", where=owner, got=f"cx={self.cx}, cy={self.cy}")
 
     @property
     def matrix(self) -> Matrix:
@@ -133,24 +81,30 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same optics sampled on another pixel grid (anisotropic if the aspect differs)."""
+        """The same optics sampled on another pixel grid (anisotropic if the aspect ratio differs)."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
-        )
+        intrinsics = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+        return replace(self, width=width, height=height, **intrinsics)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera at a place and time. ``world_from_cam`` f64[4, 4]; ``time_s`` in seconds of the scene's clock."""
+    """A camera at a place and time.
+
+    Args:
+        camera: its intrinsics.
+        world_from_cam: f64[4, 4], rigid, metres; copied and read-only.
+        time_s: seconds on the scene's clock.
+    """
 
     camera: Camera
     world_from_cam: Matrix
     time_s: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "world_from_cam", _rigid(self.world_from_cam, f"view of {self.camera.name!r}"))
-        object.__setattr__(self, "time_s", _finite(self.time_s, f"view of {self.camera.name!r}: time_s"))
+        owner = f"view of {self.camera.name!r}"
+        object.__setattr__(self, "world_from_cam", checks.rigid(self.world_from_cam, f"{owner}: world_from_cam"))
+        object.__setattr__(self, "time_s", checks.finite(self.time_s, f"{owner}: time_s"))
 
     @property
     def cam_from_world(self) -> Matrix:
@@ -169,7 +123,13 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """An ordered path of views of one camera; ``origin`` says how it came about."""
+    """An ordered path of views of one camera.
+
+    Args:
+        name: of the trajectory, e.g. ``left_2m``.
+        views: in the order of their times.
+        origin: how it came about: recorded, a recorded one shifted, or planned anew.
+    """
 
     name: str
     views: tuple[View, ...]
@@ -188,7 +148,14 @@ class Ref:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One recorded image. ``labels`` maps names (depth, semantics, sky, ego, dynamic, instance, ...) to files."""
+    """One recorded image.
+
+    Args:
+        id: ``<camera>/<digits>``, unique in the scene.
+        view: its camera, pose and time.
+        image: 8-bit RGB of the camera's size.
+        labels: name (depth, semantics, sky, ego, dynamic, instance, ...) -> file.
+    """
 
     id: str
     view: View
@@ -200,8 +167,26 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or None. The image may
+    have another size than the view's camera."""
+
+    view: View
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """One turn of a LiDAR, its points motion-compensated to ``time_s`` in the sensor's frame."""
+    """One turn of a LiDAR.
+
+    Args:
+        id: ``<sensor>/<digits>``, unique in the scene.
+        sensor: name of the LiDAR.
+        time_s: seconds on the scene's clock; the points are motion-compensated to it.
+        world_from_lidar: f64[4, 4], rigid, metres, at ``time_s``; copied and read-only.
+        points: see ``SweepPoints``.
+    """
 
     id: str
     sensor: str
@@ -210,23 +195,29 @@ class Sweep:
     points: Ref
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "world_from_lidar", _rigid(self.world_from_lidar, f"sweep {self.id!r}"))
-        object.__setattr__(self, "time_s", _finite(self.time_s, f"sweep {self.id!r}: time_s"))
+        pose = checks.rigid(self.world_from_lidar, f"sweep {self.id!r}: world_from_lidar")
+        object.__setattr__(self, "world_from_lidar", pose)
+        object.__setattr__(self, "time_s", checks.finite(self.time_s, f"sweep {self.id!r}: time_s"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepPoints:
-    """Points of a sweep: ``xyz`` f32[N, 3] metres in the LiDAR frame, ``intensity`` f32[N] in [0, 1], ``dt_s`` f32[N]
-    seconds relative to the sweep's time."""
+    """Points of a sweep.
+
+    Args:
+        xyz: f32[N, 3] metres in the LiDAR frame.
+        intensity: f32[N] in [0, 1].
+        dt_s: f32[N] seconds relative to the sweep's time.
+    """
 
     xyz: NDArray[np.float32]
     intensity: NDArray[np.float32]
     dt_s: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        _check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
-        _check_array(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
-        _check_array(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
+        checks.check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
+        checks.check_array(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
+        checks.check_array(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +229,7 @@ class Track:
         label: free class name (``car``, ``pedestrian``, ...).
         size_m: f64[3] length (x), width (y), height (z); the object frame sits in the centre of the box.
         times_s: f64[T], strictly increasing.
-        world_from_object: f64[T, 4, 4].
+        world_from_object: f64[T, 4, 4], rigid, metres.
     """
 
     id: str
@@ -248,45 +239,56 @@ class Track:
     world_from_object: Matrix
 
     def __post_init__(self) -> None:
+        owner = f"track {self.id!r}"
         size = np.array(self.size_m, np.float64).reshape(-1)
         if size.shape != (3,) or not np.isfinite(size).all() or (size <= 0).any():
-            raise InputError(
-                "a box needs a positive length, width and height", where=f"track {self.id!r}", got=_some(size)
-            )
+            what = "a box needs a positive length, width and height"
+            raise InputError(what, where=f"{owner}: size_m", got=checks.shortened(size))
         size.setflags(write=False)
-        times, poses = _pose_keys(self.times_s, self.world_from_object, f"track {self.id!r}")
+        times, poses = checks.pose_keys(self.times_s, self.world_from_object, owner, "world_from_object")
         if len(times) == 0:
-            raise InputError("a track needs at least one box", where=f"track {self.id!r}")
+            raise InputError("a track needs at least one box", where=f"{owner}: times_s")
         object.__setattr__(self, "size_m", size)
         object.__setattr__(self, "times_s", times)
         object.__setattr__(self, "world_from_object", poses)
 
     def pose_at(self, time_s: float) -> Matrix | None:
-        """World-from-object at ``time_s``: interpolated between both neighbouring keys; None outside the span."""
+        """World-from-object f64[4, 4] at ``time_s``, interpolated between both neighbouring keys; None outside the span."""
         return geometry.pose_at(self.times_s, self.world_from_object, time_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EgoPath:
-    """Poses of the recording vehicle: ``times_s`` f64[T], ``world_from_ego`` f64[T, 4, 4]."""
+    """The path of the recording vehicle.
+
+    Args:
+        times_s: f64[T], strictly increasing.
+        world_from_ego: f64[T, 4, 4], rigid, metres.
+    """
 
     times_s: NDArray[np.float64]
     world_from_ego: Matrix
 
     def __post_init__(self) -> None:
-        times, poses = _pose_keys(self.times_s, self.world_from_ego, "ego path")
+        times, poses = checks.pose_keys(self.times_s, self.world_from_ego, "ego path", "world_from_ego")
         object.__setattr__(self, "times_s", times)
         object.__setattr__(self, "world_from_ego", poses)
 
     def pose_at(self, time_s: float) -> Matrix | None:
-        """World-from-ego at ``time_s``; None outside the recording."""
+        """World-from-ego f64[4, 4] at ``time_s``; None outside the recording."""
         return geometry.pose_at(self.times_s, self.world_from_ego, time_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """Where a scene comes from. ``recipe`` holds what a generated scene needs to rebuild its exact truth; ``notes``
-    are sentences a reader of results should know (assumed timestamps, derived poses)."""
+    """Where a scene comes from.
+
+    Args:
+        dataset: name of the data set, or of the generator.
+        licence: under which the log may be used.
+        recipe: what a generated scene needs to rebuild its exact truth; None for recordings.
+        notes: sentences a reader of results should know (assumed timestamps, derived poses).
+    """
 
     dataset: str
     licence: str
@@ -296,7 +298,14 @@ class Source:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """Coloured points: ``xyz`` f32[N, 3] metres in ``frame``, ``rgb`` u8[N, 3], ``semantics`` u8[N] ids or None."""
+    """Coloured points.
+
+    Args:
+        xyz: f32[N, 3] metres in ``frame``.
+        rgb: u8[N, 3].
+        frame: the world's, or a tracked box's own.
+        semantics: u8[N] train ids (255 = unlabelled), or None.
+    """
 
     xyz: NDArray[np.float32]
     rgb: NDArray[np.uint8]
@@ -304,10 +313,10 @@ class PointCloud:
     semantics: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        _check_array(self.xyz, "point cloud: xyz", (None, 3), np.float32)
-        _check_array(self.rgb, "point cloud: rgb", (len(self.xyz), 3), np.uint8)
+        checks.check_array(self.xyz, "point cloud: xyz", (None, 3), np.float32)
+        checks.check_array(self.rgb, "point cloud: rgb", (len(self.xyz), 3), np.uint8)
         if self.semantics is not None:
-            _check_array(self.semantics, "point cloud: semantics", (len(self.xyz),), np.uint8)
+            checks.check_array(self.semantics, "point cloud: semantics", (len(self.xyz),), np.uint8)
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -315,7 +324,7 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedCloud:
-    """The static world and one cloud per moving object (track id -> cloud in its box frame)."""
+    """The static world, and one cloud per dynamic object: track id -> cloud in its box frame."""
 
     static: PointCloud
     objects: Mapping[str, PointCloud]
@@ -326,7 +335,19 @@ class FusedCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A prepared driving log. Files are referenced, not loaded; ``root`` is a directory or a stored zip."""
+    """A prepared driving log. Files are referenced, not loaded.
+
+    Args:
+        id: name of the log.
+        root: directory or stored zip that the references are relative to.
+        cameras: by name.
+        frames: images, in time order per camera.
+        sweeps: LiDAR sweeps, in time order per sensor.
+        tracks: tracked boxes.
+        ego: path of the vehicle.
+        split: frame id -> ``train`` or ``test``; frames not named are for training.
+        source: data set, licence, notes.
+    """
 
     id: str
     root: str
@@ -345,9 +366,8 @@ class Scene:
     def frames_of(self, camera: str) -> tuple[Frame, ...]:
         """Frames of one camera in time order. An unknown camera raises InputError with the names there are."""
         if camera not in self.cameras:
-            raise InputError(
-                "the scene has no such camera", where=self.root, expected=", ".join(self.cameras), got=camera
-            )
+            names = ", ".join(self.cameras)
+            raise InputError("the scene has no such camera", where=self.root, expected=names, got=camera)
         return tuple(f for f in self.frames if f.view.camera.name == camera)
 
     def frames_in(self, split: Literal["train", "test"]) -> tuple[Frame, ...]:
@@ -393,18 +413,13 @@ class Condition:
 
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
-        _check_tensor(self.color, "condition.color", (t, 3, h, w))
-        _check_tensor(self.depth, "condition.depth", (t, 1, h, w))
-        _check_tensor(self.valid, "condition.valid", (t, 1, h, w))
-        _check_tensor(self.reference, "condition.reference", (3, h, w))
-        if self.warped is not None:
-            _check_tensor(self.warped, "condition.warped", (t, 1, h, w))
-        if self.backdrop is not None:
-            _check_tensor(self.backdrop, "condition.backdrop", (t, 3, h, w))
-        if self.semantics is not None:
-            _check_tensor(self.semantics, "condition.semantics", (t, 1, h, w))
-        if self.backdrop_semantics is not None:
-            _check_tensor(self.backdrop_semantics, "condition.backdrop_semantics", (t, 1, h, w))
+        one = (t, 1, h, w)
+        checks.check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
+        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one)
+
+    def to(self, device: torch.device) -> Condition:
+        """The same condition with its tensors on a device."""
+        return replace(self, **_moved(self, device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -413,8 +428,10 @@ class Clip:
 
     Args:
         rgb: f32[T, 3, H, W] in [0, 1].
-        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W].
+        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W]; elsewhere it only fills a gap.
         semantics: i64[T, H, W] train ids, 255 = unlabelled.
+        shift_m: lateral shift from the recorded path, metres, positive to the left.
+        point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring only.
     """
 
     condition: Condition
@@ -422,13 +439,18 @@ class Clip:
     depth: Tensor
     depth_valid: Tensor
     semantics: Tensor
+    shift_m: float = 0.0
+    point_color: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, _, h, w = self.condition.color.shape
-        _check_tensor(self.rgb, "clip.rgb", (t, 3, h, w))
-        _check_tensor(self.depth, "clip.depth", (t, 1, h, w))
-        _check_tensor(self.depth_valid, "clip.depth_valid", (t, 1, h, w))
-        _check_tensor(self.semantics, "clip.semantics", (t, h, w))
+        one = (t, 1, h, w)
+        checks.check_tensors(self, rgb=(t, 3, h, w), depth=one, depth_valid=one, semantics=(t, h, w))
+        checks.check_given_tensors(self, point_color=(t, 3, h, w))
+
+    def to(self, device: torch.device) -> Clip:
+        """The same clip with its tensors on a device."""
+        return replace(self, condition=self.condition.to(device), **_moved(self, device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -436,6 +458,7 @@ class Observation:
     """What is known, or believed, about one view. Recorded and generated frames are this same type.
 
     Args:
+        view: camera, pose and time; H x W is the camera's size.
         rgb: f32[3, H, W] in [0, 1].
         depth: f32[1, H, W] metres, or None if not produced; not finite or <= 0 = no depth (sky).
         semantics: i64[H, W] train ids (255 = unlabelled), or None if not produced.
@@ -456,13 +479,8 @@ class Observation:
 
     def __post_init__(self) -> None:
         h, w = self.view.camera.height, self.view.camera.width
-        _check_tensor(self.rgb, "observation.rgb", (3, h, w))
-        if self.depth is not None:
-            _check_tensor(self.depth, "observation.depth", (1, h, w))
-        if self.semantics is not None:
-            _check_tensor(self.semantics, "observation.semantics", (h, w))
-        _check_tensor(self.confidence, "observation.confidence", (1, h, w))
-        _check_tensor(self.mask, "observation.mask", (1, h, w))
+        checks.check_tensors(self, rgb=(3, h, w), confidence=(1, h, w), mask=(1, h, w))
+        checks.check_given_tensors(self, depth=(1, h, w), semantics=(h, w))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -470,11 +488,15 @@ class Gaussians:
     """Gaussians in the world, activated (scales in metres, never their logarithm; opacity in [0, 1]).
 
     Args:
-        means: f32[N, 3] metres. quats: f32[N, 4] (w, x, y, z), need not be normalised. scales: f32[N, 3] metres.
-        opacity: f32[N]. sh: f32[N, K, 3] spherical harmonics, K = (degree + 1)^2.
+        means: f32[N, 3] metres.
+        quats: f32[N, 4] (w, x, y, z), need not be normalised.
+        scales: f32[N, 3] metres.
+        opacity: f32[N] in [0, 1].
+        sh: f32[N, K, 3] spherical harmonics, K = (degree + 1)^2.
         sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a tensor of their own (``sh`` is then
             f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms without a copy.
-        extra: f32[N, C] feature channels rendered like colours, or None. node: i32[N] index of the scene node.
+        extra: f32[N, C] feature channels rendered like colours, or None.
+        node: i32[N] index of the scene node.
     """
 
     means: Tensor
@@ -488,16 +510,9 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
-        _check_tensor(self.means, "gaussians.means", (n, 3))
-        _check_tensor(self.quats, "gaussians.quats", (n, 4))
-        _check_tensor(self.scales, "gaussians.scales", (n, 3))
-        _check_tensor(self.opacity, "gaussians.opacity", (n,))
-        _check_tensor(self.sh, "gaussians.sh", (n, None if self.sh_rest is None else 1, 3))
-        if self.sh_rest is not None:
-            _check_tensor(self.sh_rest, "gaussians.sh_rest", (n, None, 3))
-        if self.extra is not None:
-            _check_tensor(self.extra, "gaussians.extra", (n, None))
-        _check_tensor(self.node, "gaussians.node", (n,))
+        sh = (n, None if self.sh_rest is None else 1, 3)
+        checks.check_tensors(self, means=(n, 3), quats=(n, 4), scales=(n, 3), opacity=(n,), sh=sh, node=(n,))
+        checks.check_given_tensors(self, sh_rest=(n, None, 3), extra=(n, None))
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -522,9 +537,15 @@ class RasterTrace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Render:
-    """A rendered view: ``rgb`` f32[3, H, W]; ``depth`` f32[1, H, W] metres, expected z (accumulated / alpha);
-    ``alpha`` f32[1, H, W]; ``extra`` f32[C, H, W] or None (accumulated, not divided by alpha). Several views drawn at once
-    add a leading dimension V to everything."""
+    """A rendered view. Several views drawn at once add a leading dimension V to everything.
+
+    Args:
+        rgb: f32[3, H, W].
+        depth: f32[1, H, W] metres: expected camera z (accumulated / alpha).
+        alpha: f32[1, H, W] in [0, 1].
+        extra: f32[C, H, W] or None: accumulated, not divided by alpha.
+        trace: what densification needs.
+    """
 
     rgb: Tensor
     depth: Tensor

@@ -13,7 +13,7 @@ the best such motion (shift and yaw, one per object) is taken out, before and af
 over the keys of frames in which the object shows at least `SEEN_PX` pixels, held-out frames included. Of an offset, which is such a
 motion, nothing can be recovered from pictures; there, the test is that pictures do not suffer and boxes do not drift.
 
-Things in generated cities move evenly, which flatters smoothing: of independent noise, the smooth path alone (poses "smoothed": no
+Objects in generated cities move evenly, which flatters smoothing: of independent noise, the smooth path alone (poses "smoothed": no
 picture consulted) takes out most. Drift is the case in which only the pictures can help.
 """
 
@@ -29,23 +29,25 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry, log, seeds, store
 from mudg.base.config import to_dict
+from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Scene, Track
 from mudg.core import metrics
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.city import CityConfig, write_city
 from mudg.data.scene import read_image, read_label, read_scene
-from mudg.models.scene.nodes import RigidNode, SceneModel
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, FitConfig, FuseConfig
-from mudg.stages.fitting.views import ViewSet, classes_of, load_recorded, training_frames
+from mudg.stages.config.fit import DensifyConfig, PoseConfig, RecordedLossConfig, StartConfig
 from mudg.stages.fuse import rules_of, scene_sweeps
 
 LISTS: dict[str, tuple[int, ...]] = {
     "development": (2_000_000, 2_000_001, 2_000_002, 2_000_003),
     "reported": tuple(range(2_000_100, 2_000_106)),
 }
-"""Seeds of cities: to look at while choosing, and to report on."""
+"""Seeds of cities: for development, and to report on."""
 NOISE_M, NOISE_RAD = 0.1, np.radians(1.0)
 SEEN_PX, FEWEST_KEYS = 60, 4
 FRAMES, WIDTH, HEIGHT = 16, 240, 160
@@ -95,9 +97,9 @@ def _rows_of_case(config: BenchConfig, scene: Scene, city: int, kind: str, out: 
 def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
     """A small, quick fit with poses "fixed", "learnt", or only "smoothed"."""
     return FitConfig(
-        method="street_gaussians", iterations=config.pose_iterations, learn_poses=poses != "fixed",
-        pose_rounds=0 if poses == "smoothed" else FitConfig().pose_rounds, initial_gaussians=8000, densify=False,
-        semantic_every=1000, preview_every=10**6, checkpoint_every=10**6, seed=config.seed,
+        method="street_gaussians", iterations=config.pose_iterations, seed=config.seed, preview_every=10**6, checkpoint_every=10**6,
+        start=StartConfig(gaussians=8000), densify=DensifyConfig(kind="none"), loss=RecordedLossConfig(semantic_every=1000),
+        poses=PoseConfig(learn=poses != "fixed", rounds=0 if poses == "smoothed" else PoseConfig().rounds),
     )  # fmt: skip
 
 
@@ -128,14 +130,11 @@ def disturbed(tracks: tuple[Track, ...], kind: str, seed: int) -> tuple[Track, .
 
 def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> fit.FitState:
     """Fit in memory; ``folder`` takes the log and the pictures."""
-    recipe = fit.RECIPES[config.method]
-    frames = training_frames(scene, config.cameras)
-    classes = classes_of(scene, frames, None) if config.semantics else ()
-    views = ViewSet(
-        load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0), ()
-    )
-    state = fit.start_state(config, recipe, scene, cloud, views, classes)
-    run = store.RunDir.open(folder, "fit", to_dict(config), {}, fit.VERSION, overwrite=True)
+    state = fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene))
+    run = RunDir.open(folder, fit.OUTPUT, to_dict(config), {})
+    if not run.fresh:  # the fit starts again, and so does its log
+        run.discard()
+        run = RunDir.open(folder, fit.OUTPUT, to_dict(config), {})
     fit.optimise(state, config, run)
     return state
 
@@ -164,7 +163,7 @@ def pose_errors(truth: NDArray[np.float64], keys: NDArray[np.float64], free: boo
 
 
 def row_of(truth: Scene, given: Scene, model: SceneModel) -> dict[str, Any]:
-    """Errors of every object that was seen at four keys or more, and PSNR on moving things in held-out frames."""
+    """Errors of every object that was seen at four keys or more, and PSNR on dynamic objects in held-out frames."""
     objects, keys_seen = [], seen_keys(truth)
     for node in model.nodes:
         if not isinstance(node, RigidNode) or len(keys_seen[node.name]) < FEWEST_KEYS:
@@ -183,7 +182,7 @@ def row_of(truth: Scene, given: Scene, model: SceneModel) -> dict[str, Any]:
 
 
 def moving_psnr(scene: Scene, model: SceneModel) -> float:
-    """PSNR over all pixels of moving things in the held-out frames together; NaN where there are none."""
+    """PSNR over all pixels of dynamic objects in the held-out frames together; NaN where there are none."""
     errors = []
     for frame in scene.frames_in("test"):
         moving = torch.from_numpy(read_label(scene, frame, "dynamic").astype(bool))
@@ -196,7 +195,7 @@ def moving_psnr(scene: Scene, model: SceneModel) -> float:
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Per kind of box and way of fitting: errors pooled over keys, shares recovered, mean PSNR on moving things."""
+    """Per kind of box and way of fitting: errors pooled over keys, shares recovered, mean PSNR on dynamic objects."""
     made = []
     for kind, poses in dict.fromkeys((row["boxes"], row["poses"]) for row in rows):
         mine = [row for row in rows if (row["boxes"], row["poses"]) == (kind, poses)]
@@ -231,8 +230,8 @@ def table(result: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for row in result["summary"]:
-        asked = row["boxes"] in ("noise", "drift") and row["poses"] != "fixed"
-        shares = [f"{row[f'recovered_{unit}']:.0%}" if asked else "-" for unit in ("m", "rad")]
+        recoverable = row["boxes"] in ("noise", "drift") and row["poses"] != "fixed"
+        shares = [f"{row[f'recovered_{unit}']:.0%}" if recoverable else "-" for unit in ("m", "rad")]
         degrees = [np.degrees(row[f"{when}_rad"]) for when in ("before", "after")]
         lines.append(
             f"| {row['boxes']} | {row['poses']} | {row['objects']} | {row['before_m']:.3f} | {row['after_m']:.3f} | {shares[0]} "

@@ -2,7 +2,6 @@
 
 mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
                without given classes, at several numbers of steps, and the seam between windows of a longer video
-mdm-ablation   what of its condition the model lives on (see `bench_ablation`)
 poses          how much of the error of tracked boxes a fit takes out (see `bench_poses`); needs no diffusion model
 shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
 
@@ -14,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +23,22 @@ import torch
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
-from mudg.bench import mdm_ablation
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.bench import poses as bench_poses
 from mudg.bench import shift as bench_shift
 from mudg.core import flicker
 from mudg.data.clips import from_city
-from mudg.data.clips.condition import ConditionRules, Source, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
 from mudg.data.clips.from_city import CityClipRules
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import SampleRequest
+from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages.config import BenchConfig, SynthesizeConfig
 from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
-_VERSION = 1
+_FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "fits/", "rows/*.json")
 SHIFT = "shift"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
@@ -52,9 +53,9 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
         return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
         raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
-    read = {"mdm": config.model, "mdm-ablation": "embedded"}.get(name)  # poses reads no diffusion model
-    inputs = {} if read is None else {"model": mdm.digest(read)}
-    directory = store.RunDir.open(out, f"bench {name}", to_dict(config), inputs, _VERSION, overwrite)
+    inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
+    directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), to_dict(config), inputs, overwrite)
     if directory.complete:
         return directory.reused()
     torch.set_num_threads(config.threads)
@@ -66,11 +67,13 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
 
 
 def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    model = mdm.load(config.model)
     bf16 = choose_bf16(config.precision)
+    request = SampleRequest(1, config.seed, sampler=config.sampler, eta=config.eta, bf16=bf16)
+    MDM.check_request(request)
+    model = mdm_files.load(config.model)
     cities, rules = from_city.LISTS[config.cities][: config.count], CityClipRules(window=model.config.window)
     from_city.write_missing(rules, cities, out / "clips")
-    result: dict[str, Any] = {"cities": list(cities), "model": mdm.digest(config.model), "bf16": bf16, "rows": []}
+    result: dict[str, Any] = {"cities": list(cities), "model": mdm_files.digest(config.model), "bf16": bf16, "rows": []}
     lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
     with log.task("scoring", 2 * len(config.steps)) as bar:
         for given in (True, False):
@@ -78,8 +81,8 @@ def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
                 picture = out / f"steps_{steps}_{'classes' if given else 'plain'}.png"
                 started = time.perf_counter()
                 scores = learn_score.score(
-                    model, cities, out / "clips", steps=steps, seed=config.seed, bf16=bf16, eta=config.eta,
-                    sampler=config.sampler, prepare=None if given else learn_score.without_classes, picture=picture,
+                    model, cities, out / "clips", replace(request, steps=steps),
+                    prepare=None if given else learn_score.without_classes, picture=picture,
                 )  # fmt: skip
                 seconds = (time.perf_counter() - started) / scores["clips"]
                 row = {"steps": steps, "given_classes": given, "seconds_per_clip": round(seconds, 2), "scores": scores}
@@ -105,7 +108,7 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     views = [from_city.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
     truths = [record.world.render(v.resized(rules.width, rules.height)) for v in views]
     sizes = (rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
-    sources: dict[int, Source] = {}
+    sources: dict[int, WarpSource] = {}
     frames: list[torch.Tensor] = []
     tail: dict[Any, torch.Tensor] = {}
     spans = windows(len(views), model.config.window, usual.overlap)
@@ -115,9 +118,7 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
         )
         shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
-        made = model.sample(condition, steps=usual.steps, seed=config.seed, index=number, known=known, bf16=bf16)
-        if made.rgb is None:
-            raise UsageError("the model makes no colour", where=config.model)
+        made = model.sample(condition, SampleRequest(usual.steps, config.seed, number, known=known, bf16=bf16))
         frames += list(made.rgb[shared if tail else 0 :])
         tail = dict(made.latents)
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
@@ -145,7 +146,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
-    "mdm-ablation": mdm_ablation.measure,
     "poses": bench_poses.measure,
 }
 """Every measurement that is one folder, by name."""

@@ -26,15 +26,17 @@ import yaml
 from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.errors import UsageError
+from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, is_temporary, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationWriter, read_observations
+from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
-from mudg.models.mdm import model as mdm
+from mudg.methods import METHODS
+from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
 from mudg.stages import fit, fuse, ingest, render, score, score_truth, synthesize
 from mudg.stages.config import (
@@ -53,8 +55,8 @@ PERCEPTUAL_VIEWS: Final = 12
 WITHOUT, WITH, DIFFUSION, FILL = "street_gaussians", "mudg_s", "mudg_r", score.BASELINE
 GENERATED: Final = (FILL, DIFFUSION)
 """Methods without a fit."""
-_NO_DEPTH: Final = {"virtual_depth_weight": 0.0, "virtual_lidar_weight": 0.0}
-_NO_CLASSES: Final = {"virtual_semantic_weight": 0.0}
+_NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
+_NO_CLASSES: Final = {"semantic_weight": 0.0}
 ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
     "only_I": ("virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
     "only_I_D": ("virtual colour and depth", _NO_CLASSES),
@@ -65,12 +67,14 @@ ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
 virtual views can bring at this number of steps."""
 EXACT: Final = "exact"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
-_VERSION = 1
+_PAGES: Final = ("bench.json", "bench.md", "page.html")
+_FILL_OUTPUT: Final = VerbOutput(FILL, 1, below("*", OBSERVATION_FILES))
+_EXACT_OUTPUT: Final = VerbOutput(EXACT, 1, below("*", OBSERVATION_FILES))
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method to compare: its name in tables and folders, words for it, and the settings of its fit (None = no fit)."""
+    """A method to compare: its name in tables and folders, its title, and the settings of its fit (None = no fit)."""
 
     name: str
     title: str
@@ -107,6 +111,8 @@ def run(
         UsageError: an unknown method, a malformed variant, or ``out`` holds logs of other settings. Whatever a verb raises.
     """
     rows = rows_of(config)
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
+    _refuse_foreign(Path(out))
     seeds = city_logs.LISTS[config.list][: config.logs]
     shifts = tuple(sign * d for d in distances_m for sign in (1.0, -1.0))
     painted = SynthesizeConfig(
@@ -127,6 +133,23 @@ def run(
     store.write_text(Path(out) / "bench.md", shift_tables.markdown(document))
     store.write_text(Path(out) / "page.html", shift_page.page(document))
     return Path(out)
+
+
+def _refuse_foreign(out: Path) -> None:
+    """UsageError if a folder holds anything that this measurement does not write."""
+    if not out.exists():
+        return
+    names = [entry.name for entry in out.iterdir() if not is_temporary(entry.name)] if out.is_dir() else [out.name]
+    foreign = [name for name in names if name not in _PAGES and not name.isdigit()]
+    if not foreign and any(name in _PAGES for name in names):
+        try:
+            document = store.read_json(out / _PAGES[0])
+            foreign = [] if document["schema"] == 1 and "methods" in document else [_PAGES[0]]
+        except (InputError, KeyError, TypeError):
+            foreign = [name for name in names if name in _PAGES]
+    if foreign:
+        raise UsageError("the output folder holds files of something else", where=str(out), got=", ".join(sorted(foreign)[:8]),
+                         remedy="choose an empty --out")  # fmt: skip
 
 
 # ---- what is compared ----
@@ -151,9 +174,8 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
         if name in wanted
     ]
     if config.ablation:
-        rows += [
-            Row(name, f"with {words}", replace(plain, **dict(weights))) for name, (words, weights) in ABLATION.items()
-        ]  # type: ignore[arg-type]
+        for name, (description, weights) in ABLATION.items():
+            rows.append(Row(name, f"with {description}", configuration.load(FitConfig, plain, overrides={"virtual": weights})))
     for text in config.variant:
         rows.append(variant_of(text, plain))
     names = [row.name for row in rows]
@@ -167,7 +189,8 @@ def _with_method(plain: FitConfig, name: str) -> FitConfig:
 
 
 def variant_of(text: str, plain: FitConfig) -> Row:
-    """A row from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML. UsageError if malformed or no field of ``FitConfig``."""
+    """A row from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field. UsageError if malformed or
+    no field of ``FitConfig``."""
     name, separator, rest = text.partition("=")
     fields: dict[str, Any] = {}
     for part in rest.split(","):
@@ -178,7 +201,7 @@ def variant_of(text: str, plain: FitConfig) -> Row:
             fields[field.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
             raise UsageError("malformed value", where=f"--variant {name}: {field}", got=value) from error
-    changed = configuration.load(FitConfig, plain, overrides=fields)
+    changed = configuration.load(FitConfig, plain, overrides=configuration.nested(fields))
     return Row(name, f"{name}: {rest}", changed)
 
 
@@ -192,7 +215,7 @@ def rows_as_values(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
     """What was asked for, for JSON."""
     return {
-        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm.digest(config.model),
+        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
         "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
         "held_out_every": TEST_EVERY, "ablation": config.ablation,
     }  # fmt: skip
@@ -253,7 +276,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
     _made(job, lambda o: ingest.run(IngestConfig(test_every=TEST_EVERY, city=city), ingest.CITY, scene, overwrite=o))
     fused, painted = out / "fuse", out / "synthesize"
     _made(job, lambda o: fuse.run(FuseConfig(), scene, fused, overwrite=o))
-    if any(row.name == DIFFUSION or (row.fit is not None and fit.RECIPES[row.fit.method].virtual) for row in job.rows):
+    if any(row.name == DIFFUSION or (row.fit is not None and "virtual" in METHODS[row.fit.method].supervision) for row in job.rows):
         _made(job, lambda o: synthesize.run(job.synthesize, scene, fused, painted, overwrite=o))
     drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False)
     paths = render.trajectories(read_scene(scene), drawn)
@@ -275,8 +298,8 @@ def make_log(job: LogJob) -> dict[str, Any]:
         films = [path.name for path in paths]
     facts = city_logs.facts(job.seed, job.rules)
     return {
-        "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.movers,
-        "mover_share": round(facts.mover_share, 4), "words": facts.words, "films": films, "values": found,
+        "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
+        "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": found,
         "seconds": _seconds(out),
     }  # fmt: skip
 
@@ -320,40 +343,44 @@ def _scores_of(job: LogJob, row: Row, views: Path) -> dict[str, Any]:
 
 def write_fill(scene: Path, fused: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
     """The scorer's baseline on some trajectories as folders of views, so that it is a method like the others."""
+    refuse_overlap(out, {"scene": scene, "fused": fused})
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused)}
-    folder = store.RunDir.open(out, FILL, {"trajectories": [path.name for path in paths]}, inputs, _VERSION, overwrite)
+    folder = RunDir.open(out, _FILL_OUTPUT, {"trajectories": [path.name for path in paths]}, inputs, overwrite)
     if folder.complete:
         return folder.reused()
     fill = score.baseline_of(read_scene(scene), read_fused(fused))
     with log.task(FILL, sum(map(len, paths))) as bar:
         for path in paths:
-            with ObservationWriter(out / path.name, path.name, FILL) as writer:
+            with ObservationWriter(folder.path / path.name, path.name, FILL) as writer:
                 for index, view in enumerate(path.views):
                     writer.skip(view) if index < writer.done else writer.add(fill(view))
                     bar.advance()
     folder.finish({"trajectories": [path.name for path in paths]})
-    return out
+    return folder.path
 
 
 def write_exact(truth: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
     """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
+    refuse_overlap(out, {"truth": truth})
     shifted = [path.name for path in paths if path.origin == "shifted"]
-    folder = store.RunDir.open(out, EXACT, {"trajectories": shifted}, {"truth": store.digest(truth)}, _VERSION, overwrite)
+    folder = RunDir.open(out, _EXACT_OUTPUT, {"trajectories": shifted}, {"truth": store.digest(truth)}, overwrite)
     if folder.complete:
         return folder.reused()
     for name in shifted:
         views = read_observations(truth / name)
-        with ObservationWriter(out / name, name, EXACT) as writer:
+        with ObservationWriter(folder.path / name, name, EXACT) as writer:
             for index in range(len(views)):
                 seen = views[index]
                 writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
     folder.finish({"trajectories": shifted})
-    return out
+    return folder.path
 
 
 def _seconds(out: Path) -> dict[str, float]:
     """Seconds of each finished step, by folder."""
-    steps = sorted(path for path in out.glob("**/run.json") if len(path.relative_to(out).parts) <= 3)
+    steps = sorted(path.relative_to(out) for path in out.glob("**/run.json"))
     return {
-        path.parent.relative_to(out).as_posix(): float(store.read_json(path).get("seconds", math.nan)) for path in steps
+        path.parent.as_posix(): float(store.read_json(out / path).get("seconds", math.nan))
+        for path in steps
+        if len(path.parts) <= 3 and ".part" not in str(path)
     }

@@ -7,12 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from mudg.report.score_tables import markdown_table
+
 RECORDED: Final = "0"
 SHIFTED: Final = "shifted"
 """The mean over the lateral distances."""
 COLUMNS: Final[tuple[tuple[str, str, int], ...]] = (
     ("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("perceptual", "perceptual", 4), ("abs_rel", "AbsRel", 4), ("rmse_m", "RMSE m", 2),
-    ("delta1", "delta1", 4), ("miou", "mIoU", 3), ("flicker", "flicker", 3), ("psnr_movers", "PSNR of movers", 2),
+    ("delta1", "delta1", 4), ("miou", "mIoU", 3), ("flicker", "flicker", 3), ("psnr_movers", "PSNR of dynamic objects", 2),
 )  # fmt: skip
 """Metric, heading, digits."""
 
@@ -33,27 +35,24 @@ class Comparison:
     kind: Literal["difference", "ratio"]
 
 
-def _titles() -> dict[str, str]:
-    return {name: heading for name, heading, _ in COLUMNS}
-
-
-def _against(a: str, b: str, place: str, where: str, of: str) -> tuple[Comparison, ...]:
-    titles = _titles()
+def _against(a: str, b: str, place: str, metrics: str) -> tuple[Comparison, ...]:
+    where = "recorded path" if place == RECORDED else "off the recorded path"
+    titles = {name: heading for name, heading, _ in COLUMNS}
     return tuple(
         Comparison(f"{a} against {b}, {where}: {titles[m]}", a, b, place, m, "ratio" if m in RATIOS else "difference")
-        for m in of.split()
+        for m in metrics.split()
     )
 
 
 COMPARISONS: Final[tuple[Comparison, ...]] = (
-    *_against("mudg_s", "street_gaussians", SHIFTED, "beside the path", "psnr ssim perceptual abs_rel rmse_m delta1 miou"),
-    *_against("mudg_s", "street_gaussians", SHIFTED, "beside the path", "flicker psnr_movers"),
-    *_against("mudg_s", "mudg_r", SHIFTED, "beside the path", "psnr perceptual abs_rel miou flicker"),
-    *_against("mudg_s", "street_gaussians", RECORDED, "recorded path", "psnr ssim perceptual abs_rel miou"),
-    *_against("street_gaussians", "gs3d", RECORDED, "recorded path", "psnr psnr_movers"),
-    *_against("street_gaussians", "gs3d", SHIFTED, "beside the path", "psnr psnr_movers"),
-    *_against("mudg_s", "nearest_fill", SHIFTED, "beside the path", "psnr perceptual abs_rel miou"),
-    *_against("mudg_r", "nearest_fill", SHIFTED, "beside the path", "psnr perceptual abs_rel miou"),
+    *_against("mudg_s", "street_gaussians", SHIFTED, "psnr ssim perceptual abs_rel rmse_m delta1 miou"),
+    *_against("mudg_s", "street_gaussians", SHIFTED, "flicker psnr_movers"),
+    *_against("mudg_s", "mudg_r", SHIFTED, "psnr perceptual abs_rel miou flicker"),
+    *_against("mudg_s", "street_gaussians", RECORDED, "psnr ssim perceptual abs_rel miou"),
+    *_against("street_gaussians", "gs3d", RECORDED, "psnr psnr_movers"),
+    *_against("street_gaussians", "gs3d", SHIFTED, "psnr psnr_movers"),
+    *_against("mudg_s", "nearest_fill", SHIFTED, "psnr perceptual abs_rel miou"),
+    *_against("mudg_r", "nearest_fill", SHIFTED, "psnr perceptual abs_rel miou"),
 )  # fmt: skip
 ABLATION_ROWS: Final = (
     ("street_gaussians", "none"), ("only_I", "+ I"), ("only_I_D", "+ I + D"), ("only_I_S", "+ I + S"), ("mudg_s", "+ I + D + S"),
@@ -71,7 +70,7 @@ def document(
 
     Args:
         logs: per log its facts, ``values[method][distance][metric]`` (a number, or why there is none) and seconds.
-        rows: name, title and fit of each method. distances_m: beside the path. settings: what was asked for.
+        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the bench.
     """
     places = [RECORDED, *(f"{d:g}" for d in sorted(distances_m))]
     full = [{**entry, "values": {m: _with_mean(of, places[1:]) for m, of in entry["values"].items()}} for entry in logs]
@@ -86,8 +85,8 @@ def document(
         "comparisons": [compare(full, c) for c in COMPARISONS if {c.a, c.b} <= names],
         "variants": [
             {"name": r["name"], "against_mudg_s": [
-                compare(full, c) for place, where in ((SHIFTED, "beside the path"), (RECORDED, "recorded path"))
-                for c in _against(r["name"], "mudg_s", place, where, "psnr perceptual abs_rel miou")
+                compare(full, c) for place in (SHIFTED, RECORDED)
+                for c in _against(r["name"], "mudg_s", place, "psnr perceptual abs_rel miou")
             ]}
             for r in rows if "mudg_s" in names and r["fit"] is not None and r["name"] not in ("gs3d", "street_gaussians", "mudg_s")
         ],
@@ -95,7 +94,7 @@ def document(
 
 
 def _with_mean(of: Mapping[str, Mapping[str, Any]], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The values of one method and log with the mean over the distances beside the path."""
+    """The values of one method and log with the mean over the distances off the recorded path."""
     mean: dict[str, Any] = {}
     for metric, _, _ in COLUMNS:
         values = [of.get(place, {}).get(metric, "not produced") for place in shifted]
@@ -163,7 +162,7 @@ def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[
     return math.sqrt((count - 1) / count * sum((v - center) ** 2 for v in known))
 
 
-# ---- Markdown ----
+# ---- text ----
 
 
 def markdown(doc: Mapping[str, Any]) -> str:
@@ -171,21 +170,23 @@ def markdown(doc: Mapping[str, Any]) -> str:
     settings = doc["settings"]
     width, height = settings["size_px"]
     lines = [
-        f"# Beside the recorded path: {logs_text(doc)} of the {settings['list']} list", "",
+        f"# Off the recorded path: {logs_text(doc)} of the {settings['list']} list", "",
         f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
         f"frame held out; {settings['iterations']} iterations per fit, seed {settings['seed']}. Means over both sides and all logs, +- the "
-        "standard error over logs. Flicker: 1 = as calm as the truth. Perceptual: features of the shipped codec, not LPIPS.", "",
-        *_facts(doc), "",
+        "standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped codec, not LPIPS.", "",
+        *markdown_table(FACTS, [facts_of(entry) for entry in doc["logs"]]), "",
     ]  # fmt: skip
-    for place in [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]:
-        lines += [f"## {place_title(doc, place)}", "", *_method_table(doc, place), ""]
-    lines += ["## Compared", "", *_comparison_table(doc["comparisons"]), ""]
+    headings = [heading for _, heading, _ in COLUMNS]
+    for place in places_of(doc):
+        rows = [[row["name"], *score_cells(doc, row["name"], place)] for row in doc["methods"]]
+        lines += [f"## {place_title(doc, place)}", "", *markdown_table(["method", *headings], rows), ""]
+    lines += ["## Comparisons", "", *_comparison_table(doc["comparisons"]), ""]
     if any(r["name"] == "only_I" for r in doc["methods"]):
         lines += ["## Which virtual term does what", "", *_ablation_table(doc), ""]
     for variant in doc["variants"]:
         lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
     lines += [
-        "## Each log, mean beside the path",
+        "## Each log, mean off the recorded path",
         "",
         *_log_table(doc),
         "",
@@ -197,8 +198,13 @@ def markdown(doc: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def places_of(doc: Mapping[str, Any]) -> list[str]:
+    """The recorded path, the distances from it, and their mean."""
+    return [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]
+
+
 def logs_text(doc: Mapping[str, Any]) -> str:
-    """How many logs, in words."""
+    """How many logs, as text."""
     count = len(doc["logs"])
     return f"{count} log{'s' if count != 1 else ''}"
 
@@ -213,38 +219,27 @@ def place_title(doc: Mapping[str, Any], place: str) -> str:
 
 
 def number(found: Any, digits: int, with_error: bool = False) -> str:
-    """A pooled value as text: the mean, with its standard error where that is asked for and known, or the reason for none."""
+    """A pooled value as text: the mean, with its standard error where that is wanted and known, or the reason for none."""
     if isinstance(found, str):
         return found
     error = found["standard_error"]
     return f"{found['mean']:.{digits}f}" + (f" +- {error:.{digits}f}" if with_error and error is not None else "")
 
 
-def _facts(doc: Mapping[str, Any]) -> list[str]:
-    lines = ["| " + " | ".join(FACTS) + " |", "|---" * len(FACTS) + "|"]
-    return lines + ["| " + " | ".join(facts_of(entry)) + " |" for entry in doc["logs"]]
+def score_cells(doc: Mapping[str, Any], method: str, place: str, with_error: bool = False) -> list[str]:
+    """A method's pooled values at a distance, one per row of ``COLUMNS``."""
+    return [number(doc["pooled"][method][place][m], digits, with_error) for m, _, digits in COLUMNS]
 
 
-FACTS: Final = ("log", "turn, degrees", "length, m", "moving vehicles in view", "their share of the picture", "city")
+FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city")
 
 
 def facts_of(entry: Mapping[str, Any]) -> list[str]:
     """Cells of a log's row under ``FACTS``."""
-    numbers = [
-        f"{entry['turn_deg']:.1f}",
-        f"{entry['length_m']:.0f}",
-        str(entry["movers"]),
-        f"{entry['mover_share']:.1%}",
-    ]
-    return [str(entry["log"]), *numbers, entry["words"]]
-
-
-def _method_table(doc: Mapping[str, Any], place: str) -> list[str]:
-    lines = ["| method | " + " | ".join(heading for _, heading, _ in COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for row in doc["methods"]:
-        of = doc["pooled"][row["name"]][place]
-        lines.append(f"| {row['name']} | " + " | ".join(number(of[m], digits) for m, _, digits in COLUMNS) + " |")
-    return lines
+    return [
+        str(entry["log"]), f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"]),
+        f"{entry['mover_share']:.1%}", entry["words"],
+    ]  # fmt: skip
 
 
 def compared_text(found: Mapping[str, Any]) -> tuple[str, str]:
@@ -258,48 +253,34 @@ def compared_text(found: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _comparison_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    lines = ["| | value | standard error | as | logs | each log |", "|---|---|---|---|---|---|"]
+    cells = []
     for found in rows:
-        value, error = compared_text(found)
         each = " ".join("-" if v is None else f"{v:.3g}" for v in found["per_log"])
-        lines.append(f"| {found['title']} | {value} | {error} | {found['kind']} | {found['logs']} | {each} |")
-    return lines
+        cells.append([found["title"], *compared_text(found), found["kind"], str(found["logs"]), each])
+    return markdown_table(["", "value", "standard error", "as", "logs", "each log"], cells)
 
 
 def _ablation_table(doc: Mapping[str, Any]) -> list[str]:
-    heads = ("psnr", "ssim", "perceptual", "abs_rel", "delta1", "miou")
-    digits = {name: d for name, _, d in COLUMNS}
-    lines = [
-        "| virtual terms | " + " | ".join(_titles()[m] for m in heads) + " |",
-        "|---" * (len(heads) + 1) + "|",
+    metrics = ("psnr", "ssim", "perceptual", "abs_rel", "delta1", "miou")
+    chosen = [column for column in COLUMNS if column[0] in metrics]
+    rows = [
+        [title, *(number(doc["pooled"][name][SHIFTED][m], digits, with_error=True) for m, _, digits in chosen)]
+        for name, title in ABLATION_ROWS
     ]
-    for name, words in ABLATION_ROWS:
-        of = doc["pooled"][name][SHIFTED]
-        lines.append(f"| {words} | " + " | ".join(number(of[m], digits[m], with_error=True) for m in heads) + " |")
-    return lines
+    return markdown_table(["virtual terms", *(heading for _, heading, _ in chosen)], rows)
 
 
 def _log_table(doc: Mapping[str, Any]) -> list[str]:
-    lines = [
-        "| log | method | " + " | ".join(heading for _, heading, _ in COLUMNS) + " |",
-        "|---" * (len(COLUMNS) + 2) + "|",
-    ]
+    rows = []
     for entry in doc["logs"]:
         for row in doc["methods"]:
-            of = entry["values"][row["name"]][SHIFTED]
-            cells = (v if isinstance(v := of[m], str) else f"{v:.{digits}f}" for m, _, digits in COLUMNS)
-            lines.append(f"| {entry['log']} | {row['name']} | " + " | ".join(cells) + " |")
-    return lines
+            values = entry["values"][row["name"]][SHIFTED]
+            cells = (v if isinstance(v := values[m], str) else f"{v:.{digits}f}" for m, _, digits in COLUMNS)
+            rows.append([str(entry["log"]), row["name"], *cells])
+    return markdown_table(["log", "method", *(heading for _, heading, _ in COLUMNS)], rows)
 
 
 def _seconds_table(doc: Mapping[str, Any]) -> list[str]:
-    steps = list(dict.fromkeys(step for entry in doc["logs"] for step in entry["seconds"]))
-    lines = [
-        "| step | " + " | ".join(str(entry["log"]) for entry in doc["logs"]) + " |",
-        "|---" * (len(doc["logs"]) + 1) + "|",
-    ]
-    for step in steps:
-        lines.append(
-            f"| {step} | " + " | ".join(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in doc["logs"]) + " |"
-        )
-    return lines
+    steps = dict.fromkeys(step for entry in doc["logs"] for step in entry["seconds"])
+    rows = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in doc["logs"])] for step in steps]
+    return markdown_table(["step", *(str(entry["log"]) for entry in doc["logs"])], rows)

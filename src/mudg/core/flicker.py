@@ -16,13 +16,13 @@ MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus"
 def flicker(
     made: Tensor, truth: Tensor, depth: Tensor, ids: Tensor, world_from_cam: Tensor, intrinsics: Tensor
 ) -> float:
-    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as calm as the truth).
+    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as steady as the truth).
 
     Arguments as for `changes`. NaN for one frame or without such pixels.
     """
     pairs = changes(made, truth, depth, ids, world_from_cam, intrinsics)
-    of_truth = sum(t for _, t in pairs)
-    return sum(m for m, _ in pairs) / of_truth if of_truth > 0 else math.nan
+    true_change = sum(t for _, t in pairs)
+    return sum(m for m, _ in pairs) / true_change if true_change > 0 else math.nan
 
 
 def changes(
@@ -34,16 +34,16 @@ def changes(
     Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
     there (bilinear), if the same surface is seen there (depths within 3 %).
     """
-    seen = [Seen(*one) for one in zip(depth, ids, world_from_cam, intrinsics, strict=True)]
+    frames = [TrueFrame(*one) for one in zip(depth, ids, world_from_cam, intrinsics, strict=True)]
     pairs = []
     for t in range(len(truth) - 1):
-        where = carried(seen[t], seen[t + 1])
+        where = pixel_motion(frames[t], frames[t + 1])
         pairs.append((change(made[t], made[t + 1], where), change(truth[t], truth[t + 1], where)))
     return pairs
 
 
 @dataclass(frozen=True)
-class Seen:
+class TrueFrame:
     """Truth of one frame: depth f32[1,H,W] metres, ids i64[H,W], world_from_cam f64[4,4], intrinsics f64[4]: fx, fy, cx, cy."""
 
     depth: Tensor
@@ -53,7 +53,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Carried:
+class PixelMotion:
     """Where each pixel of a frame lies in the next one: ``there`` f32[1,H,W,2] in [-1, 1] as `grid_sample` takes it; ``same``
     bool[H,W]: static, and the same surface is seen there."""
 
@@ -61,7 +61,7 @@ class Carried:
     same: Tensor
 
 
-def carried(frame: Seen, following: Seen) -> Carried:
+def pixel_motion(frame: TrueFrame, following: TrueFrame) -> PixelMotion:
     """Carry every pixel of a frame by its depth into the following one."""
     height, width = frame.ids.shape
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -74,14 +74,14 @@ def carried(frame: Seen, following: Seen) -> Carried:
     fx, fy, cx, cy = following.intrinsics.float()
     there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[None]
     within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)
-    depth_there = _looked_up(following.depth, there, "nearest")[0]
-    return Carried(there, within & static & ((depth_there / ahead - 1).abs() < 0.03))
+    depth_there = _sample_at(following.depth, there, "nearest")[0]
+    return PixelMotion(there, within & static & ((depth_there / ahead - 1).abs() < 0.03))
 
 
-def change(frame: Tensor, following: Tensor, where: Carried) -> float:
+def change(frame: Tensor, following: Tensor, where: PixelMotion) -> float:
     """Summed absolute change of colours f32[3,H,W] from a frame to the following one, over the pixels in ``where.same``."""
-    return float((_looked_up(following, where.there, "bilinear") - frame).abs().mean(0)[where.same].double().sum())
+    return float((_sample_at(following, where.there, "bilinear") - frame).abs().mean(0)[where.same].double().sum())
 
 
-def _looked_up(image: Tensor, there: Tensor, mode: str) -> Tensor:
+def _sample_at(image: Tensor, there: Tensor, mode: str) -> Tensor:
     return torch.nn.functional.grid_sample(image[None], there, mode=mode, align_corners=False)[0]

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from mudg.base import palette
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, yaw_of
-from mudg.base.types import FusedCloud, PointCloud, SweepPoints, Track, View
+from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 
 Matrix = NDArray[np.float64]
 STATIC: Final = -1
@@ -75,22 +75,13 @@ class FusionRules:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
-    """An image beside a sweep: ``rgb`` u8[H, W, 3] of ``view``, and ``semantics`` u8[H, W] train ids or None."""
-
-    view: View
-    rgb: NDArray[np.uint8]
-    semantics: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SweepShots:
     """A sweep (points in the LiDAR frame at ``time_s``) and the images that may colour it."""
 
     time_s: float
     world_from_lidar: Matrix
     points: SweepPoints
-    shots: Sequence[Shot]
+    shots: Sequence[Photo]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +103,7 @@ class FusionReport:
     points_in: int = 0
     points_static_in: int = 0
     points_moving_in: int = 0
-    points_coloured: int = 0
+    points_colored: int = 0
     points_unseen: int = 0
     points_hidden: int = 0
     points_static: int = 0
@@ -233,7 +224,7 @@ def _velocity_in_lidar(track: Track, sweep: SweepShots, step_s: float = 0.05) ->
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Colours:
+class Colors:
     """Colours of a sweep's points: ``seen`` bool[N]; ``rgb`` u8[N, 3], ``semantics`` u8[N] and ``depth_m`` f32[N] (to the
     camera that gave the colour) where seen; ``hidden`` bool[N]: in an image, but behind a nearer surface in all of them."""
 
@@ -244,13 +235,13 @@ class Colours:
     depth_m: NDArray[np.float32]
 
 
-def colour_points(
+def color_points(
     sweep: SweepShots,
     owner: NDArray[np.int32],
     owned: dict[int, NDArray[np.float32]],
     movers: Sequence[Track],
     rules: FusionRules,
-) -> Colours:
+) -> Colors:
     """Colours (and semantics) of a sweep's points from the images beside it; see the module text for the rules."""
     count = len(owner)
     best = np.full(count, -1.0, np.float32)
@@ -277,7 +268,7 @@ def colour_points(
         if shot.semantics is not None:
             votes.append((ids, shot.semantics[row, column], cosine))
     seen = best > 0
-    return Colours(seen, in_image & ~seen, rgb, _count_votes(votes, count), depth_m)
+    return Colors(seen, in_image & ~seen, rgb, _count_votes(votes, count), depth_m)
 
 
 def _points_in_camera(
@@ -543,26 +534,26 @@ def fuse_sweeps(
     for sweep in sweeps:
         labelled |= any(shot.semantics is not None for shot in sweep.shots)
         owner, owned = separate(sweep, movers, rules)
-        colours = colour_points(sweep, owner, owned, movers, rules)
-        keep = colours.seen & (owner == STATIC)
+        colors = color_points(sweep, owner, owned, movers, rules)
+        keep = colors.seen & (owner == STATIC)
         static.add(
             _apply(sweep.world_from_lidar, sweep.points.xyz[keep]),
-            colours.rgb[keep],
-            colours.semantics[keep],
-            colours.depth_m[keep],
+            colors.rgb[keep],
+            colors.semantics[keep],
+            colors.depth_m[keep],
         )
         for index, xyz_object in owned.items():
             ids = np.flatnonzero(owner == index)
-            seen = colours.seen[ids]
+            seen = colors.seen[ids]
             ids = ids[seen]
-            objects[index].add(xyz_object[seen], colours.rgb[ids], colours.semantics[ids], colours.depth_m[ids])
+            objects[index].add(xyz_object[seen], colors.rgb[ids], colors.semantics[ids], colors.depth_m[ids])
         report.sweeps += 1
         report.points_in += len(owner)
         report.points_moving_in += int((owner != STATIC).sum())
-        report.points_coloured += int(colours.seen.sum())
-        report.points_hidden += int(colours.hidden.sum())
+        report.points_colored += int(colors.seen.sum())
+        report.points_hidden += int(colors.hidden.sum())
     report.points_static_in = report.points_in - report.points_moving_in
-    report.points_unseen = report.points_in - report.points_coloured - report.points_hidden
+    report.points_unseen = report.points_in - report.points_colored - report.points_hidden
     static_cloud = static.cloud("world", labelled)
     report.points_static = len(static_cloud)
     clouds: dict[str, PointCloud] = {}

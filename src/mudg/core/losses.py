@@ -1,17 +1,20 @@
-"""Every loss of the scene fit, as pure functions: maps where they are maps, scalars where a sum is part of the idea.
+"""Every loss, as pure functions: of the scene fit (maps where they are maps, scalars where a sum is part of the idea) and of the
+diffusion model (scalars, below).
 
 All work in float32 and float64 and are differentiable in the prediction. Masks are boolean and never change the shape of
 the work. Published form: Street Gaussians (recorded views) and the supervision of MuDG's scene stage (virtual views).
 
     recorded:  (1 - w) L1 + w (1 - SSIM)  +  trimmed LiDAR depth  +  sky  +  semantics
     virtual:   perceptual + robust dense depth + semantics, every pixel weighted by the observation's confidence
+
+``core.fused`` holds native twins of some, ``core.perceptual`` the distance in a network's features. The losses of the diffusion
+model stand beside that model.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -25,6 +28,8 @@ SSIM_WINDOW: Final = 11
 SSIM_SIGMA_PX: Final = 1.5
 SSIM_C1: Final = 0.01**2
 SSIM_C2: Final = 0.03**2
+MAX_LOG_RATIO: Final = 2.0
+"""Depth painted farther than e^2 times the truth costs no more than that."""
 
 
 def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
@@ -82,7 +87,7 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
 
-    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.fused.photometric`` computes the same value and
+    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes the same value and
     gradient in one native pass.
     """
     if weight is not None:
@@ -171,7 +176,7 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
 def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
 
-    ``core.fused.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
+    ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
     """
     if lift is not None:
         logits = logits.index_add(0, torch.tensor([lift[0]], device=logits.device), lift[1].detach()[None].to(logits.dtype))
@@ -189,6 +194,28 @@ def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) 
     alpha = object_alpha.clamp(floor, 1 - floor)
     entropy = -(alpha * torch.log(alpha) + (1 - alpha) * torch.log(1 - alpha))
     return torch.where(inside_boxes, entropy, -torch.log(1 - alpha))
+
+
+# ---- regularisers ------------------------------------------------------------------------------------------------
+
+
+def opacity_and_scale(opacity: Tensor, scales_m: Tensor, opacity_weight: float, scale_weight: float) -> dict[str, Tensor]:
+    """Weighted mean opacity and mean scale of all Gaussians (Kheradmand et al. 2024), scalars by name; a weight of 0 leaves a term out.
+
+    Args:
+        opacity: ``[N]`` in [0, 1]. scales_m: ``[N, 3]`` metres.
+    """
+    terms = {}
+    if opacity_weight:
+        terms["opacity"] = opacity_weight * opacity.mean()
+    if scale_weight:
+        terms["scale"] = scale_weight * scales_m.mean()
+    return terms
+
+
+def identity_distance(difference: Tensor) -> Tensor:
+    """Mean absolute entry (scalar) of what a colour map differs from the identity by, ``[3, 4]`` (Street Gaussians)."""
+    return difference.abs().mean()
 
 
 # ---- features ----------------------------------------------------------------------------------------------------
@@ -209,29 +236,60 @@ def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Ten
     return total / len(prediction)
 
 
-def unit_feature_distance(
-    prediction: Sequence[Tensor], target: Sequence[Tensor], weight: Tensor, channel_weights: Sequence[Tensor] | None = None
-) -> Tensor:
-    """LPIPS-like distance (Zhang et al. 2018, eq. 1) with every place weighted by its confidence; see ``metrics.perceptual_distance``.
+# ---- diffusion model ---------------------------------------------------------------------------------------------
+# Every term is a plain mean over clips, so that the loss of a batch is the mean over its parts however it is divided.
+
+
+def latent_error(stated: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+    """Mean of ``weight`` times the squared error of latents ``[B, T, C, h, w]``."""
+    return (weight * (stated - truth).square()).mean()
+
+
+def latent_depth_error(stated: Tensor, truth: Tensor, weight: Tensor, known: Tensor) -> Tensor:
+    """As ``latent_error`` with 5 x Huber (delta 0.2), where depth is ``known``: share of the cell f32[B, T, 1, h, w]."""
+    return (weight * (F.huber_loss(stated, truth, reduction="none", delta=0.2) * 5.0) * known).mean()
+
+
+def share_cross_entropy(log_shares: Tensor, shares: Tensor, class_weights: Tensor | None) -> Tensor:
+    """Mean cross-entropy of class shares ``[B, T, C, h, w]`` under stated logarithms; weights of the classes ``[C]`` or None."""
+    weighted = shares if class_weights is None else shares * class_weights.view(-1, 1, 1)
+    return -(weighted * log_shares).sum(2).mean()
+
+
+def image_error(error: Tensor, square: float, gradient: float) -> Tensor:
+    """L1 of an error image ``[N, 3, H, W]`` + ``square`` x its mean square + ``gradient`` x the L1 of its differences."""
+    across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
+    return error.abs().mean() + square * error.square().mean() + gradient * (across.abs().mean() + down.abs().mean())
+
+
+def depth_code_error(made: Tensor, truth: Tensor, weight: Tensor, log_per_code: float) -> Tensor:
+    """5 x smooth L1 (beta 0.005) of made / true depth - 1, weighted; a plain mean over pixels.
+
+    A surface painted too far away costs more than one too near, as in the measure it is scored by.
 
     Args:
-        prediction, target: per stage ``[C_l, h_l, w_l]``; every place's vector is brought to length 1.
-        weight: ``[1, H, W]`` in [0, 1] at full size; averaged down to each stage.
-        channel_weights: per stage ``[C_l]``; the stages are then summed as LPIPS does, else averaged.
+        made, truth: codes ``[N, 1, H, W]``, taken for logarithms of depth in steps of ``log_per_code``.
+        weight: ``[N, 1, H, W]``; 0 where the truth is not known.
     """
-    total = prediction[0].new_zeros(())
-    for stage, (mine, theirs) in enumerate(zip(prediction, target)):
-        _same_shape(mine, theirs, "unit_feature_distance")
-        squared = (_unit(mine) - _unit(theirs)) ** 2
-        if channel_weights is not None:
-            squared = squared * channel_weights[stage].view(-1, 1, 1)
-        share = F.adaptive_avg_pool2d(weight.to(mine.dtype), (mine.shape[-2], mine.shape[-1]))
-        total = total + confident_mean(squared.sum(0, keepdim=True), share)
-    return total / len(prediction) if channel_weights is None else total
+    ratio = torch.expm1(((made - truth) * log_per_code).clamp(max=MAX_LOG_RATIO))
+    off = F.smooth_l1_loss(ratio, torch.zeros_like(ratio), beta=0.005, reduction="none")
+    return 5.0 * (off * weight).mean()
 
 
-def _unit(features: Tensor) -> Tensor:
-    return features / (features.square().sum(0, keepdim=True) + 1e-12).sqrt()
+def class_error(scores: Tensor, ids: Tensor, class_weights: Tensor | None) -> Tensor:
+    """Cross-entropy of scores ``[N, C, H, W]`` summed over labelled pixels of i64[N, H, W], divided by the number of all."""
+    weight = None if class_weights is None else class_weights.to(scores.dtype)
+    return F.cross_entropy(scores, ids, weight, ignore_index=UNLABELLED, reduction="none").mean()
+
+
+def stated_error(log_error: Tensor, error: Tensor) -> Tensor:
+    """Negative log-likelihood (Laplace) of the absolute error of colour ``[N, 3, H, W]`` under the scale ``exp(log_error)``.
+
+    Moves the statement ``[N, 1, H, W]`` only, not the colour.
+    """
+    size = error.detach().abs().mean(1, keepdim=True)
+    scale = log_error.clamp(-6.0, 1.0)
+    return (size * torch.exp(-scale) + scale).mean()
 
 
 def _same_shape(a: Tensor, b: Tensor, what: str) -> None:

@@ -1,7 +1,7 @@
 """Image, depth and semantic metrics, each as a small accumulator over a whole trajectory.
 
-A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums, and is asked
-for its ``value()`` once at the end. Metrics with the same source share one measurement.
+A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums, and its
+``value()`` is read once at the end. Metrics with the same source share one measurement.
 What a method did not produce stays None ("not produced"); what needs weights that are not there is listed in ``METRICS``
 with ``build=None`` ("not computed"). Nothing is ever reported as zero for want of data.
 """
@@ -9,23 +9,22 @@ with ``build=None`` ("not computed"). Nothing is ever reported as zero for want 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from mudg.base.errors import InputError
-from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.base.palette import CLASSES
 from mudg.base.types import View
-from mudg.core import flicker, fused
+from mudg.core import flicker, native_ops
 from mudg.core.losses import ssim_map
 
 CLASS_COUNT: Final = len(CLASSES)
 SMALLEST_SHARE: Final = 1e-3
-"""Masks of moving objects that cover less of a picture than this do not count: a handful of pixels has no PSNR to speak of."""
+"""Masks of dynamic objects that cover less of an image than this do not count: a handful of pixels has no PSNR to speak of."""
 
 
 def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -56,66 +55,10 @@ def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
     if prediction.numel() == 0:
         return math.nan
     if mask is None or bool(mask.all()):
-        return 1.0 - float(fused.photometric(prediction.clamp(0, 1), truth, 1.0))
+        return 1.0 - float(native_ops.photometric(prediction.clamp(0, 1), truth, 1.0))
     values = ssim_map(prediction.clamp(0, 1), truth)
     values = values[mask.expand_as(values)]
     return float(values.double().mean()) if values.numel() else math.nan
-
-
-def perceptual_distance(
-    prediction: Sequence[Tensor],
-    truth: Sequence[Tensor],
-    mask: Tensor | None = None,
-    weights: Sequence[Tensor] | None = None,
-) -> float:
-    """Distance of two pictures in the features of a network, as LPIPS measures it (Zhang et al. 2018, eq. 1).
-
-    Per stage: every place's feature vector is brought to length 1, the squared difference is summed over channels and averaged
-    over places; the stages are averaged (without ``weights``) or summed (with them, as LPIPS does).
-
-    Args:
-        prediction, truth: per stage ``[C_l, h_l, w_l]``.
-        mask: bool ``[1, H, W]``: pixels that count, averaged down to each stage (default all).
-        weights: per stage ``[C_l]`` for the squared differences (default 1).
-
-    Returns:
-        0 for equal pictures; NaN when nothing counts.
-
-    Raises:
-        InputError: the two have other shapes.
-    """
-    return distance_to_units(prediction, unit_features(truth), mask, weights)
-
-
-def distance_to_units(
-    prediction: Sequence[Tensor],
-    truth: Sequence[Tensor],
-    mask: Tensor | None = None,
-    weights: Sequence[Tensor] | None = None,
-) -> float:
-    """``perceptual_distance`` from a truth that ``unit_features`` has prepared, for several predictions."""
-    total = 0.0
-    for stage, (mine, theirs) in enumerate(zip(prediction, truth, strict=True)):
-        if mine.shape != theirs.shape:
-            raise InputError("features of two pictures differ in shape", where=f"stage {stage}",
-                             expected=str(tuple(theirs.shape)), got=str(tuple(mine.shape)))  # fmt: skip
-        squared = (_unit(mine) - theirs) ** 2
-        places = squared.sum(0) if weights is None else (squared * weights[stage].view(-1, 1, 1)).sum(0)
-        if mask is None:
-            total += float(places.double().mean())
-            continue
-        share = F.adaptive_avg_pool2d(mask.float(), (mine.shape[-2], mine.shape[-1]))[0].double()
-        total += float((places * share).sum() / share.sum()) if bool(share.any()) else math.nan
-    return total / len(truth) if weights is None else total
-
-
-def unit_features(stages: Sequence[Tensor]) -> list[Tensor]:
-    """Feature vectors of every place brought to length 1; per stage ``[C_l, h_l, w_l]``."""
-    return [_unit(features) for features in stages]
-
-
-def _unit(features: Tensor) -> Tensor:
-    return features / (features.square().sum(0, keepdim=True).sqrt() + 1e-6)
 
 
 @dataclass(frozen=True)
@@ -189,7 +132,7 @@ class Pair:
 
     rgb ``[3, H, W]`` in [0, 1]; depth ``[1, H, W]`` m; semantics i64 ``[H, W]``; truth_depth_valid bool ``[1, H, W]``;
     mask bool ``[1, H, W]``: pixels that count at all (outside the ego vehicle); moving bool ``[1, H, W]``: true pixels of
-    moving objects, where they are known; view: camera and pose of both.
+    dynamic objects, where they are known; view: camera and pose of both.
     """
 
     rgb: Tensor | None
@@ -305,28 +248,28 @@ class StaticMotion:
 
     def __init__(self) -> None:
         self._frames: tuple[Tensor, Tensor] | None = None
-        self._found: tuple[flicker.Carried, float] | None = None
+        self._found: tuple[flicker.PixelMotion, float] | None = None
 
-    def between(self, before: Pair, pair: Pair) -> tuple[flicker.Carried, float]:
+    def between(self, before: Pair, pair: Pair) -> tuple[flicker.PixelMotion, float]:
         """For two neighbouring pairs that hold exact colour, depth, classes and the view."""
         if before.truth_rgb is None or pair.truth_rgb is None:
             raise InputError("flicker needs true colours")
         same = self._frames is not None and self._frames[0] is before.truth_rgb and self._frames[1] is pair.truth_rgb
         if self._found is None or not same:
-            carried = flicker.carried(_seen_by(before), _seen_by(pair))
-            self._found = carried, flicker.change(before.truth_rgb, pair.truth_rgb, carried)
+            motion = flicker.pixel_motion(_true_frame(before), _true_frame(pair))
+            self._found = motion, flicker.change(before.truth_rgb, pair.truth_rgb, motion)
             self._frames = before.truth_rgb, pair.truth_rgb
         return self._found
 
 
-def _seen_by(pair: Pair) -> flicker.Seen:
+def _true_frame(pair: Pair) -> flicker.TrueFrame:
     view, depth, ids = pair.view, pair.truth_depth, pair.truth_semantics
     if view is None or depth is None or ids is None:
         raise InputError("flicker needs exact depth, classes and the view")
     camera = view.camera
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0)
     lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-    return flicker.Seen(depth, ids, torch.from_numpy(view.world_from_cam.copy()), lens)
+    return flicker.TrueFrame(depth, ids, torch.from_numpy(view.world_from_cam.copy()), lens)
 
 
 class Flicker:
@@ -338,7 +281,7 @@ class Flicker:
     """
 
     def __init__(self, motion: StaticMotion | None = None) -> None:
-        self.source = _whole
+        self.source = _pair_itself
         self._motion = motion or StaticMotion()
         self._before: Pair | None = None
         self._made = 0.0
@@ -349,16 +292,16 @@ class Flicker:
         before, self._before = self._before, measured
         if before is None or before.rgb is None or measured.rgb is None or not (_exact(before) and _exact(measured)):
             return
-        carried, truly = self._motion.between(before, measured)
-        self._made += flicker.change(before.rgb.clamp(0, 1), measured.rgb.clamp(0, 1), carried)
-        self._true += truly
+        motion, true_change = self._motion.between(before, measured)
+        self._made += flicker.change(before.rgb.clamp(0, 1), measured.rgb.clamp(0, 1), motion)
+        self._true += true_change
 
     def value(self) -> float | None:
-        """1 = as calm as the truth; None without two neighbouring frames or without static surfaces."""
+        """1 = as steady as the truth; None without two neighbouring frames or without static surfaces."""
         return self._made / self._true if self._true > 0 else None
 
 
-def _whole(pair: Pair) -> Pair:
+def _pair_itself(pair: Pair) -> Pair:
     return pair
 
 
@@ -393,7 +336,7 @@ def _ssim_of(pair: Pair) -> float | None:
     return ssim(pair.rgb, pair.truth_rgb, pair.mask)
 
 
-def _psnr_of_movers(pair: Pair) -> float | None:
+def _psnr_of_dynamic(pair: Pair) -> float | None:
     if pair.rgb is None or pair.truth_rgb is None or pair.moving is None:
         return None
     counted = pair.moving if pair.mask is None else pair.moving & pair.mask
@@ -414,7 +357,9 @@ class MetricRow:
 METRICS: Final[dict[str, MetricRow]] = {
     "psnr": MetricRow("PSNR", "dB", ("rgb",), "higher", lambda: FrameMean(_psnr_of)),
     "ssim": MetricRow("SSIM", "", ("rgb",), "higher", lambda: FrameMean(_ssim_of)),
-    "psnr_movers": MetricRow("PSNR of movers", "dB", ("movers", "rgb"), "higher", lambda: FrameMean(_psnr_of_movers)),
+    "psnr_movers": MetricRow(
+        "PSNR of dynamic objects", "dB", ("dynamic objects", "rgb"), "higher", lambda: FrameMean(_psnr_of_dynamic)
+    ),
     "perceptual": MetricRow("perceptual", "", ("rgb", "features of the shipped codec"), "lower", None),
     "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "lower", Flicker),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
@@ -451,10 +396,3 @@ def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:
         number = metrics[name].value()
         table[name] = "not produced" if number is None else number
     return table
-
-
-__all__ = [
-    "CLASS_COUNT", "METRICS", "UNLABELLED", "DepthError", "DepthErrors", "Flicker", "FrameMean", "Metric", "MetricRow", "Pair",
-    "Segmentation", "StaticMotion", "build_all", "confusion", "depth_errors", "distance_to_units", "iou_of", "measure",
-    "perceptual_distance", "psnr", "results", "ssim", "unit_features",
-]  # fmt: skip

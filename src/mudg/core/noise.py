@@ -18,7 +18,7 @@ A step index `t` runs from 0 (nearly clean) to `steps - 1` (pure noise).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,9 +26,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mudg.base.errors import NumericsError, UsageError
+from mudg.base.errors import UsageError
 
-Prediction = Literal["x0", "v", "eps"]
+Prediction = Literal["x0", "v"]
+"""What a network states: the clean data, or the velocity."""
 
 RESCALE_STEPS = 400
 """Number of steps over which the dynamic rescale falls from 1 to its base value."""
@@ -79,7 +80,7 @@ class Schedule:
     def __len__(self) -> int:
         return self.config.steps
 
-    def at(self, t: Tensor, ndim: int) -> tuple[Tensor, Tensor]:
+    def alpha_sigma(self, t: Tensor, ndim: int) -> tuple[Tensor, Tensor]:
         """alpha and sigma of steps `t` i64[B], shaped [B,1,...] with `ndim` axes for broadcasting."""
         shape = (-1,) + (1,) * (ndim - 1)
         where = t.to(self.alpha.device)
@@ -92,13 +93,13 @@ class Schedule:
 
     def add_noise(self, x0: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """x_t of `x0` [B,...] with `noise` of the same shape at steps `t` i64[B]; applies the dynamic rescale."""
-        alpha, sigma = self.at(t, x0.ndim)
+        alpha, sigma = self.alpha_sigma(t, x0.ndim)
         scale = self.scale[t.cpu()].view(alpha.shape).to(x0.device)
         return alpha * scale * x0 + sigma * noise
 
     def velocity(self, x0: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """v-target of training at steps `t`; `x0` is multiplied by the dynamic rescale first."""
-        alpha, sigma = self.at(t, x0.ndim)
+        alpha, sigma = self.alpha_sigma(t, x0.ndim)
         scale = self.scale[t.cpu()].view(alpha.shape).to(x0.device)
         return alpha * noise - sigma * scale * x0
 
@@ -107,23 +108,13 @@ def x0_and_eps(x: Tensor, output: Tensor, alpha: Tensor, sigma: Tensor, predicti
     """Clean data and noise implied by a network output at one noise level.
 
     `x`, `output` [B,...]; `alpha`, `sigma` broadcastable. With `prediction="x0"` the noise is (x - alpha x0) / sigma, with
-    sigma floored at 1e-4; with "eps" the data is (x - sigma eps) / alpha, which is undefined at zero terminal SNR.
+    sigma floored at 1e-4.
     """
     if prediction == "v":
         return alpha * x - sigma * output, alpha * output + sigma * x
     if prediction == "x0":
         return output, (x - alpha * output) / sigma.clamp(min=1e-4)
-    if prediction == "eps":
-        if bool((alpha <= 0).any()):
-            raise NumericsError(
-                "noise prediction cannot recover the data where no signal is left",
-                where="noise.x0_and_eps",
-                expected="alpha > 0",
-                got="alpha = 0",
-                remedy="predict v or x0, or switch zero_terminal_snr off",
-            )
-        return (x - sigma * output) / alpha, output
-    raise UsageError("unknown prediction type", expected="x0, v or eps", got=str(prediction))
+    raise UsageError("unknown prediction type", expected="x0 or v", got=str(prediction))
 
 
 def loss_weight(schedule: Schedule, t: Tensor, clip: float = 5.0, floor: float = 1.0) -> Tensor:
@@ -189,10 +180,9 @@ def ddim(
     step_indices: Sequence[int],
     *,
     prediction: Prediction = "x0",
-    eta: float = 0.0,
+    eta: float = 1.0,
     draw: Callable[[], Tensor] | None = None,
     last: Literal["x0", "first_alpha"] = "x0",
-    on_step: Callable[[int, Tensor], None] | None = None,
 ) -> Tensor:
     """Denoising diffusion implicit sampling (Song et al., equation 12) over descending `step_indices`.
 
@@ -200,7 +190,6 @@ def ddim(
     eta          0 deterministic, 1 ancestral; needs `draw`, a function giving fresh noise of start's shape
     last         what the final step returns: "x0" the clean estimate itself; "first_alpha" one more step to alpha_bar[0],
                  which the published sampler does
-    on_step      called with (number of the step, estimate of x0) after each denoiser call
 
     With a dynamic rescale the estimate of x0 is multiplied by scale_previous / scale_t at each step, and the final
     result keeps the factor of the last step visited, as the published sampler does.
@@ -213,8 +202,6 @@ def ddim(
         final = number + 1 == len(step_indices)
         alpha, sigma = schedule.alpha[t], schedule.sigma[t]
         x0, eps = x0_and_eps(x, denoise(x, t), alpha, sigma, prediction)
-        if on_step is not None:
-            on_step(number, x0)
         previous = 0 if final else step_indices[number + 1]
         scale_previous = schedule.scale[t if final else previous]
         x0 = x0 * (scale_previous / schedule.scale[t])
@@ -229,11 +216,6 @@ def ddim(
     return x
 
 
-def ancestral(denoise: Denoise, start: Tensor, schedule: Schedule, step_indices: Sequence[int], **options: object) -> Tensor:
-    """DDIM with eta 1: fresh noise at every step, as in the original reverse process."""
-    return ddim(denoise, start, schedule, step_indices, **{**options, "eta": 1.0})  # type: ignore[arg-type]
-
-
 def dpm_solver(
     denoise: Denoise,
     start: Tensor,
@@ -241,15 +223,13 @@ def dpm_solver(
     step_indices: Sequence[int],
     *,
     prediction: Prediction = "x0",
-    on_step: Callable[[int, Tensor], None] | None = None,
-    **_: object,
 ) -> Tensor:
     """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order from two consecutive estimates of x0, deterministic.
 
     With lambda = log(alpha / sigma) and h its step, x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) D, where D is
     extrapolated from the last two estimates. A first step at zero SNR (lambda = -infinity) is taken at first order, and so
-    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. `eta` and `draw`
-    are not used. A dynamic rescale is refused. Arguments and result as for `ddim`.
+    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. A dynamic rescale
+    is refused. Arguments and result as for `ddim`.
     """
     if bool((schedule.scale != 1).any()):
         raise UsageError("dpm_solver does not know the dynamic rescale", expected="sampler = ddim", got="base_scale set")
@@ -258,8 +238,6 @@ def dpm_solver(
     x, before, step_before = start, None, math.inf
     for number, t in enumerate(step_indices):
         x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0]
-        if on_step is not None:
-            on_step(number, x0)
         if number + 1 == len(step_indices):
             return x0
         following = step_indices[number + 1]
@@ -275,52 +253,23 @@ def dpm_solver(
     return x
 
 
-def renoise(
-    denoise: Denoise,
-    start: Tensor,
-    schedule: Schedule,
-    step_indices: Sequence[int],
-    *,
-    prediction: Prediction = "x0",
-    draw: Callable[[], Tensor] | None = None,
-    on_step: Callable[[int, Tensor], None] | None = None,
-    **_: object,
-) -> Tensor:
-    """Few-step sampling: state x0, add fresh noise for the next level, repeat (as consistency models are sampled).
+SAMPLERS: dict[str, Callable[..., Tensor]] = {"ddim": ddim, "dpm_solver": dpm_solver}
+"""Every sampler by name. Each costs one denoiser pass per step (two with classifier-free guidance). A new one is a function
+that takes the positional arguments and `prediction` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""
 
-    All of the noise is fresh at each step, so an error of the first estimate is not carried on. Meant for 1 to 4 steps.
-    Arguments and result as for `ddim`; a dynamic rescale multiplies x0 as in training.
-    """
-    if draw is None and len(step_indices) > 1:
-        raise UsageError("stochastic sampling needs a source of noise", where="noise.renoise")
-    x, x0 = start, start
-    for number, t in enumerate(step_indices):
-        x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0]
-        x0 = x0 / schedule.scale[t]
-        if on_step is not None:
-            on_step(number, x0)
-        if number + 1 < len(step_indices) and draw is not None:
-            following = step_indices[number + 1]
-            x = schedule.alpha[following] * schedule.scale[following] * x0 + schedule.sigma[following] * draw()
-    return x0
+SAMPLER_SETTINGS: dict[str, tuple[str, ...]] = {"ddim": ("eta", "draw", "last"), "dpm_solver": ()}
+"""Sampler -> its further settings. Any other is refused by `check_sampler`, never ignored."""
 
 
-def partial_steps(indices: Sequence[int], steps: int, strength: float) -> list[int]:
-    """The part of descending step `indices` that a start from given data runs: those below `strength` * steps.
-
-    At least the last one. strength 1 = all of them, from pure noise (Meng et al., "SDEdit").
-    """
-    if not 0 < strength <= 1:
-        raise UsageError("strength is out of range", expected="0 < strength <= 1", got=str(strength))
-    kept = [t for t in indices if t < strength * steps]
-    return kept or [indices[-1]]
-
-
-SAMPLERS: dict[str, Callable[..., Tensor]] = {
-    "ddim": ddim,
-    "ancestral": ancestral,
-    "dpm_solver": dpm_solver,
-    "renoise": renoise,
-}
-"""Every sampler by name. A new one is a function with the signature of `ddim` and one row here. Each costs one denoiser
-pass per step (two with classifier-free guidance)."""
+def check_sampler(sampler: str, settings: Iterable[str] = ()) -> None:
+    """UsageError unless there is such a sampler and it takes all `settings` (names of arguments)."""
+    if sampler not in SAMPLERS:
+        raise UsageError("unknown sampler", expected=", ".join(SAMPLERS), got=sampler)
+    for name in settings:
+        if name not in SAMPLER_SETTINGS[sampler]:
+            takers = ", ".join(other for other, taken in SAMPLER_SETTINGS.items() if name in taken)
+            raise UsageError(
+                f"the sampler {sampler} does not take the setting {name}", where=f"sampler {sampler}",
+                expected=f"{name} with {takers}" if takers else ", ".join(SAMPLER_SETTINGS[sampler]) or "no settings", got=name,
+                remedy=f"leave {name} out, or choose a sampler that takes it",
+            )  # fmt: skip

@@ -1,35 +1,130 @@
-"""Pictures of results: sizes, bytes and colour maps. Every resizing and every colour map of the package is here."""
+"""Pictures: every way in which images and label maps change size, and every colour map of the package.
+
+Images change size by one of four rules, because what was trained and stored with one must not be read with another:
+
+* ``resize_area``: Pillow's box filter; what fits, clips and labellers use on recorded images.
+* ``resize_bicubic``: Pillow's bicubic filter; what depth networks were trained with.
+* ``shrink_exact``: the exact mean over each new pixel's area in float32; what importers write into scenes.
+* ``resize_rgb``: torch, bilinear with antialiasing; how scores and pages bring views to one size.
+
+Depth, labels and masks take the nearest pixel (``resize_nearest``). Networks resize their own feature maps themselves.
+"""
 
 from __future__ import annotations
 
+from typing import Any, Final, TypeVar
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
+from mudg.base import palette
+from mudg.base.errors import InputError
 
-def error_image(rgb: Tensor, truth: Tensor) -> np.ndarray:
-    """Mean absolute colour error as a picture u8[H, W, 3]: black = equal, through red to white = 0.35 or more."""
-    error = ((rgb.clamp(0, 1) - truth).abs().mean(0) / 0.35).clamp(0, 1).numpy()
-    channels = (np.clip(error * 2.2, 0, 1), np.clip(error * 2.2 - 0.8, 0, 1), np.clip(error * 3.2 - 2.2, 0, 1))
-    return (np.stack(channels, -1) * 255).round().astype(np.uint8)
+Map = TypeVar("Map", Tensor, NDArray[Any])
+
+# Near = warm, far = cold. Saturated all the way, so that points stand out from the image under them and far is not taken for missing.
+_DEPTH_STOPS: Final = np.array(
+    [[220, 30, 30], [250, 120, 30], [230, 210, 50], [90, 220, 90], [40, 190, 200], [50, 110, 230], [70, 40, 160]],
+    np.float64,
+)
 
 
-def to_bytes(rgb: Tensor) -> np.ndarray:
-    """Colour f32[3, H, W] in [0, 1] as a picture u8[H, W, 3]."""
-    return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+# ---- sizes -----------------------------------------------------------------------------------------------------------
+
+
+def resize_area(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """Image u8[H, W, 3] to another size by averaging areas (Pillow's box filter); the same array if the size is right already."""
+    if rgb.shape[:2] == (height, width):
+        return rgb
+    return np.array(Image.fromarray(rgb).resize((width, height), Image.Resampling.BOX))
+
+
+def resize_bicubic(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """Image u8[H, W, 3] to another size by Pillow's bicubic filter; always a new array."""
+    return np.array(Image.fromarray(rgb).resize((width, height), Image.Resampling.BICUBIC))
 
 
 def resize_rgb(rgb: Tensor, height: int, width: int) -> Tensor:
-    """Colour f32[3, H, W] to another size, bilinear with antialiasing; unchanged if the size is right already."""
+    """Colour f32[3, H, W] to another size, bilinear with antialiasing; the same tensor if the size is right already."""
     if rgb.shape[-2:] == (height, width):
         return rgb
     return torch.nn.functional.interpolate(rgb[None], size=(height, width), mode="bilinear", antialias=True)[0]
 
 
-def resize_nearest(values: Tensor, height: int, width: int) -> Tensor:
-    """Depth, labels or masks [C, H, W] to another size by the nearest pixel centre; nothing is mixed."""
-    if values.shape[-2:] == (height, width):
+def resize_nearest(values: Map, height: int, width: int) -> Map:
+    """Depth, labels or masks [..., H, W] to another size by the nearest pixel centre; nothing is mixed."""
+    if tuple(values.shape[-2:]) == (height, width):
         return values
-    rows = ((torch.arange(height) + 0.5) * values.shape[-2] / height).long()
-    columns = ((torch.arange(width) + 0.5) * values.shape[-1] / width).long()
-    return values[:, rows][:, :, columns]
+    rows = ((np.arange(height) + 0.5) * values.shape[-2] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * values.shape[-1] / width).astype(int)
+    return values[..., rows[:, None], columns]
+
+
+def shrink_exact(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """Image u8[H, W, 3] to u8[height, width, 3]: each new pixel is the mean over its exact area of the old image.
+
+    Raises:
+        InputError: larger than the image.
+    """
+    tall, wide = rgb.shape[:2]
+    if height > tall or width > wide:
+        raise InputError("images are never enlarged", expected=f"at most {wide}x{tall}", got=f"{width}x{height}")
+    down = _area_weights(tall, height) @ rgb.reshape(tall, wide * 3).astype(np.float32)
+    across = _area_weights(wide, width) @ down.reshape(height, wide, 3).transpose(1, 0, 2).reshape(wide, height * 3)
+    return np.rint(across.reshape(width, height, 3).transpose(1, 0, 2)).clip(0, 255).astype(np.uint8)
+
+
+def _area_weights(old: int, new: int) -> Any:
+    """Sparse f32[new, old]: the share of each old pixel in each new one; rows add to 1."""
+    from scipy.sparse import csr_matrix
+
+    edges = np.arange(new + 1) * (old / new)
+    first = np.floor(edges[:-1] + 1e-9).astype(int)
+    last = np.minimum(np.ceil(edges[1:] - 1e-9).astype(int), old)
+    rows = np.repeat(np.arange(new), last - first)
+    columns = np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
+    share = np.minimum(columns + 1, edges[rows + 1]) - np.maximum(columns, edges[rows])
+    return csr_matrix(((share * new / old).astype(np.float32), (rows, columns)), (new, old))
+
+
+# ---- colours ---------------------------------------------------------------------------------------------------------
+
+
+def to_bytes(rgb: Tensor) -> NDArray[np.uint8]:
+    """Colour f32[3, H, W] in [0, 1] as a picture u8[H, W, 3]."""
+    return (rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+
+
+def depth_colors(depth_m: NDArray[np.floating], near_m: float = 2.0, far_m: float = 100.0) -> NDArray[np.uint8]:
+    """Depth f[...] in metres to colours u8[..., 3], logarithmic from near (warm) to far (cold); no depth is black.
+
+    The one colour map of depth: videos, pages, previews and contact sheets use it. Pictures are for people; nothing reads them back.
+    """
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    safe = np.where(known, depth_m, far_m).clip(near_m, far_m)
+    along = np.log(safe / near_m) / np.log(far_m / near_m) * (len(_DEPTH_STOPS) - 1)
+    index = np.minimum(along.astype(int), len(_DEPTH_STOPS) - 2)
+    part = (along - index)[..., None]
+    colors = _DEPTH_STOPS[index] * (1 - part) + _DEPTH_STOPS[index + 1] * part
+    colors[~known] = 0
+    return colors.round().astype(np.uint8)
+
+
+def class_colors(train_ids: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """Train ids [H, W] to the colours people know from Cityscapes, u8[H, W, 3]; unlabelled is black."""
+    return palette.encode(train_ids, palette.DISPLAY_COLORS)
+
+
+def gray(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Values [H, W] in [0, 1] (a confidence) as a picture u8[H, W, 3] from black to white."""
+    return np.repeat((255 * values.clip(0, 1)).astype(np.uint8)[..., None], 3, 2)
+
+
+def error_image(rgb: Tensor, truth: Tensor) -> NDArray[np.uint8]:
+    """Mean absolute colour error as a picture u8[H, W, 3]: black = equal, through red to white = 0.35 or more."""
+    error = ((rgb.clamp(0, 1) - truth).abs().mean(0) / 0.35).clamp(0, 1).numpy()
+    channels = (np.clip(error * 2.2, 0, 1), np.clip(error * 2.2 - 0.8, 0, 1), np.clip(error * 3.2 - 2.2, 0, 1))
+    return (np.stack(channels, -1) * 255).round().astype(np.uint8)

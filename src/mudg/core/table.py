@@ -1,11 +1,7 @@
 """A row-aligned table of parameters: every column, its two Adam moments and every counter share one row order.
 
 Row operations (``take``, ``append``, ``permute`` as a take) move all of them together, so a moment can never belong to another
-row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of ``models/scene/nodes.py``.
-
-Some columns only a few rows need (the time-varying colour of moving objects). Such a *partial* column holds a value for
-every row whose label ``node`` is above 0, in row order, and nothing for the others: static rows pay neither memory nor a
-pass of Adam for it, and which value belongs to which row needs no index that could go stale.
+row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of ``models/scene/model.py``.
 """
 
 from __future__ import annotations
@@ -42,16 +38,12 @@ class Table:
     Args:
         columns: name -> raw parameter, float, all with the same first dimension N. They become leaves with gradients.
         labels: name -> per-row facts (e.g. the node index), any dtype, carried along, never optimised.
-        partial: name -> raw parameter ``[M, ...]`` for the M rows whose label ``node`` is above 0, in row order.
     """
 
-    def __init__(
-        self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor] | None = None, partial: Mapping[str, Tensor] | None = None
-    ) -> None:
+    def __init__(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor] | None = None) -> None:
         self.columns = {name: _leaf(value) for name, value in columns.items()}
-        self.partial = {name: _leaf(value) for name, value in (partial or {}).items()}
-        self.moment1 = {name: torch.zeros_like(value) for name, value in {**self.columns, **self.partial}.items()}
-        self.moment2 = {name: torch.zeros_like(value) for name, value in {**self.columns, **self.partial}.items()}
+        self.moment1 = {name: torch.zeros_like(value) for name, value in self.columns.items()}
+        self.moment2 = {name: torch.zeros_like(value) for name, value in self.columns.items()}
         self.labels = {name: value.detach().clone() for name, value in (labels or {}).items()}
         self._check()
 
@@ -68,45 +60,20 @@ class Table:
         for name, value in {**self.columns, **self.labels}.items():
             if value.shape[:1] != (rows,):
                 raise InputError("columns of a table differ in length", where=name, expected=f"{rows} rows", got=str(tuple(value.shape)))
-        if not self.partial:
-            return
-        if "node" not in self.labels or set(self.partial) & set(self.columns):
-            raise InputError("partial columns need the label 'node' and names of their own", got=", ".join(self.partial))
-        holders = int(self.holders().sum())
-        for name, value in self.partial.items():
-            if value.shape[:1] != (holders,):
-                raise InputError("a partial column does not fit its rows", where=name, expected=f"{holders} rows of moving nodes",
-                                 got=str(tuple(value.shape)))  # fmt: skip
-
-    def holders(self) -> Tensor:
-        """Bool[N]: the rows that have values in the partial columns."""
-        return self.labels["node"] > 0
 
     # -- row operations ---------------------------------------------------------------------------------------------
 
     def take(self, rows: Tensor) -> None:
         """Keep ``rows`` (i64 indices in the wanted order, or a bool mask [N]); everything moves together."""
         index = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
-        part = self.partial_index(index) if self.partial else index
         self.columns = {name: _leaf(value.detach()[index]) for name, value in self.columns.items()}
-        self.partial = {name: _leaf(value.detach()[part]) for name, value in self.partial.items()}
         for moments in (self.moment1, self.moment2):
             for name in moments:
-                moments[name] = moments[name][part if name in self.partial else index]
+                moments[name] = moments[name][index]
         self.labels = {name: value[index] for name, value in self.labels.items()}
 
-    def partial_index(self, index: Tensor) -> Tensor:
-        """Rows of the partial columns that belong to table rows ``index`` (those that have values), in that order."""
-        holders = self.holders()
-        rank = torch.cumsum(holders, 0) - 1
-        return rank[index[holders[index]]]
-
-    def append(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor], like: Tensor | None = None) -> None:
-        """Add rows with zero moments. Every column and label of the table must be given.
-
-        Args:
-            like: i64[new rows], the row each new one copies its partial values from (same node); None: they start at zero.
-        """
+    def append(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor]) -> None:
+        """Add rows with zero moments. Every column and label of the table must be given."""
         if set(columns) != set(self.columns) or set(labels) != set(self.labels):
             raise InputError(
                 "appended rows must fill every column",
@@ -114,12 +81,6 @@ class Table:
                 got=str(sorted(set(columns) | set(labels))),
             )
         fresh = {name: value.detach() for name, value in columns.items()}
-        for name, value in self.partial.items():
-            count = int((labels["node"] > 0).sum())
-            given = value.new_zeros(count, *value.shape[1:]) if like is None else value.detach()[self.partial_index(like)]
-            self.partial[name] = _leaf(torch.cat([value.detach(), given]))
-            for moments in (self.moment1, self.moment2):
-                moments[name] = torch.cat([moments[name], torch.zeros_like(given)])
         self.columns = {name: _leaf(torch.cat([value.detach(), fresh[name]])) for name, value in self.columns.items()}
         for moments in (self.moment1, self.moment2):
             for name in fresh:
@@ -139,12 +100,11 @@ class Table:
 
     def gradients(self) -> dict[str, Tensor]:
         """Gradients of the last backward, by column; columns without one are left out."""
-        everything = {**self.columns, **self.partial}
-        return {name: value.grad for name, value in everything.items() if value.grad is not None}
+        return {name: value.grad for name, value in self.columns.items() if value.grad is not None}
 
     def clear_gradients(self) -> None:
         """Drop all gradients."""
-        for value in (*self.columns.values(), *self.partial.values()):
+        for value in self.columns.values():
             value.grad = None
 
     def adam_step(
@@ -155,24 +115,20 @@ class Table:
         Args:
             step: number of this step, from 1 (bias correction).
             rates: learning rate per column; a column that is not named stays as it is.
-            kernel: ``torch_adam_columns`` or ``fused.adam_columns``.
+            kernel: ``torch_adam_columns`` or ``native_ops.adam_columns``.
             visible: bool[N]: update these rows only, parameters and moments (others wait); None = all.
         """
-        for columns, rows in ((self.columns, visible), (self.partial, None)):
-            if columns is self.partial and visible is not None and self.partial:
-                rows = visible[self.holders()]
-            kernel(
-                [AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
-                 for name, value in columns.items() if value.grad is not None and rates.get(name, 0.0) > 0],
-                step, rows,
-            )  # fmt: skip
+        kernel(
+            [AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
+             for name, value in self.columns.items() if value.grad is not None and rates.get(name, 0.0) > 0],
+            step, visible,
+        )  # fmt: skip
 
     # -- state ------------------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Tensor]:
         """All tensors under flat names, ready for a checkpoint."""
         flat = {f"column.{name}": value.detach() for name, value in self.columns.items()}
-        flat |= {f"partial.{name}": value.detach() for name, value in self.partial.items()}
         flat |= {f"moment1.{name}": value for name, value in self.moment1.items()}
         flat |= {f"moment2.{name}": value for name, value in self.moment2.items()}
         return flat | {f"label.{name}": value for name, value in self.labels.items()}
@@ -180,13 +136,16 @@ class Table:
     @classmethod
     def from_state(cls, flat: Mapping[str, Tensor]) -> Table:
         """Inverse of ``state``. Moments may be absent (a finished model): they start at zero."""
-        groups: dict[str, dict[str, Tensor]] = {"column": {}, "partial": {}, "moment1": {}, "moment2": {}, "label": {}}
+        groups: dict[str, dict[str, Tensor]] = {"column": {}, "moment1": {}, "moment2": {}, "label": {}}
         for key, value in flat.items():
             group, _, name = key.partition(".")
+            if group == "partial":
+                raise InputError("this scene's objects change colour over time, which is not supported any more", where=key,
+                                 remedy="fit it again, or render it with the version that fitted it")  # fmt: skip
             if group not in groups or not name:
                 raise InputError("not a tensor of a parameter table", where=key)
             groups[group][name] = value
-        table = cls(groups["column"], groups["label"], groups["partial"])
+        table = cls(groups["column"], groups["label"])
         for moments, stored in ((table.moment1, groups["moment1"]), (table.moment2, groups["moment2"])):
             for name, value in stored.items():
                 if name not in moments or moments[name].shape != value.shape:

@@ -12,14 +12,12 @@ rear axle in a tight turn), the heading wins; ``heading_against_path_rad`` tells
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Camera, EgoPath, Scene, Trajectory, View
+from mudg.base.types import EgoPath, Scene, Trajectory, View
 
 WORLD_UP = np.array([0.0, 0.0, 1.0])
 
@@ -110,94 +108,6 @@ def heading_against_path_rad(path: EgoPath) -> NDArray[np.float64]:
             difference = geometry.yaw_of(path.world_from_ego[i]) - np.arctan2(step[1], step[0])
             angles[i] = np.pi - (np.pi - difference) % (2 * np.pi)
     return angles
-
-
-def resampled(trajectory: Trajectory, *, speed_factor: float | None = None, count: int | None = None) -> Trajectory:
-    """The same path and the same time span with other sampling, by interpolation between neighbouring views.
-
-    Exactly one of the two is given. ``speed_factor`` 2 drives twice as fast through the scene: half as many views, each
-    showing the scene at the time it was passed (scene time keeps pace with the camera). ``count`` asks for that many
-    views, evenly spaced in time, first and last kept.
-
-    Raises:
-        UsageError: neither or both given, a factor that is not positive, or a count below 1.
-    """
-    if (speed_factor is None) == (count is None):
-        raise UsageError("give either speed_factor or count, not both and not none")
-    views = trajectory.views
-    if count is None:
-        factor = float(speed_factor or 0.0)
-        if not np.isfinite(factor) or factor <= 0:
-            raise UsageError("speed_factor must be positive", got=str(speed_factor))
-        positions = np.arange(0.0, len(views) - 1 + 1e-9, factor)
-        times = np.interp(positions, np.arange(len(views)), [view.time_s for view in views])
-    else:
-        if count < 1:
-            raise UsageError("count must be at least 1", got=str(count))
-        times = np.linspace(views[0].time_s, views[-1].time_s, count) if count > 1 else np.array([views[0].time_s])
-    keys = np.array([view.time_s for view in views])
-    poses = np.stack([view.world_from_cam for view in views])
-    sampled = []
-    for time_s in times:
-        pose = geometry.pose_at(keys, poses, float(time_s))
-        if pose is None:
-            raise InputError("a resampled time lies outside the trajectory", where=trajectory.name, got=f"{time_s} s")
-        sampled.append(View(views[0].camera, pose, float(time_s)))
-    return Trajectory(f"{trajectory.name}_x{len(sampled)}", tuple(sampled), trajectory.origin)
-
-
-def spline_through(
-    world_from_cam: Sequence[NDArray[np.float64]],
-    camera: Camera,
-    key_times_s: Sequence[float],
-    times_s: Sequence[float] | None = None,
-    *,
-    name: str = "planned",
-) -> Trajectory:
-    """A smooth camera path that passes through given poses.
-
-    Positions: natural cubic spline in time. Rotations: cubic rotation spline with continuous angular rate (Kang & Park
-    1999, as in scipy's RotationSpline). Both are exact at the keys. Two keys give a straight line and a slerp.
-
-    Args:
-        world_from_cam: ``K`` rigid 4x4 poses.
-        camera: intrinsics of all views.
-        key_times_s: ``K`` strictly increasing times.
-        times_s: where to sample; default the key times. Inside the span of the keys.
-
-    Raises:
-        InputError: no poses, lengths differ, times not increasing, a pose not rigid, or a sample outside the span.
-    """
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import Rotation, RotationSpline
-
-    keys = np.asarray(key_times_s, np.float64)
-    poses = np.asarray(world_from_cam, np.float64)
-    if len(poses) == 0 or len(poses) != len(keys) or (np.diff(keys) <= 0).any():
-        raise InputError(
-            "a spline needs as many increasing times as poses, at least one",
-            got=f"{len(poses)} poses, times {keys.tolist()[:8]}",
-        )
-    for index, pose in enumerate(poses):
-        problem = geometry.rigid_problem(pose)
-        if problem:
-            raise InputError(f"pose {index} of the spline is not rigid: {problem}")
-    samples = keys if times_s is None else np.asarray(times_s, np.float64)
-    if samples.min() < keys[0] - 1e-9 or samples.max() > keys[-1] + 1e-9:
-        raise InputError(
-            "a spline is not extrapolated",
-            expected=f"times within [{keys[0]}, {keys[-1]}] s",
-            got=f"[{samples.min()}, {samples.max()}] s",
-        )
-    if len(keys) == 1:
-        return Trajectory(name, tuple(View(camera, poses[0], float(t)) for t in samples), "planned")
-    positions = CubicSpline(keys, poses[:, :3, 3], bc_type="natural")(samples)
-    rotations = RotationSpline(keys, Rotation.from_matrix(poses[:, :3, :3]))(samples).as_matrix()
-    views = tuple(
-        View(camera, geometry.from_rotation_translation(rotation, position), float(time_s))
-        for rotation, position, time_s in zip(rotations, positions, samples)
-    )
-    return Trajectory(name, views, "planned")
 
 
 def _frames(scene: Scene, camera: str) -> tuple:

@@ -21,28 +21,22 @@ from mudg.base.types import FusedCloud, PointCloud
 def write_fused(folder: Path | str, cloud: FusedCloud, report: Mapping[str, Any]) -> None:
     """Write a fused cloud and its report; ``fuse.json`` comes last, without it the folder is not a fused cloud."""
     folder = Path(folder)
-    _write_cloud(folder / "static.safetensors", cloud.static)
-    files: dict[str, dict[str, Any]] = {}
-    for index, (track_id, points) in enumerate(cloud.objects.items()):
-        name = f"objects/{index:03d}.safetensors"
-        _write_cloud(folder / name, points)
-        files[track_id] = {"file": name, "sha256": store.sha256_file(folder / name), "points": len(points)}
-    static = {
-        "file": "static.safetensors",
-        "sha256": store.sha256_file(folder / "static.safetensors"),
-        "points": len(cloud.static),
+    static = _write_cloud(folder, "static.safetensors", cloud.static)
+    files = {
+        track_id: _write_cloud(folder, f"objects/{index:03d}.safetensors", points)
+        for index, (track_id, points) in enumerate(cloud.objects.items())
     }
-    store.write_json(
-        folder / "fuse.json",
-        {"format": "mudg-fused", "schema_version": 1, "static": static, "objects": files, **report},
-    )
+    head = {"format": "mudg-fused", "schema_version": 1, "static": static, "objects": files}
+    store.write_json(folder / "fuse.json", {**head, **report})
 
 
-def _write_cloud(path: Path, cloud: PointCloud) -> None:
+def _write_cloud(folder: Path, name: str, cloud: PointCloud) -> dict[str, Any]:
+    """Write a cloud; returns its entry in ``fuse.json``."""
     arrays = {"xyz": cloud.xyz, "rgb": cloud.rgb}
     if cloud.semantics is not None:
         arrays["semantics"] = cloud.semantics
-    store.write_safetensors(path, arrays)
+    store.write_safetensors(folder / name, arrays)
+    return {"file": name, "sha256": store.sha256_file(folder / name), "points": len(cloud)}
 
 
 def read_fused(folder: Path | str) -> FusedCloud:
@@ -73,9 +67,8 @@ def _read_cloud(folder: Path, entry: Mapping[str, Any], frame: str) -> PointClou
     if not path.is_file():
         raise IntegrityError("a cloud is missing", where=str(path), remedy="run `mudg fuse` again")
     if store.sha256_file(path) != entry["sha256"]:
-        raise IntegrityError(
-            "a cloud was altered after it was written", where=str(path), remedy="run `mudg fuse` again"
-        )
+        raise IntegrityError("a cloud was altered after it was written", where=str(path),
+            remedy="run `mudg fuse` again")  # fmt: skip
     arrays = store.read_safetensors(path)
     xyz = arrays["xyz"]
     if not np.isfinite(xyz).all():

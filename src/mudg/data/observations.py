@@ -21,42 +21,13 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, ObservationKind, View
+from mudg.core.pictures import to_bytes
+from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 1
-
-
-def camera_record(camera: Camera) -> dict[str, Any]:
-    """A camera as JSON values."""
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
-        "readout_s": camera.readout_s,
-    }
-
-
-def camera_from_record(record: Any, where: str) -> Camera:
-    """Inverse of ``camera_record``; InputError names ``where`` and the field."""
-    try:
-        return Camera(
-            name=str(record["name"]),
-            width=int(record["width"]),
-            height=int(record["height"]),
-            fx=float(record["fx"]),
-            fy=float(record["fy"]),
-            cx=float(record["cx"]),
-            cy=float(record["cy"]),
-            distortion=tuple(float(x) for x in record.get("distortion", ())),
-            readout_s=float(record.get("readout_s", 0.0)),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError("a camera record is incomplete or malformed", where=where, got=repr(error)) from error
+OBSERVATION_FILES = (_INDEX, "rgb/*.png", "data/*.safetensors")
+"""Patterns of the names in a folder of observations."""
 
 
 class ObservationWriter:
@@ -67,10 +38,7 @@ class ObservationWriter:
     """
 
     def __init__(self, out: Path, trajectory: str, source: str, kind: ObservationKind = "virtual") -> None:
-        self._out = Path(out)
-        self._trajectory = trajectory
-        self._source = source
-        self._kind = kind
+        self._out, self._trajectory, self._source, self._kind = Path(out), trajectory, source, kind
         self._records: list[dict[str, Any]] = []
         self.done = 0
         while (self._out / "data" / f"{self.done:06d}.safetensors").is_file():
@@ -90,7 +58,7 @@ class ObservationWriter:
         if not bool(torch.isfinite(observation.rgb).all()):
             count = int((~torch.isfinite(observation.rgb)).sum())
             raise InputError("colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values")
-        rgb = (observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+        rgb = to_bytes(observation.rgb)
         with store.atomic_path(self._out / "rgb" / f"{name}.png") as temporary:
             Image.fromarray(rgb).save(temporary, compress_level=1)
         arrays = {"confidence": _numpy(observation.confidence[0], np.float16), "mask": _numpy(observation.mask[0], np.uint8)}
@@ -104,7 +72,7 @@ class ObservationWriter:
     def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
         self._records.append(
             {
-                "camera": camera_record(view.camera),
+                "camera": {"name": view.camera.name, **camera_to_json(view.camera)},
                 "world_from_cam": view.world_from_cam.tolist(),
                 "time_s": view.time_s,
                 "depth": has_depth,
@@ -116,16 +84,8 @@ class ObservationWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None:
-            store.write_json(
-                self._out / _INDEX,
-                {
-                    "schema": _SCHEMA,
-                    "trajectory": self._trajectory,
-                    "source": self._source,
-                    "kind": self._kind,
-                    "observations": self._records,
-                },
-            )
+            head = {"schema": _SCHEMA, "trajectory": self._trajectory, "source": self._source, "kind": self._kind}
+            store.write_json(self._out / _INDEX, {**head, "observations": self._records})
 
 
 def _numpy(tensor: torch.Tensor, dtype: type[np.generic]) -> NDArray[Any]:
@@ -151,20 +111,25 @@ class ObservationSet:
         """Colour u8[H, W, 3] of one observation."""
         return read_image_file(self.path / "rgb" / f"{index:06d}.png", self.views[index].camera)
 
-    def __getitem__(self, index: int) -> Observation:
+    def arrays(self, index: int) -> dict[str, NDArray[Any]]:
+        """What the data file of one observation holds, as stored: confidence f16, mask u8, and where there are any depth f32 and
+        semantics u8, [H, W] each; InputError where an array is missing or of another size."""
         if not 0 <= index < len(self):
             raise IndexError(index)
-        view = self.views[index]
+        camera = self.views[index].camera
         path = self.path / "data" / f"{index:06d}.safetensors"
         arrays = store.read_safetensors(path)
-        shape = (view.camera.height, view.camera.width)
+        shape = (camera.height, camera.width)
         wanted = ["confidence", "mask"] + ["depth"] * self.has_depth[index] + ["semantics"] * self.has_semantics[index]
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
-                raise InputError(
-                    "an observation file does not fit its view", where=f"{path}: {name}", expected=str(shape), got=got
-                )
+                raise InputError("an observation file does not fit its view", where=f"{path}: {name}",
+                    expected=str(shape), got=got)  # fmt: skip
+        return {name: arrays[name] for name in wanted}
+
+    def __getitem__(self, index: int) -> Observation:
+        arrays, view = self.arrays(index), self.views[index]
         return Observation(
             view=view,
             rgb=torch.from_numpy(self.rgb_u8(index).copy()).permute(2, 0, 1).float() / 255,
@@ -183,12 +148,8 @@ def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
         with Image.open(io.BytesIO(content)) as image:
             if image.size != (camera.width, camera.height):
-                raise InputError(
-                    "an image has another size than its camera",
-                    where=str(path),
-                    expected=f"{camera.width}x{camera.height}",
-                    got=f"{image.size[0]}x{image.size[1]}",
-                )
+                raise InputError("an image has another size than its camera", where=str(path),
+                    expected=f"{camera.width}x{camera.height}", got=f"{image.size[0]}x{image.size[1]}")  # fmt: skip
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
@@ -206,29 +167,22 @@ def read_observations(path: Path) -> ObservationSet:
     content = store.read_json(index)
     try:
         if content["schema"] != _SCHEMA:
-            raise InputError(
-                "unknown schema version", where=str(index), expected=str(_SCHEMA), got=str(content["schema"])
-            )
+            raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
+                got=str(content["schema"]))  # fmt: skip
         records = content["observations"]
-        views = tuple(
-            View(
-                camera_from_record(r["camera"], f"{index}: observations[{i}].camera"),
-                np.asarray(r["world_from_cam"], np.float64),
-                float(r["time_s"]),
-            )
-            for i, r in enumerate(records)
-        )
-        return ObservationSet(
-            Path(path),
-            str(content["trajectory"]),
-            str(content["source"]),
-            "recorded" if content["kind"] == "recorded" else "virtual",
-            views,
-            tuple(bool(r["depth"]) for r in records),
-            tuple(bool(r["semantics"]) for r in records),
-        )
+        cameras = [_camera(r["camera"], f"{index}: observations[{i}].camera") for i, r in enumerate(records)]
+        poses = [np.asarray(r["world_from_cam"], np.float64) for r in records]
+        views = tuple(View(c, p, float(r["time_s"])) for c, p, r in zip(cameras, poses, records, strict=True))
+        has_depth, has_semantics = (tuple(bool(r[key]) for r in records) for key in ("depth", "semantics"))
+        kind: ObservationKind = "recorded" if content["kind"] == "recorded" else "virtual"
+        trajectory, source = str(content["trajectory"]), str(content["source"])
+        return ObservationSet(Path(path), trajectory, source, kind, views, has_depth, has_semantics)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
+
+
+def _camera(record: Any, where: str) -> Camera:
+    return parse_camera(str(record["name"]), {key: value for key, value in record.items() if key != "name"}, where)
 
 
 def list_observation_sets(path: Path) -> dict[str, Path]:

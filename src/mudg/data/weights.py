@@ -3,7 +3,7 @@
 The only place where a pickle is opened, and only with torch's restricted unpickler: tensors and plain containers. Of the objects
 that training frameworks leave in their files a short list is replaced by an inert stand-in; anything else is refused.
 
-`RULES` is the whole map, as text: each row says how a published name is called here, both ways. `{i}` stands for a number.
+`RULES` is the complete map, as text: each row says how a published name is called here, both ways. `{i}` stands for a number.
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mudg.base import store
-from mudg.base.errors import InputError, IntegrityError
+from mudg.base import shards
+from mudg.base.errors import InputError
 
 # names ----------------------------------------------------------------------------------------------------------------
 
@@ -183,7 +182,7 @@ def clean_name(published: str) -> str | None:
 
 
 def published_names(clean: Iterable[str]) -> dict[str, str]:
-    """Our names -> published names. The whole collection of a model's names is needed: the number of what enlarges
+    """Our names -> published names. All names of a model are needed: the number of what enlarges
     depends on whether its stage has transformers.
 
     Raises:
@@ -262,7 +261,7 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise InputError("no such checkpoint", where=str(path))
     if path.suffix == ".safetensors":
-        return _without_prefix(_read_safetensors(path))
+        return _without_prefix(shards.read_tensors(path))
     content = _unpickle(path)
     found = _named_tensors(content)
     if not found:
@@ -334,14 +333,6 @@ def _without_prefix(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return dict(tensors)
 
 
-def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError) as error:
-        raise InputError("not a valid safetensors file", where=str(path), got=str(error)) from error
-
-
 def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """A checkpoint completed by an OpenCLIP file (names without prefix) where it has no text or no image tower of its own."""
     result = dict(found)
@@ -395,58 +386,3 @@ def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int
             expected=f"{len(wanted)} tensors of {network}", got="; ".join(lines),
             remedy="check that the file is complete and of the right kind",
         )  # fmt: skip
-
-
-# safetensors folders --------------------------------------------------------------------------------------------------
-
-
-def write_shards(
-    folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None
-) -> dict[str, str]:
-    """Write tensors as `weights_NN.safetensors` of at most about `shard_bytes` each; returns file name -> sha256.
-
-    dtype   number format of floating-point tensors (None: as they are). `folder` is a tree under a temporary name.
-    Memory: one shard twice over.
-    """
-    from safetensors.torch import save as safetensors_bytes
-
-    files: dict[str, str] = {}
-    shard: dict[str, Tensor] = {}
-    size = 0
-
-    def flush() -> None:
-        nonlocal shard, size
-        if shard:
-            name = f"weights_{len(files):02d}.safetensors"
-            store.write_in_tree(folder / name, safetensors_bytes(shard))
-            files[name] = store.sha256_file(folder / name)
-        shard, size = {}, 0
-
-    for name, value in tensors.items():
-        wide = 0 if dtype is None or not value.is_floating_point() else dtype.itemsize
-        nbytes = value.numel() * (wide or value.element_size())
-        if size + nbytes > shard_bytes:
-            flush()
-        # a copy of its own: safetensors refuses tensors that share memory, and a mapped file must not be written through
-        shard[name] = value.detach().to(dtype if wide else value.dtype, copy=True).contiguous()
-        size += nbytes
-    flush()
-    return files
-
-
-def read_shards(folder: Path, files: Mapping[str, str], *, verify: bool = True) -> dict[str, Tensor]:
-    """The tensors of files written by `write_shards`, checked against their sha256.
-
-    Raises:
-        IntegrityError: a file is missing or altered.
-    """
-    tensors: dict[str, Tensor] = {}
-    for name, digest in files.items():
-        path = folder / Path(name).name
-        if not path.is_file() or (verify and store.sha256_file(path) != digest):
-            raise IntegrityError(
-                "a weight file is missing or altered", where=str(path), expected=f"sha256 {digest[:16]}...",
-                remedy="convert the checkpoint again",
-            )  # fmt: skip
-        tensors |= _read_safetensors(path)
-    return tensors

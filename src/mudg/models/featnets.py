@@ -1,15 +1,15 @@
 """Feature extractors for perceptual comparison: a fixed filter bank, the shipped codec's network, the trunk of LPIPS.
 
-Fits compare in the eyes of the filter bank, scores in those of the codec, unless something else is asked for.
+By default fits use the filter bank and scores the codec.
 
-All take an image and give a list of feature maps. ``FilterBank`` needs no weights; it is built from what early vision is known
-to do (Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours) rather than learnt:
+Each takes an image and returns a list of feature maps. ``FilterBank`` needs no weights; it follows what is known of early vision
+(Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours):
 
-* opponent colours: luminance and two chroma axes, compared on blurred images only (the eye places colour coarsely);
+* opponent colours: luminance and two chroma axes, compared on blurred images only (the eye resolves colour coarsely);
 * per scale (1, 1/2, 1/4 of the size): first-derivative responses in four orientations, divided by the local contrast, so that
   a weak texture in shadow counts as much as a strong one in the sun;
-* the responses' *energy*, pooled over a few pixels: two pictures of the same texture that differ by a pixel of
-  misalignment are close, where L1 sees two different pictures and answers with blur.
+* the responses' *energy*, pooled over a few pixels: two images of the same texture that are misaligned by a
+  pixel are close, where L1 sees two different images and answers with blur.
 
 The bank is differentiable, deterministic, and costs about as much as SSIM.
 """
@@ -25,8 +25,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mudg.base.errors import InputError
-from mudg.core.fused import box_mean
-from mudg.core.metrics import Pair, distance_to_units, unit_features
+from mudg.core.metrics import Pair
+from mudg.core.native_ops import box_mean
+from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.mdm.codec import PatchCodec
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
@@ -75,12 +76,11 @@ class FilterBank(nn.Module):
 
 
 class CodecFeatures(nn.Module):
-    """Features of an image ``[3, H, W]`` in [0, 1]: what the codec's network makes of the image's own code.
+    """Features of an image ``[3, H, W]`` in [0, 1]: activations of the codec's decoder network on the image's own code.
 
-    The codec's encoder is one linear map of 2x2 pixels; all that it has learned about pictures beyond that lies in the network
-    behind the code, which was trained to put back what the code lost. Its stages (the first convolution and each residual
-    block) are the features, for the image and for it at 1/2 and 1/4 of its size. Depth and classes are withheld, as in a
-    part of the codec's training.
+    The codec's encoder is one linear map of 2x2 pixels; what the codec has learned about images lies in the decoder network, which
+    was trained to restore what the code lost. Its stages (the first convolution and each residual block) are the features, for
+    the image at full, half and quarter size. Depth and classes are withheld, as in a part of the codec's training.
 
     Returns (from ``forward``):
         Per size, largest first, and per stage one tensor ``[C, h, w]``.
@@ -93,15 +93,15 @@ class CodecFeatures(nn.Module):
         self.codec = codec
 
     def forward(self, rgb: Tensor) -> list[Tensor]:
-        """Features of one image; sides that are no multiple of 8 are continued by their last pixels."""
+        """Features of one image; sides that are no multiple of 8 are padded by repeating their last pixels."""
         height, width = rgb.shape[-2:]
         image = F.pad(rgb[None].clamp(0, 1), (0, -width % 8, 0, -height % 8), mode="replicate")
         features = []
         for _ in range(self.SIZES):
             code = self.codec.encode_rgb(image)
             others = sum(count for modality, count in self.codec.channels.items() if modality != "rgb")
-            whole = torch.cat([code, code.new_zeros(1, others, *code.shape[-2:])], 1)
-            x = self.codec.enter(whole.contiguous(memory_format=torch.channels_last))  # as the codec's norms want it
+            latent = torch.cat([code, code.new_zeros(1, others, *code.shape[-2:])], 1)
+            x = self.codec.enter(latent.contiguous(memory_format=torch.channels_last))  # as the codec's norms want it
             features.append(x[0])
             for block in self.codec.blocks:
                 x = block(x)
@@ -143,7 +143,7 @@ class LpipsFeatures(nn.Module):
         """Features ``[C, h, w]`` of the five stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
         if min(rgb.shape[-2:]) < self.SMALLEST_PX:
             size = f"{rgb.shape[-1]}x{rgb.shape[-2]}"
-            raise InputError("a picture is too small for LPIPS", expected=f"{self.SMALLEST_PX} pixels a side", got=size)
+            raise InputError("an image is too small for LPIPS", expected=f"{self.SMALLEST_PX} pixels a side", got=size)
         shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (self.SHIFT, self.SCALE))
         x = (rgb[None].clamp(0, 1) * 2 - 1 - shift) / scale
         features = []
@@ -163,9 +163,9 @@ def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], wher
 
 
 class PerceptualDistance:
-    """``metrics.perceptual_distance`` of a pair's colours in the features of a network. Several threads may ask.
+    """``lpips_distance`` of a pair's colours in the features of a network; threads may call it.
 
-    Truth is compared with one method after another: each thread keeps its features until another truth comes.
+    The same truth is compared with one method after another: each thread keeps its features until another truth comes.
     """
 
     def __init__(self, features: nn.Module, weights: list[Tensor] | None = None) -> None:
@@ -177,7 +177,8 @@ class PerceptualDistance:
         if pair.rgb is None or pair.truth_rgb is None:
             return None
         with torch.no_grad():
-            if getattr(self._known, "picture", None) is not pair.truth_rgb:
+            if getattr(self._known, "image", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb))
-                self._known.picture = pair.truth_rgb
-            return distance_to_units(self._features(pair.rgb), self._known.features, pair.mask, self._weights)
+                self._known.image = pair.truth_rgb
+            distance = lpips_distance(self._features(pair.rgb), self._known.features, pair.mask, self._weights, over_weight=True)
+            return float(distance)

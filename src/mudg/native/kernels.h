@@ -26,7 +26,7 @@ struct PhotometricJob {
   double* partial;  // [planes * strips]
 };
 
-// One Adam step (adam.h) on a table: columns [rows][width] that share their rows. Mirrored in core/fused.py.
+// One Adam step (adam.h) on a table: columns [rows][width] that share their rows. Mirrored in core/native_ops.py.
 struct AdamColumn {
   float* parameter;
   const float* gradient;

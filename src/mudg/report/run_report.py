@@ -7,8 +7,6 @@ colour error), so that the panels can never run apart; the page cuts them out of
 from __future__ import annotations
 
 import base64
-import io
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,23 +15,20 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from mudg import native
 from mudg.base import log, store
-from mudg.base.types import Observation
-from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.data.exporters.video import depth_colors, mp4_bytes, semantic_colors, video_encoders
+from mudg.data.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
-from mudg.report.page import FAR_M, NEAR_M, Reel, page
+from mudg.report.page import FPS, PANEL_ROWS, TrajectoryVideo, page
+from mudg.report.panels import panel_grid, panel_size
 
 PANEL_WIDTH: Final = 416
 BUDGET_BYTES: Final = 16 * 2**20
 """For all videos together, before base64; the page stays under 25 MB."""
-FPS: Final = 10
 SAME_TIME_S: Final = 1e-4
-ROWS: Final = ("rgb", "depth", "semantics", "error")
-FIRST_CRF, LAST_CRF = 27, 45
+ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
+ENCODING: Final = Encoding(FPS, first_crf=27, last_crf=45, preset="veryfast")
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ def write_report(out: Path) -> Path:
     return write_page(out, film(out))
 
 
-def film(out: Path) -> list[Reel]:
+def film(out: Path) -> list[TrajectoryVideo]:
     """The costly half of a report: one video per trajectory. Raises as ``write_report``."""
     out = Path(out)
     scores = store.read_json(out / "score" / "metrics.json")
@@ -66,31 +61,27 @@ def film(out: Path) -> list[Reel]:
     playable = bool(video_encoders())
     if not playable:
         log.warn("PyAV has no H.264 encoder here: the report shows one picture per trajectory instead of a video")
-    courses = [course for course in scores["trajectories"] if any(course["name"] in of for of in folders.values())]
-    budget = BUDGET_BYTES // max(1, len(courses))
-    with log.task("report", len(courses)) as bar, ThreadPoolExecutor(native.default_threads()) as pool:
+    trajectories = [t for t in scores["trajectories"] if any(t["name"] in found for found in folders.values())]
+    budget = BUDGET_BYTES // max(1, len(trajectories)) if playable else 0
+    with log.task("report", len(trajectories)) as bar, ThreadPoolExecutor(native.default_threads()) as pool:
 
-        def make(course: Mapping[str, Any]) -> Reel:
-            reel = _reel(course, folders, playable, budget)
+        def make(trajectory: Mapping[str, Any]) -> TrajectoryVideo:
+            video = _video(trajectory, folders, budget)
             bar.advance()
-            return reel
+            return video
 
-        return list(pool.map(make, courses))
+        return list(pool.map(make, trajectories))
 
 
-def write_page(out: Path, reels: Sequence[Reel]) -> Path:
+def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     """The cheap half: scores, times and settings around the videos."""
     out = Path(out)
     scores = store.read_json(out / "score" / "metrics.json")
     ledger = store.read_json(out / "run.json")
-    columns = list(_folders(out, scores))
-    store.write_text(out / "report.html", page(scores, ledger, _settings(out), reels, columns))
+    settings = out / "run.yaml"
+    text = settings.read_text(encoding="utf-8") if settings.is_file() else ""
+    store.write_text(out / "report.html", page(scores, ledger, text, videos, list(_folders(out, scores))))
     return out / "report.html"
-
-
-def _settings(out: Path) -> str:
-    path = out / "run.yaml"
-    return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def _folders(out: Path, scores: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
@@ -101,47 +92,38 @@ def _folders(out: Path, scores: Mapping[str, Any]) -> dict[str, dict[str, Path]]
         candidates = (out / "render" / name, out / "score" / name, out / "synthesize")
         places[name] = next(path for path in candidates if path.is_dir() or path.name == "synthesize")
     found = {name: list_observation_sets(path) for name, path in places.items()}
-    return {name: of for name, of in found.items() if of}
+    return {name: sets for name, sets in found.items() if sets}
 
 
 # ---- one trajectory as one video ----
 
 
-def _reel(course: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]], playable: bool, budget: int) -> Reel:
-    name = course["name"]
-    columns = _columns(course, folders)
-    width = min(PANEL_WIDTH, int(course["width"])) // 2 * 2
-    height = max(2, round(int(course["height"]) * width / int(course["width"])) // 2 * 2)
-    panels = {column: tuple(_modalities(columns, column)) for column in columns.sets}
+def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]], budget: int) -> TrajectoryVideo:
+    """All panels of a trajectory as one video of at most ``budget`` bytes; 0 = only the picture of its middle frame."""
+    columns = _columns(trajectory, folders)
+    size = panel_size(int(trajectory["width"]), int(trajectory["height"]), PANEL_WIDTH)
     order = list(folders)
-    video, crf = b"", FIRST_CRF
-    while playable:
-        video = mp4_bytes(_atlases(columns, order, panels, width, height), FPS, crf, "veryfast")
-        if len(video) <= budget or crf >= LAST_CRF:
-            break
-        # Six steps of the quality halve the size, about.
-        crf = min(LAST_CRF, crf + max(1, math.ceil(6 * math.log2(len(video) / budget))))
-    middle = columns.frames // 2
-    poster = _jpeg(next(_atlases(columns, order, panels, width, height, first=middle)))
-    return Reel(
-        name=name, camera=str(course["camera"]), shift_m=course["shift_m"], width=width, height=height,
-        frames=columns.frames, panels=panels, video=_data_uri("video/mp4", video) if video else "",
-        poster=_data_uri("image/jpeg", poster),
+    video = mp4_within(lambda: _frames(columns, order, size), ENCODING, budget) if budget else b""
+    poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=70)
+    return TrajectoryVideo(
+        name=trajectory["name"], camera=str(trajectory["camera"]), shift_m=trajectory["shift_m"], width=size[0], height=size[1],
+        frames=columns.frames, panels={column: _rows(columns, column) for column in columns.sets},
+        video=_data_uri("video/mp4", video) if video else "", poster=_data_uri("image/jpeg", poster),
     )  # fmt: skip
 
 
-def _columns(course: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]]) -> Columns:
+def _columns(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]]) -> Columns:
     """Truth and baseline have just the scored views; of the methods' views the scorer's indices pick the same.
 
     Where a trajectory has no truth (a shifted view of a recorded log), its column shows the recorded path at the same moments.
     """
-    name, frames, picked = course["name"], int(course["views"]), course["indices"]
-    sets = {column: read_observations(of[name]) for column, of in folders.items() if name in of}
+    name, frames, picked = trajectory["name"], int(trajectory["views"]), trajectory["indices"]
+    sets = {column: read_observations(found[name]) for column, found in folders.items() if name in found}
     indices: dict[str, Sequence[int]] = {c: picked[c] if c in picked else range(frames) for c in sets}
     has_truth = "truth" in sets
-    driven = folders.get("truth", {}).get(f"{course['camera']}_recorded")
-    if not has_truth and driven is not None:
-        recorded = read_observations(driven)
+    recorded_folder = folders.get("truth", {}).get(f"{trajectory['camera']}_recorded")
+    if not has_truth and recorded_folder is not None:
+        recorded = read_observations(recorded_folder)
         column = next(iter(sets))
         wanted = np.array([sets[column].views[i].time_s for i in indices[column]])
         apart = np.abs(np.array([view.time_s for view in recorded.views])[None] - wanted[:, None])
@@ -151,50 +133,23 @@ def _columns(course: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]
     return Columns(sets, indices, frames, has_truth)
 
 
-def _modalities(columns: Columns, column: str) -> Iterator[str]:
+def _rows(columns: Columns, column: str) -> tuple[str, ...]:
+    """The rows that a column has, as its first view says."""
     first = columns.sets[column][columns.indices[column][0]]
-    yield "rgb"
-    if first.depth is not None:
-        yield "depth"
-    if first.semantics is not None:
-        yield "semantics"
-    if columns.has_truth and column != "truth":
-        yield "error"
+    there = {
+        "rgb": True, "depth": first.depth is not None, "semantics": first.semantics is not None,
+        "error": columns.has_truth and column != "truth",
+    }  # fmt: skip
+    return tuple(row for row in ROWS if there[row])
 
 
-def _atlases(
-    columns: Columns, order: Sequence[str], panels: Mapping[str, Sequence[str]], width: int, height: int, first: int = 0
+def _frames(
+    columns: Columns, order: Sequence[str], size: tuple[int, int], first: int = 0
 ) -> Iterator[NDArray[np.uint8]]:
     """One picture per frame: columns in page order, rows of ``ROWS``; what a method does not produce stays grey."""
     for frame in range(first, columns.frames):
-        atlas = np.full((height * len(ROWS), width * len(order), 3), 24, np.uint8)
-        seen = {c: of[columns.indices[c][frame]] for c, of in columns.sets.items()}
-        colours = {c: resize_rgb(o.rgb, height, width) for c, o in seen.items()}
-        for x, column in enumerate(order):
-            for y, row in enumerate(ROWS):
-                if row in panels.get(column, ()):
-                    place = atlas[y * height : (y + 1) * height, x * width : (x + 1) * width]
-                    if row == "rgb":
-                        place[:] = to_bytes(colours[column])
-                    elif row == "error":
-                        place[:] = error_image(colours[column], colours["truth"].clamp(0, 1))
-                    else:
-                        place[:] = _picture(seen[column], row, width, height)
-        yield atlas
-
-
-def _picture(seen: Observation, row: str, width: int, height: int) -> NDArray[np.uint8]:
-    if row == "depth" and seen.depth is not None:
-        return depth_colors(resize_nearest(seen.depth, height, width)[0].numpy(), NEAR_M, FAR_M)
-    if row == "semantics" and seen.semantics is not None:
-        return semantic_colors(resize_nearest(seen.semantics[None], height, width)[0].numpy())
-    return np.zeros((height, width, 3), np.uint8)
-
-
-def _jpeg(picture: NDArray[np.uint8]) -> bytes:
-    target = io.BytesIO()
-    Image.fromarray(picture).save(target, "JPEG", quality=70)
-    return target.getvalue()
+        views = {c: columns.sets[c][columns.indices[c][frame]] if c in columns.sets else None for c in order}
+        yield panel_grid(views, ROWS, size, views["truth"] if columns.has_truth else None)
 
 
 def _data_uri(kind: str, content: bytes) -> str:

@@ -9,13 +9,13 @@ from mudg.base.types import Scene
 from mudg.methods import METHODS
 
 NO_TRUTH: Final = "no truth"
-NOT_ASKED: Final = "not asked for"
+NOT_REQUESTED: Final = "not requested"
 TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
     "nearest_fill": "Fused points, holes filled",
     **{name: method.title for name, method in METHODS.items()},
 }
-SHOWN: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "delta1", "miou")
+TERMINAL_METRICS: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "delta1", "miou")
 _DIGITS: Final = {"psnr": 2, "psnr_movers": 2, "flicker": 2, "rmse_m": 2, "fid": 1, "fvd": 1}
 
 
@@ -32,27 +32,27 @@ def number_text(metric: str, value: float | str | None) -> str:
 
 
 def document(
-    scene: Scene, exact: bool, courses: Sequence[Mapping[str, Any]], methods: Sequence[str],
+    scene: Scene, exact: bool, trajectories: Sequence[Mapping[str, Any]], methods: Sequence[str],
     results: Sequence[Mapping[str, Any]], rows: Mapping[str, Mapping[str, Any]], depth_limit_m: float,
 ) -> dict[str, Any]:  # fmt: skip
     """Everything ``metrics.json`` holds.
 
     Args:
         scene: what was scored. exact: whether truth exists at any view.
-        courses: trajectories as JSON values. methods: in the order of the tables.
+        trajectories: as JSON values. methods: in the order of the tables.
         results: one entry per method and trajectory. rows: title, unit, better and needs of each metric.
         depth_limit_m: depths beyond it do not count.
     """
     held_out = len(scene.frames_in("test"))
     rules = [
-        "All methods are scored at one size, that of the scene's camera unless another was asked for; "
+        "All methods are scored at one size, that of the scene's camera unless another was requested; "
         "colour is resized bilinearly, depth and classes take the nearest pixel.",
         "On the recorded path only held-out frames count."
         if held_out
         else "No frame was held out: on the recorded path the frames that were learned from are scored.",
-        "Views off the path were never seen by any method."
+        "Views off the recorded path were never seen by any method."
         if exact
-        else "A recorded log has no truth off its path: shifted views are shown, not scored.",
+        else "A recorded log has no ground truth off its path: shifted views are shown, not scored.",
         f"Depth counts where the truth is known and at most {depth_limit_m:g} m; "
         f"where a method gives none, it counts as {depth_limit_m:g} m.",
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
@@ -68,30 +68,30 @@ def document(
         "rules": rules,
         "methods": [{"name": m, "title": title_of(m)} for m in methods],
         "metrics": [{"name": name, **row} for name, row in rows.items()],
-        "trajectories": list(courses),
+        "trajectories": list(trajectories),
         "results": list(results),
-        "by_distance": by_distance(courses, methods, results, list(rows)),
+        "by_distance": by_distance(trajectories, methods, results, list(rows)),
     }  # fmt: skip
 
 
 def by_distance(
-    courses: Sequence[Mapping[str, Any]],
+    trajectories: Sequence[Mapping[str, Any]],
     methods: Sequence[str],
     results: Sequence[Mapping[str, Any]],
     names: Sequence[str],
 ) -> list[dict[str, Any]]:
     """Mean over cameras and both sides, per method and distance from the recorded path (metres)."""
-    distances = sorted({abs(float(c["shift_m"])) for c in courses if c["shift_m"] is not None})
+    distances = sorted({abs(float(c["shift_m"])) for c in trajectories if c["shift_m"] is not None})
     table = []
     for distance in distances:
-        here = [c["name"] for c in courses if c["shift_m"] is not None and abs(float(c["shift_m"])) == distance]
-        signs = {float(c["shift_m"]) > 0 for c in courses if c["name"] in here}
+        here = [c["name"] for c in trajectories if c["shift_m"] is not None and abs(float(c["shift_m"])) == distance]
+        signs = {float(c["shift_m"]) > 0 for c in trajectories if c["name"] in here}
         sides = "recorded" if distance == 0 else "both" if len(signs) == 2 else "left" if signs == {True} else "right"
         for method in methods:
-            of = [r for r in results if r["method"] == method and r["trajectory"] in here]
+            rows = [r for r in results if r["method"] == method and r["trajectory"] in here]
             table.append(
-                {"method": method, "distance_m": distance, "sides": sides, "trajectories": [r["trajectory"] for r in of],
-                 "values": {name: _mean([r["values"].get(name) for r in of]) for name in names}}
+                {"method": method, "distance_m": distance, "sides": sides, "trajectories": [r["trajectory"] for r in rows],
+                 "values": {name: _mean([r["values"].get(name) for r in rows]) for name in names}}
             )  # fmt: skip
     return table
 
@@ -121,19 +121,20 @@ def distance_title(document: Mapping[str, Any], distance_m: float) -> str:
     return f"{distance_m:g} m to {'either side' if sides == {'both'} else 'the ' + ' and '.join(sorted(sides))}"
 
 
-def _lookup(document: Mapping[str, Any]) -> dict[tuple[str, float], Mapping[str, Any]]:
+def values_by_distance(document: Mapping[str, Any]) -> dict[tuple[str, float], Mapping[str, Any]]:
+    """(Method, distance in metres) -> values by metric."""
     return {(row["method"], float(row["distance_m"])): row["values"] for row in document["by_distance"]}
 
 
 def plain(document: Mapping[str, Any]) -> str:
     """The main numbers for a terminal: one block per distance, best values marked with a star."""
-    of = _lookup(document)
-    distances = sorted({d for _, d in of})
-    columns = [m for m in document["metrics"] if m["name"] in SHOWN]
+    values_of = values_by_distance(document)
+    distances = sorted({d for _, d in values_of})
+    columns = [m for m in document["metrics"] if m["name"] in TERMINAL_METRICS]
     lines = []
     for distance in distances:
         if not any(
-            isinstance(v, float) for m in document["methods"] for v in of.get((m["name"], distance), {}).values()
+            isinstance(v, float) for m in document["methods"] for v in values_of.get((m["name"], distance), {}).values()
         ):
             lines += [f"{distance_title(document, distance)}: nothing to score against (no truth)", ""]
             continue
@@ -141,10 +142,12 @@ def plain(document: Mapping[str, Any]) -> str:
         heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
         lines.append("  " + " " * 28 + "".join(f"{head:>14}" for head in heads))
         for method in document["methods"]:
-            values = of.get((method["name"], distance), {})
+            values = values_of.get((method["name"], distance), {})
             cells = []
             for metric in columns:
-                across = {m["name"]: of.get((m["name"], distance), {}).get(metric["name"]) for m in document["methods"]}
+                across = {
+                    m["name"]: values_of.get((m["name"], distance), {}).get(metric["name"]) for m in document["methods"]
+                }
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
                 cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>14}")
             lines.append(f"  {method['title']:<28}" + "".join(cells))
@@ -154,14 +157,18 @@ def plain(document: Mapping[str, Any]) -> str:
 
 def markdown(document: Mapping[str, Any]) -> str:
     """All trajectories and metrics as Markdown, with the rules."""
-    lines = [f"# Scores of {document['scene']['id']}", ""]
-    lines += [f"* {rule}" for rule in document["rules"]]
+    lines = [f"# Scores of {document['scene']['id']}", "", *(f"* {rule}" for rule in document["rules"])]
     names = [m["name"] for m in document["metrics"]]
-    for course in document["trajectories"]:
-        lines += ["", f"## {course['name']}", "", "| method | views | " + " | ".join(names) + " |"]
-        lines.append("|---" * (len(names) + 2) + "|")
-        for row in document["results"]:
-            if row["trajectory"] == course["name"]:
-                cells = " | ".join(number_text(n, row["values"].get(n)) for n in names)
-                lines.append(f"| {title_of(row['method'])} | {row['views']} | {cells} |")
+    for trajectory in document["trajectories"]:
+        rows = [
+            [title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in names)]
+            for r in document["results"] if r["trajectory"] == trajectory["name"]
+        ]  # fmt: skip
+        lines += ["", f"## {trajectory['name']}", "", *markdown_table(["method", "views", *names], rows)]
     return "\n".join(lines) + "\n"
+
+
+def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    first, *others = ("| " + " | ".join(cells) + " |" for cells in (heads, *rows))
+    return [first, "|---" * len(heads) + "|", *others]

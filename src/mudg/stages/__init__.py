@@ -1,1 +1,5 @@
-"""Floor 4: one file per verb. Each holds the verb's run(), from artefacts on disk and a frozen config to an artefact on disk."""
+"""The verbs: each is a module with a ``run()``, from files on disk and a frozen configuration to files on disk.
+
+The other modules (``batch``, ``convert_depthlab``, ``score_truth``) and the folders hold what one or
+several verbs need.
+"""

@@ -24,21 +24,21 @@ from numpy.typing import NDArray
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.processes import one_torch_thread, run_in_processes
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Scene
-from mudg.data.scene import SceneWriter, read_image, read_scene
+from mudg.data.scene import SCENE_FILES, SceneWriter, read_image, read_scene
 from mudg.models.labels.ground import driven_path
 from mudg.models.labels.inputs import LabelInput, Labels
 from mudg.models.labels.labellers import labeller
 from mudg.report.annotate_page import write_page
 from mudg.stages import batch
 from mudg.stages.config import AnnotateConfig
-from mudg.stages.ingest import add_frame_copy, add_rest
 from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import find_ego
 from mudg.stages.labelling.points import NearbyReturns
 
-_VERSION = 4
 _ASIDE = "labelled"
+_OUTPUT = VerbOutput("annotate", 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", f"{_ASIDE}/"))
 _FRAMES_PER_PROCESS = 8
 """Fewer frames than this are not worth the start of a process."""
 
@@ -54,10 +54,11 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     Raises:
         InputError: the scene is malformed. UsageError: ``out`` holds something else. ResourceError: weights are missing.
     """
+    refuse_overlap(out, {"scene": scene, **annotate_depth.folders(config)})
     settings = to_dict(config)
     settings.pop("processes")  # changes no result
     inputs = inputs_of(config, scene)
-    folder = store.RunDir.open(out, "annotate", settings, inputs, _VERSION, overwrite)
+    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if folder.complete:
         return folder.reused()
     loaded = read_scene(scene)
@@ -72,7 +73,7 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
             loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, inputs, aside))
         )
         with SceneWriter(folder.path, loaded.id, source) as writer:
-            add_rest(writer, loaded)
+            writer.copy_all_but_frames(loaded)
             _add_frames(config, loaded, missing, aside, writer)
             writer.finish()
     made = read_scene(folder.path)
@@ -88,7 +89,9 @@ def run_many(
     """``run`` for every scene of a list; see ``stages/batch.py``."""
     entries = batch.shard(batch.read_list(listed), shard)
     work = functools.partial(_one_of_many, dataclasses.replace(config, processes=1))
-    return batch.run_batch("annotate", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+    return batch.run_batch(
+        "annotate", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed
+    )
 
 
 def _one_of_many(config: AnnotateConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
@@ -195,7 +198,7 @@ def _add_frames(
     lacking = {frame.id for frame in missing}
     for frame in scene.frames:
         if frame.id not in lacking:
-            add_frame_copy(writer, scene, frame)
+            writer.copy_frame(scene, frame)
             continue
         arrays = store.read_safetensors(aside_file(aside, frame.id))
         for name in ("semantics", "depth"):  # a confidence tells that a label was made: none beside one that was given
@@ -203,4 +206,4 @@ def _add_frames(
                 arrays.pop(f"{name}_confidence", None)
         if config.ego:
             arrays["ego"] = ego[frame.view.camera.name]
-        add_frame_copy(writer, scene, frame, arrays)
+        writer.copy_frame(scene, frame, arrays)

@@ -24,6 +24,7 @@ from typing import Any, Final
 from mudg import native
 from mudg.base import log, processes, store
 from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.run_folder import refuse_overlaps
 from mudg.data.scene.schema import NAME_PATTERN
 
 FAILED_BASE: Final = 10
@@ -148,6 +149,7 @@ def run_batch(
     jobs: int = 0,
     overwrite: bool = False,
     shard_text: str = "",
+    listed: Path | None = None,
 ) -> dict[str, Any]:
     """Do ``work`` for every entry, ``jobs`` processes at a time.
 
@@ -156,14 +158,19 @@ def run_batch(
         out: ROOT; ``ROOT/status.json`` (with a shard: ``status-i-of-n.json``) tells the outcome.
         jobs: processes; 0 = as many as there are processors. They share the processors.
         overwrite: replace results of other settings.
+        listed: the list, where it is a file.
 
     Returns:
         ``scenes`` (one record each), counts, ``text``: the table for people, and ``exit_code``: 0, or 10 plus the number of
         failed scenes, at most 99.
 
     Raises:
-        UsageError: ``jobs`` is negative. KeyboardInterrupt: the running scenes are stopped.
+        UsageError: ``jobs`` is negative; an output touches a source, or the status another file. KeyboardInterrupt: the
+            running scenes are stopped.
     """
+    suffix = "-" + shard_text.replace("/", "-of-") if shard_text else ""
+    status = out / f"status{suffix}.json"
+    _refuse_overlaps(entries, out, status, listed)
     if jobs < 0:
         raise UsageError("number of jobs cannot be negative", where="--jobs", got=str(jobs))
     jobs = min(jobs or native.default_threads(), max(len(entries), 1))
@@ -178,14 +185,30 @@ def run_batch(
                 log.warn(f"{verb}: {outcome.name} failed: {outcome.words}")
     ordered = [outcomes[entry.name] for entry in entries]
     counts = {state: sum(o.state == state for o in ordered) for state in ("done", "reused", "failed")}
-    suffix = "-" + shard_text.replace("/", "-of-") if shard_text else ""
-    status = out / f"status{suffix}.json"
     store.write_json(status, {"schema": 1, "verb": verb, "counts": counts, "scenes": [asdict(o) for o in ordered]})
     code = min(FAILED_BASE + counts["failed"], FAILED_MOST) if counts["failed"] else 0
     return {
         "scenes": [asdict(outcome) for outcome in ordered], **counts, "status": status, "text": table(verb, ordered),
         "exit_code": code,
     }  # fmt: skip
+
+
+def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:
+    """UsageError where a scene's output touches any source or the list, or the status would replace another file."""
+    read: dict[str, Path | str | None] = {
+        f"source of {entry.name}": entry.source for entry in entries if entry.source != "city"
+    }
+    read["list"] = listed if listed is not None and listed.is_file() else None
+    refuse_overlaps([status, *(out / entry.name for entry in entries)], read)
+    if status.exists():
+        try:
+            known = {"schema", "verb", "counts", "scenes"} <= set(store.read_json(status))
+        except (InputError, TypeError):
+            known = False
+        if not known:
+            raise UsageError(
+                "the status would replace a file of something else", where=str(status), remedy="choose another --out"
+            )
 
 
 def _run_all(entries: list[Entry], out: Path, work: Work, jobs: int, overwrite: bool) -> Iterator[Outcome]:

@@ -7,6 +7,7 @@ text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import zipfile
 from collections.abc import Callable, Mapping
@@ -19,13 +20,15 @@ from torch import Tensor
 
 from mudg.base import log, processes, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.replacement import Replacement, all_names
+from mudg.base.run_folder import refuse_overlap
 from mudg.data import weights
 from mudg.models.published import clip
+from mudg.models.published import files as published_files
 from mudg.models.published.clip import TextTower
 from mudg.models.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
 from mudg.stages import convert_depthlab
 from mudg.stages.config import ConvertConfig
-from mudg.stages.learning import published_model
 
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
@@ -45,7 +48,7 @@ def run(
     overwrite: bool = False,
     network: PublishedConfig | None = None,
 ) -> Path:
-    """Convert one checkpoint; returns `to`, which is whole or not there.
+    """Convert one checkpoint; returns `to`, which is complete or not there.
 
     Args:
         config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's files.
@@ -53,23 +56,55 @@ def run(
         network: sizes of the network the checkpoint should hold (None: the published ones).
 
     Raises:
-        UsageError: the folder exists, or the resolution cannot be told. InputError: not such a checkpoint; nothing is written.
+        UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is written.
         ResourceError: memory limit or disk.
     """
     checkpoint, to = Path(checkpoint), Path(to)
-    if to.exists() and not overwrite:
+    refuse_overlap(to, {"checkpoint": checkpoint, "towers": config.towers})
+    replacement = Replacement.at(to)
+    replacement.recover(_holds_model, own_names)
+    replaces = to.exists()
+    if replaces and not overwrite:
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
-    if to.exists() and not (to / "model.json").is_file():
+    if replaces and not _holds_model(to):
         raise UsageError("the folder holds something else than a model", where=str(to), remedy="choose another --to")
+    place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
     work, limit = (
-        _from_folder(config, checkpoint, to) if checkpoint.is_dir() else _from_file(config, checkpoint, to, network)
+        _from_folder(config, checkpoint, place)
+        if checkpoint.is_dir()
+        else _from_file(config, checkpoint, place, network)
     )
-    with log.task("convert", 1) as bar:
-        peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
-        bar.advance()
+    if replaces:
+        replacement.begin()
+    try:
+        with log.task("convert", 1) as bar:
+            peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
+            bar.advance()
+        if replaces:
+            replacement.swap(own_names)
+    finally:
+        with contextlib.suppress(OSError):  # there and empty only if converting failed
+            replacement.staging.rmdir()
     memory = f"; peak memory {peak / processes.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
-    log.info(f"convert: {to} is whole{memory}")
+    log.info(f"convert: {to} is complete{memory}")
     return to
+
+
+def _holds_model(folder: Path) -> bool:
+    """Whether a folder holds a model that was converted, or trained, by this program."""
+    return bool(own_names(folder))
+
+
+def own_names(folder: Path) -> list[str]:
+    """Names of the files that a model folder's description lists, and its own last; none if there is no such description."""
+    try:
+        content = store.read_json(folder / "model.json")
+        files = list(content["files"]) if "files" in content else []
+        files += [f"{part}/{name}" for part, entry in content.get("parts", {}).items() for name in entry["files"]]
+    except (InputError, KeyError, TypeError, AttributeError):
+        return []
+    there = set(all_names(folder))
+    return [name for name in (*files, "MODEL_CARD.md", "model.json") if name in there] if files else []
 
 
 def _from_file(
@@ -97,7 +132,7 @@ def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Callabl
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
-    """Height and width that the checkpoint was trained at: as configured, else told by the file's name."""
+    """Height and width that the checkpoint was trained at: as configured, else from the file's name."""
     if config.resolution != "auto":
         height, width = config.resolution.split("x")
         return int(height), int(width)
@@ -140,7 +175,7 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
         "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
     }  # fmt: skip
-    published_model.write(
+    published_files.save(
         to,
         network,
         tensors,

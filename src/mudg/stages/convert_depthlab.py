@@ -5,8 +5,8 @@
       marigold-depth-v1-0/     model_index.json, scheduler, vae, and of unet the description alone
       CLIP-ViT-H-14-.../       config.json, and model.safetensors or pytorch_model.bin
 
-The three are told by what lies in them, not by their names. Tensors are compared with the networks that the descriptions stand for, by
-name and shape, all of them before the first is written. The published code takes what the pickle of the denoising U-Net or of
+The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the descriptions stand
+for, by name and shape, all of them before the first is written. The published code takes what the pickle of the denoising U-Net or of
 the linear layer lacks from Marigold or leaves it random; here that is an error.
 """
 
@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mudg.base import store
+from mudg.base import shards, store
 from mudg.base.errors import InputError
 from mudg.data import weights
 from mudg.models import folders
@@ -121,7 +121,7 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
             vision["projection_dim"] = clip["projection_dim"]
     transformers = folders.package("transformers")
     try:
-        whole = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
+        vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError("the image encoder is not described", where=str(sources.encoder / "config.json"),
                          got=str(error)[:300]) from error  # fmt: skip
@@ -132,7 +132,7 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
         raise InputError("this is the noise schedule of a later Marigold", where=str(file), got="rescale_betas_zero_snr: true",
                          expected="that of marigold-depth-v1-0, which DepthLab was made from",
                          remedy="take marigold-depth-v1-0")  # fmt: skip
-    return depthlab.part_configs(unet, vae, whole), schedule
+    return depthlab.part_configs(unet, vae, vision_config), schedule
 
 
 def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Tensor]]:
@@ -164,7 +164,7 @@ def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str
 
 
 def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_bytes: int) -> None:
-    """The conversion, in this process; ``to`` is whole or not there.
+    """The conversion, in this process; ``to`` is complete or not there.
 
     Args:
         folder: what holds the sources. dtype: number format of the weights (None: as published). shard_bytes: of one file.
@@ -184,7 +184,7 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
     }  # fmt: skip
     with store.atomic_directory(to) as partial:
         parts = {
-            part: {"config": configs[part], "files": weights.write_shards(partial / part, found[part], shard_bytes, dtype)}
+            part: {"config": configs[part], "files": shards.write_shards(partial / part, found[part], shard_bytes, dtype)}
             for part in PARTS
         }  # fmt: skip
         store.write_text(partial / "MODEL_CARD.md", _card(facts))

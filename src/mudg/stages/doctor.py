@@ -17,7 +17,7 @@ from mudg.base.versions import version
 if TYPE_CHECKING:
     from mudg.data.scene.check import Finding
 
-_CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av")
+_CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av", "jinja2")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
     # module: (what it is for, how to get it)
     "pyarrow": ("logs of Argoverse 2 and format 2 of Waymo", "pip install 'mudg[data]'"),
@@ -80,13 +80,13 @@ def report_scene(scene: Path) -> dict[str, Any]:
         alignment, agreements, doubts = _alignment(scene)
         found = worst_first([*found, *doubts])
     count = {level: sum(f.level == level for f in found) for level in ("error", "warning", "note")}
-    lines = [f"{f.level}: {f.where}: {f.words}" for f in found] + agreements
+    lines = [f"{f.level}: {f.where}: {f.message}" for f in found] + agreements
     if count["error"]:
         lines.append(f"{scene} cannot be used: {count['error']} errors, {count['warning']} warnings")
     else:
         lines.append(f"{scene} can be used: {count['warning']} warnings, {count['note']} notes")
     return {
-        "scene": scene, "findings": [{"level": f.level, "where": f.where, "words": f.words} for f in found],
+        "scene": scene, "findings": [{"level": f.level, "where": f.where, "words": f.message} for f in found],
         "alignment": alignment, "usable": not count["error"], "text": "\n".join(lines), "exit_code": 3 if count["error"] else 0,
     }  # fmt: skip
 
@@ -97,10 +97,10 @@ def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
     from mudg.data.scene.check import Finding
 
     found = alignment.camera_alignment(read_scene(path))
-    records = {name: alignment.record(one) for name, one in found.items()}
-    fine = [alignment.words(name, one) for name, one in found.items() if one.verdict != "doubtful"]
+    records = {name: alignment.to_json(one) for name, one in found.items()}
+    fine = [alignment.describe(name, one) for name, one in found.items() if one.verdict != "doubtful"]
     doubts = [
-        Finding("warning", f"camera {name}", alignment.words(name, one).partition(": ")[2])
+        Finding("warning", f"camera {name}", alignment.describe(name, one).partition(": ")[2])
         for name, one in found.items()
         if one.verdict == "doubtful"
     ]

@@ -1,8 +1,8 @@
 """fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out.
 
-The loop is ``optimise`` and reads top to bottom. What it calls: ``fit_views`` (what a view is), ``fit_start`` (where the
-Gaussians start), ``models.nodes.compose`` (the scene at a time), ``core.raster`` (the renderer), ``core.losses`` (every
-loss), ``models.densify``. Nothing else touches the parameters.
+The loop is ``optimise`` and reads top to bottom. What it calls: ``fitting/views.py`` (what a view is), ``fitting/start.py`` (where the
+Gaussians start), ``models.scene.model.compose`` (the scene at a time), ``core.raster`` (the renderer), ``core.losses`` (every
+loss), ``models.scene.densify``. Nothing else touches the parameters.
 
     OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``)
     OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
@@ -19,7 +19,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,38 +28,44 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from mudg.base import checkpoint, log, palette, seeds, store
+from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
-from mudg.core import fused as kernels
-from mudg.core import losses, metrics
+from mudg.core import losses, metrics, native_ops
+from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
+from mudg.data.observations import ObservationSet
 from mudg.data.scene import read_scene
+from mudg.methods import METHODS
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
 from mudg.models.scene.mcmc import McmcSettings, drift, relocate_and_grow
-from mudg.models.scene.nodes import RigidNode, SceneModel, compose, composite_semantics, composite_sky, sky_lift
+from mudg.models.scene.model import SceneModel, compose, composite_semantics, composite_sky, sky_lift
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
 from mudg.stages.fitting.poses import refine_poses
-from mudg.stages.fitting.start import StartSettings, start_model
+from mudg.stages.fitting.start import start_model
 from mudg.stages.fitting.trust import unseen_maps, unseen_rows
 from mudg.stages.fitting.views import (
-    Sample,
-    StoredView,
+    TrainView,
     ViewSet,
     classes_of,
     fused_lidar,
     load_recorded,
     load_virtual,
-    offsets_from_path_m,
     training_frames,
+    virtual_sets,
 )
 
-VERSION = 1
+OUTPUT = VerbOutput(
+    "fit", 2,
+    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "preview/*.png", "steps/"),
+)  # fmt: skip
 PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
@@ -67,23 +73,6 @@ LAST_POSE_ROUND = 0.85
 NEAR_M = 0.2
 MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
 """Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """What a method consists of: nodes of the scene and kinds of supervision."""
-
-    objects: bool
-    sky: bool
-    lidar: bool
-    virtual: bool
-
-
-RECIPES: dict[str, Recipe] = {
-    "gs3d": Recipe(objects=False, sky=False, lidar=False, virtual=False),
-    "street_gaussians": Recipe(objects=True, sky=True, lidar=True, virtual=False),
-    "mudg_s": Recipe(objects=True, sky=True, lidar=True, virtual=True),
-}
 
 
 def run(
@@ -103,22 +92,26 @@ def run(
 
     Raises:
         UsageError: a method with virtual views without ``observations``. NumericsError: a loss or gradient is not
-        finite. InputError: damaged inputs.
+        finite. InputError: damaged inputs, or recorded views among ``observations``.
     """
-    recipe = RECIPES[config.method]
-    if recipe.virtual and observations is None:
+    learns_virtual = "virtual" in METHODS[config.method].supervision
+    if learns_virtual and observations is None:
         raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and hand its folder on")
-    virtual = observations if recipe.virtual else None
+    refuse_overlap(
+        out, {"scene": scene, "fused": fused, "observations": observations, "virtual.lpips-weights": config.virtual.lpips_weights}
+    )
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
-    if virtual is not None:
-        inputs["observations"] = store.digest(Path(virtual))
-    if config.lpips_weights:
-        inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
-    folder = store.RunDir.open(Path(out), "fit", to_dict(config), inputs, VERSION, overwrite)
+    virtual: Mapping[str, ObservationSet] = {}
+    if learns_virtual and observations is not None:
+        virtual = virtual_sets(Path(observations))
+        inputs["observations"] = store.digest(Path(observations))
+    if config.virtual.lpips_weights:
+        inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
+    folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     with _one_torch_thread():
-        state = _prepare(config, recipe, Path(scene), Path(fused), virtual, folder.path)
+        state = _prepare(config, Path(scene), Path(fused), virtual, folder.path)
         optimise(state, config, folder)
     save_model(state.model, folder.path)
     save_appearance(state.appearance, folder.path)
@@ -138,8 +131,6 @@ class FitState:
     step: int
     seconds: float = 0.0
     last: Mapping[str, float] | None = None
-    unseen: Tensor | None = None
-    """u8[V, H, W] of the virtual views: 1 where no recorded view saw what they show; None before they join."""
     appearance: Appearance = field(default_factory=lambda: Appearance({}))
 
     def summary(self) -> dict[str, Any]:
@@ -147,86 +138,81 @@ class FitState:
         return {"gaussians": len(self.model.table), "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def _prepare(config: FitConfig, recipe: Recipe, scene_path: Path, fused_path: Path, virtual: Path | None, out: Path) -> FitState:
+def _prepare(config: FitConfig, scene_path: Path, fused_path: Path, virtual: Mapping[str, ObservationSet], out: Path) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene = read_scene(scene_path)
-    frames = training_frames(scene, config.cameras)
-    classes = classes_of(scene, frames, virtual) if config.semantics else ()
-    recorded = load_recorded(scene, frames, classes, config.width_px, recipe.lidar and config.lidar_weight > 0)
-    fused = read_fused(fused_path)
-    shown: tuple[StoredView, ...] = ()
-    if virtual is not None:
-        measured = fused_lidar(fused, scene.tracks) if config.virtual_lidar_weight else None
-        shown = load_virtual(virtual, classes, measured)
-    views = ViewSet(recorded, shown, offsets_from_path_m(recorded, shown))
-    schedule = densify_schedule(config)
+    scene, fused = read_scene(scene_path), read_fused(fused_path)
+    views, classes = recorded_views(config, scene, virtual)
+    if virtual:
+        measured = fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
+        views = replace(views, virtual=load_virtual(virtual, classes, measured))
     found = checkpoint.latest(out / "steps")
-    if found is not None:
-        model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
-        log.info(f"continuing at step {found.step} of {config.iterations}")
-        stats = DensifyStats.from_state(found.tensors("stats"))
-        unseen = found.tensors("unseen").get("maps") if found.state["virtual"] else None
-        appearance = Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
-        return FitState(model, views, stats, schedule, found.step, float(found.state["seconds"]), found.state["last"], unseen, appearance)
-    return start_state(config, recipe, scene, fused, views, classes)
+    if found is None:
+        return start_state(config, scene, fused, views, classes)
+    log.info(f"continuing at step {found.step} of {config.iterations}")
+    model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
+    stats, appearance = found.tensors("stats"), Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
+    return FitState(
+        model, views, DensifyStats.from_state(stats), densify_schedule(config), found.step, float(found.state["seconds"]),
+        found.state["last"], appearance,
+    )  # fmt: skip
 
 
-def start_state(
-    config: FitConfig, recipe: Recipe, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]
-) -> FitState:
+def recorded_views(
+    config: FitConfig, scene: Scene, virtual: Mapping[str, ObservationSet] | None = None
+) -> tuple[ViewSet, tuple[int, ...]]:
+    """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels (those that
+    ``virtual`` shows included)."""
+    frames = training_frames(scene, config.cameras)
+    classes = classes_of(scene, frames, virtual or {}) if config.semantics else ()
+    with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
+    return ViewSet(load_recorded(scene, frames, classes, config.width_px, with_lidar), ()), classes
+
+
+def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]) -> FitState:
     """The state that a fit starts from: a model built from the fused cloud, nothing corrected yet."""
-    start = StartSettings(
-        config.initial_gaussians, config.voxel_m, config.far_m, config.sh_degree, recipe.objects, recipe.sky,
-        config.learn_poses, config.seed, config.deformable, config.color_terms, config.mirror_start, config.outlier_deviations,
-    )  # fmt: skip
-    model = start_model(scene, cloud, views.recorded, classes, start)
+    model = start_model(scene, cloud, views.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
+    wanted = config.appearance
     appearance = Appearance.of_views(
-        [view.name for view in views.recorded], [view.name for view in views.virtual], config.exposure, config.learn_cameras,
-        config.virtual_appearance,
-    )  # fmt: skip
+        [view.name for view in views.recorded], [view.name for view in views.virtual], wanted.exposure, wanted.cameras, wanted.virtual
+    )
     return FitState(model, views, DensifyStats.zeros(len(model.table)), densify_schedule(config), 0, appearance=appearance)
 
 
 # ---- the loop ------------------------------------------------------------------------------------------------------
 
 
-def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
-    """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``virtual_beside``).
+def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
+    """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``VirtualConfig.beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
-    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config)
-    virtual_from, virtual_to = (share * config.iterations for share in (config.virtual_start, config.virtual_stop))
+    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual)
+    virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     with log.task(f"fit {config.method}", config.iterations, state.step) as bar, _interrupt_at_end_of_step() as interrupted:
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
-            if step > virtual_from and state.unseen is None and state.views.virtual:
-                state.unseen = admit_virtual_views(state, config, raster)
-            probability = config.virtual_probability if virtual_from < step <= virtual_to else 0.0
-            reach_m = _virtual_reach_m(state.views, config, step)
-            samples = state.views.choose(config.seed, step, probability, state.unseen, reach_m, config.virtual_beside)
-            learnt = [_learn_from(state, sample, config, raster, perception, step, index) for index, sample in enumerate(samples)]
-            (render, terms), sample = learnt[0], samples[0]
-            visible = render.trace.visible
-            for other, _ in learnt[1:]:
-                visible = visible | other.trace.visible
-            adam_step(state.model, step, config, visible)
-            state.appearance.adam_step(step, appearance_rates(step, config.iterations), kernels.adam_columns)
+            if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
+                start_unseen_gaussians(state, config, raster)
+            probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
+            views = state.views.choose(config.seed, step, probability, config.virtual.beside)
+            learnt = [_learn_from(state, view, config, raster, perception, step, view is views[0]) for view in views]
+            adam_step(state.model, step, config.iterations)
+            state.appearance.adam_step(step, appearance_rates(step, config.iterations), native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
-                shorten_needles(state.model.table, config.longest_to_middle)
+                shorten_needles(state.model.table, config.densify.longest_to_middle)
                 settle_nodes(state.model, config, step)
             if pose_round_due(config, step):
                 moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
                 folder.log(step=step, boxes_moved_m=round(moved_m, 5))
-            grown = _densify_if_due(state, config, step)
+            densified = _densify_if_due(state, config, step)
 
             state.step, state.seconds = step, state.seconds + time.perf_counter() - began
-            if step % 20 == 0 or step == config.iterations or grown:
-                state.last = _progress(state, render, sample, terms)
-                folder.log(step=step, view=sample.name, seconds=round(state.seconds, 3), **state.last, **grown)
+            if step % 20 == 0 or step == config.iterations or densified:
+                state.last = _progress(state, views[0], *learnt[0])
+                folder.log(step=step, view=views[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
                 bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
                 write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
@@ -239,156 +225,128 @@ def optimise(state: FitState, config: FitConfig, folder: store.RunDir) -> None:
 
 
 def _learn_from(
-    state: FitState, sample: Sample, config: FitConfig, raster: RasterConfig, perception: Perception, step: int, index: int
+    state: FitState, view: TrainView, config: FitConfig, raster: RasterConfig, perception: Perception, step: int, first: bool
 ) -> tuple[Render, dict[str, Tensor]]:
     """Render a view and add the gradients of its loss to the parameters'.
 
     Args:
-        index: place of the view among those of this step; what does not depend on the view counts with the first.
+        first: whether it is the first view of this step; terms that do not depend on the view count with it.
 
     Returns:
         The picture, and the weighted loss terms.
     """
-    observation = sample.observation
-    recorded = observation.kind == "recorded"
-    wanted = recorded or config.virtual_densify
-    growing = wanted and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
-    with_classes = not recorded or step % config.semantic_every == 0
-    gaussians = compose(state.model, observation.view.time_s, None, with_classes, recorded and shows_mirrored(config, step))
-    pose = state.appearance.world_from_cam(observation.view, sample.name) if recorded else None
-    render = rasterize(gaussians, observation.view, raster, absgrad=growing, world_from_cam=pose)
-    terms = (recorded_terms if recorded else virtual_terms)(state.model, render, sample, config, perception, state.appearance)
-    terms |= (regularisers(gaussians, config) if index == 0 else {}) | correction_terms(state, gaussians, sample, config, raster, step)
-    finite_or_refuse(terms, sample.name, step)
+    recorded = view.kind == "recorded"
+    feeds_densify = recorded or config.virtual.densify
+    growing = feeds_densify and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
+    with_classes = not recorded or step % config.loss.semantic_every == 0
+    gaussians = compose(state.model, view.view.time_s, with_classes)
+    pose = state.appearance.world_from_cam(view.view, view.name) if recorded else None
+    render = rasterize(gaussians, view.view, raster, absgrad=growing, world_from_cam=pose)
+    terms = recorded_terms(state, render, view, config) if recorded else virtual_terms(state, render, view, config, perception)
+    terms |= (regularisers(gaussians, config) if first else {}) | correction_terms(state, gaussians, view, config, raster, step)
+    finite_or_refuse(terms, view.name, step)
     torch.stack(list(terms.values())).sum().backward()
-    gradients_or_refuse(state.model, sample.name, step)
-    state.appearance.refuse_non_finite(sample.name, step)
+    gradients_or_refuse(state.model, view.name, step)
+    state.appearance.refuse_non_finite(view.name, step)
     if growing:
-        camera = observation.view.camera
+        camera = view.view.camera
         state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0])
     return render, terms
 
 
-def _virtual_reach_m(views: ViewSet, config: FitConfig, step: int) -> float:
-    """How far from the recorded path virtual views may be at a step, metres: grows from the nearest one to all of them."""
-    if not views.virtual or not config.virtual_grow:
-        return math.inf
-    nearest, farthest = min(views.offsets_m), max(views.offsets_m)
-    along = (step / config.iterations - config.virtual_start) / config.virtual_grow
-    return nearest + (farthest - nearest) * min(max(along, 0.0), 1.0)
-
-
-def admit_virtual_views(state: FitState, config: FitConfig, raster: RasterConfig) -> Tensor:
-    """Before virtual views join: work out what only they see, and start Gaussians there (see ``fit_trust``).
-
-    Returns:
-        Maps u8[V, H, W], 1 where no recorded view saw what a virtual view shows; padded to the largest view.
-    """
+def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
+    """When virtual views join: start Gaussians at the surfaces that only they show (see ``fitting/trust.py``)."""
     maps = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
-    if config.virtual_gaussians:
-        columns, labels = unseen_rows(state.model, state.views.virtual, maps, config.virtual_gaussians, config.seed)
-        state.model.table.append(columns, labels)
-        state.model.sort_rows()
-        state.stats = DensifyStats.zeros(len(state.model.table))
-    height, width = (max(size) for size in zip(*(found.shape for found in maps)))
-    stacked = torch.zeros(len(maps), height, width, dtype=torch.uint8)
-    for index, found in enumerate(maps):
-        stacked[index, : found.shape[0], : found.shape[1]] = torch.from_numpy(found)
+    columns, labels = unseen_rows(state.model, state.views.virtual, maps, config.virtual.gaussians, config.seed)
+    state.model.table.append(columns, labels)
+    state.model.sort_rows()
+    state.stats = DensifyStats.zeros(len(state.model.table))
     log.info(f"virtual views: {float(np.mean([found.mean() for found in maps])):.0%} of their pixels show what no recorded view saw")
-    return stacked
 
 
-def recorded_terms(
-    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: Perception, appearance: Appearance | None = None
-) -> dict[str, Tensor]:
+def _picture(state: FitState, render: Render, view: TrainView) -> Tensor:
+    """The rendered colours ``[3, H, W]`` over the sky, as the camera (or generator) of the view would show them."""
+    rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
+    return state.appearance.colored(rgb, view.name, view.kind)
+
+
+def recorded_terms(state: FitState, render: Render, view: TrainView, config: FitConfig) -> dict[str, Tensor]:
     """Weighted loss terms of a recorded view: colour, LiDAR depth, sky, semantics (those that apply).
 
-    The observation's confidence is that of its labels (a labeller may be unsure; the photograph is not).
+    The view's confidence is that of its labels (a labeller may be unsure; the photograph is not).
     """
-    seen = sample.observation
-    labels = seen.confidence * seen.mask
-    rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
-    rgb = rgb if appearance is None else appearance.colored(rgb, sample.name, seen.kind)
-    rgb = losses.outside_mask_copied(rgb, seen.rgb, None if seen.mask.all() else seen.mask)
-    terms = {"color": kernels.photometric(rgb, seen.rgb, config.ssim_weight)}
-    if sample.lidar is not None and len(sample.lidar.pixel) and config.lidar_weight:
-        terms["lidar"] = config.lidar_weight * losses.sparse_depth(render.depth, sample.lidar.pixel, sample.lidar.depth_m)
-    if sample.sky is not None and config.sky_weight and model.sky is not None:
-        terms["sky"] = config.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, sample.sky), labels)
-    if render.extra is not None and seen.semantics is not None and config.semantic_weight:
-        total = max(float(labels.sum()), 1e-12) / config.semantic_weight
-        terms["semantics"] = kernels.class_loss(render.extra, seen.semantics, labels[0], total, sky_lift(model, render.alpha))
+    weights = config.loss
+    labels = view.confidence * view.mask
+    rgb = losses.outside_mask_copied(_picture(state, render, view), view.rgb, None if view.mask.all() else view.mask)
+    terms = {"color": native_ops.photometric(rgb, view.rgb, weights.ssim_weight)}
+    if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
+        terms["lidar"] = weights.lidar_weight * losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
+    if view.sky is not None and weights.sky_weight and state.model.sky is not None:
+        terms["sky"] = weights.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, view.sky), labels)
+    if render.extra is not None and view.channels is not None and weights.semantic_weight:
+        total = max(float(labels.sum()), 1e-12) / weights.semantic_weight
+        terms["semantics"] = native_ops.class_loss(render.extra, view.channels, labels[0], total, sky_lift(state.model, render.alpha))
     return terms
 
 
 def virtual_terms(
-    model: SceneModel, render: Render, sample: Sample, config: FitConfig, perception: Perception, appearance: Appearance | None = None
+    state: FitState, render: Render, view: TrainView, config: FitConfig, perception: Perception
 ) -> dict[str, Tensor]:
-    """Weighted loss terms of a virtual view, every pixel weighted by the observation's confidence."""
-    seen = sample.observation
-    sure = seen.confidence if config.virtual_confidence_power == 1 else seen.confidence**config.virtual_confidence_power
-    weight = sure * seen.mask * torch.where(sample.unseen, 1.0, config.virtual_seen_weight)
-    rgb = composite_sky(model, seen.view, render.rgb, render.alpha)
-    rgb = rgb if appearance is None else appearance.colored(rgb, sample.name, seen.kind)
+    """Weighted loss terms of a virtual view, every pixel weighted by the view's confidence."""
+    weights = config.virtual
+    sure = view.confidence if weights.confidence_power == 1 else view.confidence**weights.confidence_power
+    weight = sure * view.mask
+    rgb = _picture(state, render, view)
     terms: dict[str, Tensor] = {}
-    if config.virtual_color_weight:
-        terms["virtual_color"] = config.virtual_color_weight * kernels.photometric(rgb, seen.rgb, config.virtual_ssim_weight, weight[0])
-    if config.virtual_perceptual_weight:
-        terms["virtual_perceptual"] = config.virtual_perceptual_weight * perception(rgb, seen.rgb, weight)
-    if seen.depth is not None and config.virtual_depth_weight:
-        valid = torch.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth < FARTHEST_VIRTUAL_DEPTH_M)
-        loss = losses.dense_depth_map(render.depth, torch.where(valid, seen.depth, 1.0))
-        terms["virtual_depth"] = config.virtual_depth_weight * losses.confident_mean(loss, weight * valid)
-    if sample.lidar is not None and len(sample.lidar.pixel) and config.virtual_lidar_weight:
-        loss = losses.sparse_depth(render.depth, sample.lidar.pixel, sample.lidar.depth_m)
-        terms["virtual_lidar"] = config.virtual_lidar_weight * loss
-    if sample.sky is not None and config.sky_weight and model.sky is not None:
-        terms["virtual_sky"] = config.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, sample.sky), weight)
-    if render.extra is not None and seen.semantics is not None and config.virtual_semantic_weight:
-        total, lift = weight[0].numel() / config.virtual_semantic_weight, sky_lift(model, render.alpha)
-        terms["virtual_semantics"] = kernels.class_loss(render.extra, seen.semantics, weight[0], total, lift)
+    if weights.color_weight:
+        terms["virtual_color"] = weights.color_weight * native_ops.photometric(rgb, view.rgb, weights.ssim_weight, weight[0])
+    if weights.perceptual_weight:
+        terms["virtual_perceptual"] = weights.perceptual_weight * perception(rgb, view.rgb, weight)
+    if view.depth is not None and weights.depth_weight:
+        valid = torch.isfinite(view.depth) & (view.depth > 0) & (view.depth < FARTHEST_VIRTUAL_DEPTH_M)
+        loss = losses.dense_depth_map(render.depth, torch.where(valid, view.depth, 1.0))
+        terms["virtual_depth"] = weights.depth_weight * losses.confident_mean(loss, weight * valid)
+    if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
+        loss = losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
+        terms["virtual_lidar"] = weights.lidar_weight * loss
+    if view.sky is not None and config.loss.sky_weight and state.model.sky is not None:
+        terms["virtual_sky"] = config.loss.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, view.sky), weight)
+    if render.extra is not None and view.channels is not None and weights.semantic_weight:
+        total, lift = weight[0].numel() / weights.semantic_weight, sky_lift(state.model, render.alpha)
+        terms["virtual_semantics"] = native_ops.class_loss(render.extra, view.channels, weight[0], total, lift)
     return terms
 
 
 def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
-    """Weighted mean opacity and mean scale in metres of all Gaussians, where their weights are not 0."""
-    published = config.densify == "mcmc"
-    opacity_weight = (MCMC_OPACITY_WEIGHT if published else 0.0) if config.opacity_weight is None else config.opacity_weight
-    scale_weight = (MCMC_SCALE_WEIGHT if published else 0.0) if config.scale_weight is None else config.scale_weight
-    terms = {}
-    if opacity_weight:
-        terms["opacity"] = opacity_weight * gaussians.opacity.mean()
-    if scale_weight:
-        terms["scale"] = scale_weight * gaussians.scales.mean()
-    return terms
+    """Weighted mean opacity and mean scale of all Gaussians; unset weights are those published with ``mcmc``, else 0."""
+    published = config.densify.kind == "mcmc"
+    opacity_weight, scale_weight = config.loss.opacity_weight, config.loss.scale_weight
+    if opacity_weight is None:
+        opacity_weight = MCMC_OPACITY_WEIGHT if published else 0.0
+    if scale_weight is None:
+        scale_weight = MCMC_SCALE_WEIGHT if published else 0.0
+    return losses.opacity_and_scale(gaussians.opacity, gaussians.scales, opacity_weight, scale_weight)
 
 
 def correction_terms(
-    state: FitState, gaussians: Gaussians, sample: Sample, config: FitConfig, raster: RasterConfig, step: int
+    state: FitState, gaussians: Gaussians, view: TrainView, config: FitConfig, raster: RasterConfig, step: int
 ) -> dict[str, Tensor]:
     """Weighted terms that hold what is learnt to what is known: colour maps near the identity, objects within their boxes
     (once densification is over)."""
-    seen = sample.observation
     terms: dict[str, Tensor] = {}
-    distance = state.appearance.penalty(sample.name, seen.kind)
-    if distance is not None and config.exposure_weight:
-        terms["exposure"] = config.exposure_weight * distance
-    if config.object_weight and seen.kind == "recorded" and _settled(state.schedule, step) and len(state.model.nodes) > 1:
-        alpha = rasterize(objects_only(gaussians), seen.view, raster).alpha
-        inside = boxes_in_view(state.model, seen.view)
-        terms["objects"] = config.object_weight * losses.object_map(alpha, inside).mean()
+    distance = state.appearance.penalty(view.name, view.kind)
+    if distance is not None and config.appearance.exposure_weight:
+        terms["exposure"] = config.appearance.exposure_weight * distance
+    if config.loss.object_weight and view.kind == "recorded" and _settled(state.schedule, step) and len(state.model.nodes) > 1:
+        alpha = rasterize(objects_only(gaussians), view.view, raster).alpha
+        inside = boxes_in_view(state.model, view.view)
+        terms["objects"] = config.loss.object_weight * losses.object_map(alpha, inside).mean()
     return terms
 
 
 def _settled(schedule: DensifySettings | McmcSettings | None, step: int) -> bool:
     """Whether the number of Gaussians does not change any more after a step."""
     return schedule is None or step > schedule.stop
-
-
-def shows_mirrored(config: FitConfig, step: int) -> bool:
-    """Whether symmetric objects are shown mirrored at a step."""
-    probability = config.mirror_probability
-    return probability > 0 and float(seeds.numpy_rng(config.seed, step, "mirrored").random()) < probability
 
 
 def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
@@ -401,10 +359,10 @@ def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
 
 def pose_round_due(config: FitConfig, step: int) -> bool:
     """Whether boxes are corrected after a step."""
-    if not config.learn_poses or not config.pose_rounds:
+    poses = config.poses
+    if not poses.learn or not poses.rounds:
         return False
-    first, last = config.pose_start, max(config.pose_start, LAST_POSE_ROUND)
-    shares = np.linspace(first, last, config.pose_rounds)
+    shares = np.linspace(poses.start, max(poses.start, LAST_POSE_ROUND), poses.rounds)
     return step in {max(1, round(float(share) * config.iterations)) for share in shares}
 
 
@@ -454,7 +412,6 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "semantics": 1e-2 * boost,
         "panorama": 1e-2 * gentle,
         "deform": 1e-3 * boost * gentle,
-        "sh_time": 2.5e-3 * boost * gentle,
     }
 
 
@@ -472,26 +429,20 @@ def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None
     total = config.iterations
     every = max(10, min(100, total // 20))
     start = max(every, min(500, total // 10))
-    if config.densify == "mcmc":
-        return McmcSettings(start, int(0.8 * total), every, max_rows=config.max_gaussians)
-    if config.densify == "none":
+    if config.densify.kind == "mcmc":
+        return McmcSettings(start, int(0.8 * total), every, max_rows=config.densify.max_gaussians)
+    if config.densify.kind == "none":
         return None
     return DensifySettings(
-        start, int(0.6 * total), every, max_rows=config.max_gaussians, reset_every=3000 if total >= 10_000 else 0
+        start, int(0.6 * total), every, max_rows=config.densify.max_gaussians, reset_every=3000 if total >= 10_000 else 0
     )
 
 
-def adam_step(model: SceneModel, step: int, config: FitConfig, visible: Tensor) -> None:
-    """One Adam step on every table of the model, then gradients are dropped.
-
-    Args:
-        visible: bool[N], the Gaussians this step's view shows; with ``config.selective_adam`` the others rest.
-    """
-    rates = learning_rates(step, config.iterations)
-    model.table.adam_step(step, rates, kernels.adam_columns, visible if config.selective_adam else None)
-    for table in model.node_tables().values():
-        table.adam_step(step, rates, kernels.adam_columns)
+def adam_step(model: SceneModel, step: int, iterations: int) -> None:
+    """One Adam step on every table of the model, then gradients are dropped."""
+    rates = learning_rates(step, iterations)
     for table in (model.table, *model.node_tables().values()):
+        table.adam_step(step, rates, native_ops.adam_columns)
         table.clear_gradients()
 
 
@@ -520,12 +471,9 @@ def save_checkpoint(state: FitState, folder: Path) -> None:
     """All that changes: model with moments, statistics, step."""
     values, groups = state.model.state()
     groups = {**groups, "stats": state.stats.state()}
-    if state.unseen is not None:
-        groups["unseen"] = {"maps": state.unseen}
     names, groups["appearance"] = state.appearance.state()
     groups["appearance"] = groups["appearance"] or {"none": torch.zeros(1)}
-    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "virtual": state.unseen is not None,
-             "appearance": names}  # fmt: skip
+    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "appearance": names}
     checkpoint.save(folder, state.step, groups, facts)
 
 
@@ -567,16 +515,14 @@ def load_model(folder: Path) -> SceneModel:
     return SceneModel.from_state(values, groups)
 
 
-# ---- looking at it --------------------------------------------------------------------------------------------------
+# ---- pictures -------------------------------------------------------------------------------------------------------
 
 
-def _progress(state: FitState, render: Render, sample: Sample, terms: Mapping[str, Tensor]) -> dict[str, float]:
-    seen = sample.observation
+def _progress(state: FitState, view: TrainView, render: Render, terms: Mapping[str, Tensor]) -> dict[str, float]:
     with torch.no_grad():
-        rgb = composite_sky(state.model, seen.view, render.rgb, render.alpha)
-        psnr = metrics.psnr(rgb, seen.rgb, seen.mask)
-    shown = {f"loss_{name}": round(value.item(), 6) for name, value in terms.items()}
-    return {"psnr": round(min(psnr, 99.0), 3), **shown}
+        rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
+        psnr = metrics.psnr(rgb, view.rgb, view.mask)
+    return {"psnr": round(min(psnr, 99.0), 3), **{f"loss_{name}": round(value.item(), 6) for name, value in terms.items()}}
 
 
 @torch.no_grad()
@@ -604,13 +550,11 @@ def render_view(model: SceneModel, view: View, raster: RasterConfig, sky_below_a
 
 def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
     """A picture: truth, render, depth, semantics of the middle recorded view."""
-    from mudg.data.exporters.video import depth_colors
-
     stored = state.views.recorded[len(state.views.recorded) // 2]
     seen = render_view(state.model, stored.view, raster)
-    panels = [stored.rgb, (seen.rgb * 255).round().byte().permute(1, 2, 0).numpy(), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
+    panels = [stored.rgb, to_bytes(seen.rgb), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
     if seen.semantics is not None:
-        panels.append(palette.encode(seen.semantics.numpy(), palette.DISPLAY_COLORS))
+        panels.append(class_colors(seen.semantics.numpy()))
     with store.atomic_path(path) as temporary:
         Image.fromarray(np.concatenate(panels, 1)).save(temporary)
 

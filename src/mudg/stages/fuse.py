@@ -13,21 +13,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from mudg.base import log, store
 from mudg.base.config import to_dict
-from mudg.base.types import Frame, FusedCloud, Scene
-from mudg.core.fusion import FusionReport, FusionRules, Shot, SweepShots, fuse_sweeps
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
+from mudg.core.fusion import FusionReport, FusionRules, SweepShots, fuse_sweeps
 from mudg.data.cloudfile import write_fused
 from mudg.data.scene import read_image, read_label, read_points, read_scene
+from mudg.report.top_view import TopView, draw_top_view
 from mudg.stages import batch
 from mudg.stages.config import FuseConfig
 
-_VERSION = 1
-_TOP_VIEW_PX = 1400
-_MOVER_COLOUR = (255, 90, 60)
-_PATH_COLOUR = (60, 200, 255)
+_OUTPUT = VerbOutput("fuse", 1, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
+_TOP_VIEW_PX = (1400, 1000)
 
 
 def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) -> Path:
@@ -41,7 +41,8 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
     Raises:
         InputError: the scene is malformed. UsageError: ``out`` holds something else.
     """
-    folder = store.RunDir.open(out, "fuse", to_dict(config), {"scene": store.digest(scene)}, _VERSION, overwrite)
+    refuse_overlap(out, {"scene": scene})
+    folder = RunDir.open(out, _OUTPUT, to_dict(config), {"scene": store.digest(scene)}, overwrite)
     if folder.complete:
         return folder.reused()
     loaded = read_scene(scene)
@@ -55,7 +56,7 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
         log.info(f"fuse: {words}")
     write_fused(folder.path, cloud, report_record(report, rules))
     with store.atomic_path(folder.path / "top.png") as temporary:
-        draw_top_view(loaded, cloud, report).save(temporary)
+        top_view(loaded, cloud, report).save(temporary)
     folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
     return folder.path
 
@@ -66,7 +67,7 @@ def run_many(
     """``run`` for every scene of a list; see ``stages/batch.py``."""
     entries = batch.shard(batch.read_list(listed), shard)
     work = functools.partial(_one_of_many, config)
-    return batch.run_batch("fuse", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+    return batch.run_batch("fuse", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed)
 
 
 def _one_of_many(config: FuseConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
@@ -81,11 +82,11 @@ def rules_of(config: FuseConfig) -> FusionRules:
 
 def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
     """The sweeps of a scene, one at a time, each with the images that may colour it."""
-    frames = [f for f in scene.frames if config.colour_from_held_out or scene.split.get(f.id, "train") == "train"]
+    frames = [f for f in scene.frames if config.color_from_held_out or scene.split.get(f.id, "train") == "train"]
     by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "fusing sweeps"):
         chosen = [_nearest(found, sweep.time_s) for found in by_camera.values() if found]
-        shots = [_shot(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= config.max_image_gap_s]
+        shots = [_photo(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= config.max_image_gap_s]
         points = read_points(scene, sweep)
         yield SweepShots(sweep.time_s, sweep.world_from_lidar, points, shots)
 
@@ -94,9 +95,9 @@ def _nearest(frames: list[Frame], time_s: float) -> Frame:
     return min(frames, key=lambda frame: abs(frame.view.time_s - time_s))
 
 
-def _shot(scene: Scene, frame: Frame) -> Shot:
+def _photo(scene: Scene, frame: Frame) -> Photo:
     semantics = read_label(scene, frame, "semantics") if "semantics" in frame.labels else None
-    return Shot(frame.view, read_image(scene, frame), semantics)
+    return Photo(frame.view, read_image(scene, frame), semantics)
 
 
 def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
@@ -120,7 +121,7 @@ def describe(report: FusionReport) -> list[str]:
     movers = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
     total = max(report.points_in, 1)
     lines = [
-        f"{report.sweeps} sweeps, {report.points_in} points: {report.points_coloured / total:.0%} coloured, "
+        f"{report.sweeps} sweeps, {report.points_in} points: {report.points_colored / total:.0%} coloured, "
         f"{report.points_hidden / total:.1%} hidden behind nearer surfaces, {report.points_unseen / total:.0%} in no image",
         f"{len(movers)} of {len(report.verdicts)} tracked boxes move; {report.points_static} points in the static cloud",
     ]
@@ -128,39 +129,16 @@ def describe(report: FusionReport) -> list[str]:
     return lines
 
 
-def draw_top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Image.Image:
-    """The clouds from above (x right, y up), movers at the middle of their tracks, the vehicle's path as a line."""
+def top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Image.Image:
+    """The clouds from above, dynamic objects at the middle of their tracks."""
     xyz, rgb = _placed(scene, cloud)
-    path = scene.ego.world_from_ego[:, :2, 3]
-    around = np.concatenate([xyz[:, :2], path]) if len(xyz) else path
-    low, high = np.percentile(around, 1, axis=0) - 5, np.percentile(around, 99, axis=0) + 5
-    low, high = np.minimum(low, path.min(0) - 5), np.maximum(high, path.max(0) + 5)
-    scale = _TOP_VIEW_PX / float((high - low).max())
-    width, height = (np.ceil((high - low) * scale).astype(int) + 1).tolist()
-    canvas = np.full((height, width, 3), 18, np.uint8)
-    pixel = ((xyz[:, :2] - low) * scale).astype(int)
-    inside = ((pixel >= 0) & (pixel < [width, height])).all(1)
-    order = np.flatnonzero(inside)[np.argsort(xyz[inside, 2], kind="stable")]  # higher points on top
-    dot = 2 if len(order) < 400_000 else 1
-    for down, right in np.ndindex(dot, dot):
-        rows, columns = height - 1 - pixel[order, 1] + down, pixel[order, 0] + right
-        canvas[rows.clip(0, height - 1), columns.clip(0, width - 1)] = rgb[order]
-    image = Image.fromarray(canvas)
-    draw = ImageDraw.Draw(image)
-
-    def at(points: NDArray[np.floating]) -> list[tuple[float, float]]:
-        return [(float(x), float(height - 1 - y)) for x, y in (points - low) * scale]
-
-    if len(path) > 1:
-        draw.line(at(path), fill=_PATH_COLOUR, width=2)
-    for track in scene.tracks:
-        if report.verdicts[track.id].moving:
-            draw.line(at(track.world_from_object[:, :2, 3]), fill=_MOVER_COLOUR, width=1)
-            draw.polygon(at(_footprint(track.size_m, _middle(track))), outline=_MOVER_COLOUR)
-    return image
+    boxes = {track.id: _middle(track) for track in scene.tracks if report.verdicts[track.id].moving}
+    caption = f"{scene.id}: {len(xyz)} points, {len(boxes)} dynamic objects"
+    dot_px = 2 if len(xyz) < 400_000 else 1
+    return draw_top_view(scene, TopView(xyz, rgb, boxes, caption, dot_px, outer_percent=1.0), *_TOP_VIEW_PX)
 
 
-def _middle(track: Any) -> NDArray[np.float64]:
+def _middle(track: Track) -> NDArray[np.float64]:
     return track.world_from_object[len(track.times_s) // 2]
 
 
@@ -171,8 +149,3 @@ def _placed(scene: Scene, cloud: FusedCloud) -> tuple[NDArray[np.float64], NDArr
         xyz.append(points.xyz.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
         rgb.append(points.rgb)
     return np.concatenate(xyz), np.concatenate(rgb)
-
-
-def _footprint(size_m: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2 * size_m[:2]
-    return corners @ pose[:2, :2].T + pose[:2, 3]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import os
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,19 +13,19 @@ from typing import Any
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Frame, Scene
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap, run_state
+from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS, files_of
 from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
-from mudg.data.scene import SceneWriter, alignment, read_label, read_points, read_scene
+from mudg.data.scene import SCENE_FILES, SceneWriter, alignment, read_scene
 from mudg.data.scene import check as scene_check
-from mudg.data.scene.files import open_files
 from mudg.report import contact_sheet
 from mudg.stages import batch
 from mudg.stages.config import IngestConfig
 
 CITY = "city"
-_VERSION = 1
+_OUTPUT = VerbOutput("ingest", 1, (*SCENE_FILES, contact_sheet.NAME))
 
 
 def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> Path:
@@ -44,51 +42,41 @@ def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool 
         InputError: the log is missing, malformed or contradictory. UsageError: ``out`` holds something else.
     """
     source = str(source)
+    refuse_overlap(out, {"log": "" if source == CITY else source, "poses": config.poses, "boxes": config.boxes})
     kind = CITY if source == CITY else _kind(config, Path(source))
+    if kind in IMPORTERS:
+        files = files_of(kind, Path(source), import_options(config))
+        refuse_overlap(out, {f"file {n} of the log": path for n, path in enumerate((*files.files, *files.entries))})
     inputs = {} if kind == CITY else {"source": source_digest(Path(source), kind, config)}
     idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
     settings = {name: value for name, value in to_dict(config).items() if name not in idle}
-    existed = out.exists()
-    fresh = not existed or (out.is_dir() and not any(out.iterdir()))
-    folder = store.RunDir.open(out, "ingest", settings, inputs, _VERSION, overwrite or _abandoned(out))
+    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite or _abandoned(out))
     if folder.complete:
         return folder.reused()
     try:
         return _fill(folder, kind, config, Path(source))
     except BaseException:
-        if (
-            fresh and not (folder.path / "scene.json").is_file()
-        ):  # nothing was made: the next try may ask for something else
-            _empty(folder.path, remove=not existed)
+        if folder.fresh and not (folder.path / "scene.json").is_file():
+            folder.discard()  # nothing was made: the next try may ask for something else
         raise
-
-
-def _empty(folder: Path, *, remove: bool) -> None:
-    """Take everything out of a folder, and the folder away."""
-    with contextlib.suppress(OSError):  # the error that brought us here is the one to tell
-        for entry in folder.iterdir():
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-        if remove:
-            folder.rmdir()
 
 
 def _abandoned(out: Path) -> bool:
     """Whether an import that is not finished made no scene at ``out`` yet."""
-    try:
-        state = store.read_json(out / "run.json")
-        return bool(state["verb"] == "ingest" and state["state"] != "complete" and not (out / "scene.json").is_file())
-    except (InputError, KeyError, TypeError):
-        return False
+    state = run_state(out)
+    return state.get("verb") == "ingest" and state["state"] != "complete" and not (out / "scene.json").is_file()
 
 
-def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -> Path:
+def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path:
     """Make the scene in its folder, draw its contact sheet and finish the run."""
     if (folder.path / "scene.json").is_file():
         scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
     else:
         scene = _make(kind, config, source, folder.path)
         if kind not in (CITY, _SCENE):
-            scene_check.check_records(scene, _say)
+            for finding in scene_check.check_records(scene):
+                if finding.level == "warning":
+                    log.warn(f"ingest: {finding.where}: {finding.message}")
     held_out = sum(split == "test" for split in scene.split.values())
     log.info(
         f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "
@@ -102,22 +90,17 @@ def _fill(folder: store.RunDir, kind: str, config: IngestConfig, source: Path) -
     }
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
-        log.info(f"ingest: look at {sheet}")
+        log.info(f"ingest: look at {folder.out / sheet.name}")
     folder.finish({**summary, **({} if kind == CITY else _alignment(scene))})
     return folder.path
-
-
-def _say(level: scene_check.Level, where: str, words: str) -> None:
-    if level == "warning":
-        log.warn(f"ingest: {where}: {words}")
 
 
 def _alignment(scene: Scene) -> dict[str, Any]:
     """How the images fit the LiDAR, for the summary; a doubtful camera is said aloud."""
     found = alignment.camera_alignment(scene)
     for name, one in found.items():
-        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.words(name, one)}")
-    return {"alignment": {name: alignment.record(one) for name, one in found.items()}}
+        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.describe(name, one)}")
+    return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +151,9 @@ def run_many(
     commas), poses and boxes for itself."""
     entries = batch.shard(batch.read_list(listed, _OF_A_LINE), shard)
     work = functools.partial(_one_of_many, config)
-    return batch.run_batch("ingest", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard)
+    return batch.run_batch(
+        "ingest", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed
+    )
 
 
 def _one_of_many(config: IngestConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
@@ -259,7 +244,7 @@ def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
     named = [path for path in (options.poses, options.boxes) if path is not None and path.exists()]
     total = hashlib.sha256()
     base = source if source.is_dir() else source.parent
-    for path in (*files.whole, *named):
+    for path in (*files.files, *named):
         for name in _walk(path):
             state = name.stat() if name.exists() else name.lstat()  # a link may lead nowhere
             place = Path(os.path.relpath(name, base)).as_posix()
@@ -300,29 +285,11 @@ def _refuse(config: IngestConfig, names: Sequence[str], what: str, remedy: str) 
 
 
 def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
-    """Check a scene by reading everything, and write it anew; held-out frames are kept as the scene has them."""
+    """Copy a scene, every file checked; held-out frames are kept as the scene has them."""
     _refuse(config, _OF_A_LOG, "a scene is taken as it is", "leave it out")
     scene = read_scene(source)
     with SceneWriter(out, scene.id, scene.source) as writer:
-        add_rest(writer, scene)
+        writer.copy_all_but_frames(scene)
         for frame in log.progress(scene.frames, len(scene.frames), "copying frames"):
-            add_frame_copy(writer, scene, frame)
+            writer.copy_frame(scene, frame)
         return writer.finish()
-
-
-def add_rest(writer: SceneWriter, scene: Scene) -> None:
-    """Copy everything of a scene but its frames: cameras, sweeps, tracks, ego path, split."""
-    for camera in scene.cameras.values():
-        writer.add_camera(camera)
-    for sweep in log.progress(scene.sweeps, len(scene.sweeps), "copying sweeps"):
-        writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, read_points(scene, sweep))
-    for track in scene.tracks:
-        writer.add_track(track)
-    writer.set_ego(scene.ego)
-    writer.set_split(scene.split)
-
-
-def add_frame_copy(writer: SceneWriter, scene: Scene, frame: Frame, labels: Mapping[str, Any] | None = None) -> None:
-    """Copy a frame, its image's bytes as they are and its labels; ``labels`` (name -> array) fill in what it lacks."""
-    own = {name: read_label(scene, frame, name) for name in frame.labels}
-    writer.add_frame(frame.id, frame.view, open_files(scene.root).read(frame.image.path), {**(labels or {}), **own})

@@ -12,19 +12,19 @@ from pathlib import Path
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
-from mudg.core.edit import without_tracks
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.exporters.video import panels_of, side_by_side, write_mp4
-from mudg.data.observations import ObservationWriter, read_observations
+from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
-from mudg.models.scene.nodes import SceneModel
+from mudg.models.scene.model import SceneModel
 from mudg.stages.config import RenderConfig
 from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.fitting.views import resized_view
 
-VERSION = 1
+_OUTPUT = VerbOutput("render", 1, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
 def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite: bool = False) -> Path:
@@ -38,13 +38,14 @@ def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite:
     Returns:
         ``out``, finished; an interrupted run continues with the next missing view.
     """
+    refuse_overlap(out, {"scene": scene, "model": model})
     inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
-    folder = store.RunDir.open(Path(out), "render", to_dict(config), inputs, VERSION, overwrite)
+    folder = RunDir.open(out, _OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     fitted = load_model(Path(model))
     if config.remove_tracks:
-        fitted = without_tracks(fitted, config.remove_tracks)
+        fitted = fitted.without_nodes(config.remove_tracks)
     source = str(fitted.facts.get("method", "fit"))
     paths = trajectories(read_scene(Path(scene)), config)
     try:

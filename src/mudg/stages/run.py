@@ -15,6 +15,7 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.run_folder import is_temporary, refuse_overlap
 from mudg.base.versions import environment, version
 from mudg.stages.config import RunConfig
 
@@ -37,19 +38,21 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     """Run the whole chain on a generated city, a dataset log or a scene, and write ``OUT/report.html``.
 
     A step whose folder holds a finished result of the same settings and inputs is verified and reused; an interrupted
-    one continues. The seconds of each step are summed over all continuations.
+    one continues. The seconds of each step are summed over all continuations. A scene at ``OUT/scene`` may be the source: nothing
+    is written there then.
 
     Args:
         config: settings of all verbs.
         source: ``"city"``, the folder of a dataset log, or a scene made by ingest.
         out: folder for everything.
-        overwrite: replace what other settings have left in ``out``.
+        overwrite: replace what other settings have left in ``out``, each step's result when the new one is finished.
 
     Returns:
         Paths of the report and the metrics, the seconds per step, and ``text``: the tables for people.
 
     Raises:
-        InputError: no such log. UsageError: ``out`` holds a run of other settings. Whatever a verb raises.
+        InputError: no such log. UsageError: ``out`` holds a run of other settings or files of something else, or touches what is
+            read. Whatever a verb raises.
     """
     from mudg import native
     from mudg.report import run_report
@@ -57,6 +60,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
         raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
+    _refuse_overlap(config, source, out)
     _use_all_threads(native.default_threads())
     ledger = _Ledger.open(out, config, str(source), overwrite)
     try:
@@ -83,11 +87,32 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     }  # fmt: skip
 
 
+def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
+    """UsageError where the chain would write into, over or around what it reads. Its own scene is no such case: with a scene as
+    source it writes none."""
+    from mudg.models.mdm.files import folder_of
+
+    refuse_overlap(out, {
+        "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
+        "ingest.poses": config.ingest.poses, "ingest.boxes": config.ingest.boxes, "annotate.weights": config.annotate.weights,
+        "annotate.depth-network": config.annotate.depth_network, "synthesize.model": folder_of(config.synthesize.model),
+        "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights, "score.lpips-weights": config.score.lpips_weights,
+    })  # fmt: skip
+
+
+def _is_scene(source: str | Path) -> bool:
+    return (Path(source) / "scene.json").is_file() or str(source).endswith(".zip")
+
+
+def _is_own_scene(source: str | Path, out: Path) -> bool:
+    return _is_scene(source) and (out / "scene").exists() and (out / "scene").samefile(source)
+
+
 def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Ledger, overwrite: bool) -> Path:
     """Ingest (unless ``source`` is a scene already) and, where semantic labels are absent, annotate."""
     from mudg.stages import annotate, ingest
 
-    if (Path(source) / "scene.json").is_file() or str(source).endswith(".zip"):
+    if str(source) != CITY and _is_scene(source):
         scene = Path(source)
     else:
         scene = ledger.timed(
@@ -171,8 +196,8 @@ def _report_key(out: Path) -> str:
 
 def _digests(out: Path) -> dict[str, str]:
     """Hash of each artefact's manifest."""
-    folders = sorted(path.parent for path in out.rglob(store.MANIFEST))
-    return {folder.relative_to(out).as_posix(): store.sha256_file(folder / store.MANIFEST) for folder in folders}
+    names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
+    return {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
 
 
 def _use_all_threads(count: int) -> None:
@@ -204,29 +229,45 @@ class _Ledger:
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
-        """Open or begin the ledger of ``out``; UsageError if it belongs to other settings."""
+        """Open or begin the ledger of ``out``; UsageError if it belongs to other settings, or the folder to something else."""
         asked = {"verb": "run", "source": source, **configuration.to_dict(config)}
         before: dict[str, Any] = {}
         known = out / "run.json"
         if known.is_file():
-            before = store.read_json(known)
-            if before.get("asked") == asked:
+            before = cls._read(known)
+            if before["asked"] == asked:
                 pass
             elif overwrite:
                 before = {}
             else:
                 raise UsageError(
                     "the output folder holds a run of other settings", where=str(out),
-                    got="; ".join(store.differences(before.get("asked", {}), asked)[:8]) or "another program version",
+                    got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
                     remedy="choose another --out, or add --overwrite to replace it",
                 )  # fmt: skip
-        elif out.is_dir() and any(out.iterdir()) and not overwrite:
-            raise UsageError("the output folder holds files of something else", where=str(out),
-                             remedy="choose an empty --out")  # fmt: skip
+        elif out.exists():
+            own = {"scene"} if _is_own_scene(source, out) else set()
+            if not out.is_dir() or any(entry.name not in own and not is_temporary(entry.name) for entry in out.iterdir()):
+                raise cls._foreign(out)
         ledger = cls(out, asked, before)
         ledger.save("running")
         store.write_text(out / "run.yaml", configuration.dump_yaml(config))
         return ledger
+
+    @classmethod
+    def _read(cls, path: Path) -> dict[str, Any]:
+        """An earlier ledger; UsageError if the file is something else, as the run.json of a single verb is."""
+        try:
+            content = store.read_json(path)
+            if content["asked"]["verb"] == "run":
+                return content
+        except (InputError, KeyError, TypeError):
+            pass
+        raise cls._foreign(path.parent)
+
+    @staticmethod
+    def _foreign(out: Path) -> UsageError:
+        return UsageError("the output folder holds files of something else", where=str(out), remedy="choose an empty --out")
 
     def has_report(self, key: str) -> bool:
         """Whether report.html was made of just this and is unchanged."""

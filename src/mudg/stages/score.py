@@ -27,35 +27,41 @@ from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, palette, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
+from mudg.data.observations import (
+    OBSERVATION_FILES,
+    ObservationSet,
+    ObservationWriter,
+    list_observation_sets,
+    read_observations,
+)
 from mudg.data.scene import read_scene
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files as mdm_files
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
-from mudg.stages.score_truth import (
-    SAME_PLACE_M,
-    SAME_TIME_S,
-    TrueView,
-    Truth,
-    stored_truth,
-    truth_of,
-)
+from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, Truth, ViewTruth, apart_m, stored_truth, truth_of
 
-Made = TypeVar("Made")
 BASELINE: Final = "nearest_fill"
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
 DEPTH_LIMIT_M: Final = 80.0
-_VERSION: Final = 2
+_OUTPUT: Final = VerbOutput(
+    "score", 3,
+    ("metrics.json", "metrics.md", "errors/*.png", *below("truth/*", OBSERVATION_FILES), *below(f"{BASELINE}/*", OBSERVATION_FILES)),
+)  # fmt: skip
 _NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
+
+Result = TypeVar("Result")
+Baseline = Callable[[View], Observation]
+PairDistance = Callable[[metrics.Pair], float | None]
 
 
 @dataclass(frozen=True)
-class Course:
+class ScoredTrajectory:
     """One trajectory to score.
 
     Args:
@@ -72,22 +78,30 @@ class Course:
     sets: Mapping[str, ObservationSet]
     indices: Mapping[str, tuple[int, ...]]
 
-
-Baseline = Callable[[View], Observation]
+    def record(self) -> dict[str, Any]:
+        """The trajectory as JSON values."""
+        camera = self.views[0].camera
+        return {
+            "name": self.name, "camera": self.camera, "shift_m": self.shift_m, "views": len(self.views), "width": camera.width,
+            "height": camera.height, "methods": list(self.sets), "indices": {m: list(i) for m, i in self.indices.items()},
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Yardstick:
-    """What every method is held against."""
+class Reference:
+    """What every method is compared with, and how.
+
+    Args:
+        truth, baseline: of any view. held_out: ids of the recorded frames that count.
+        distances: what computes the rows of the table that need weights, at ``distance_views`` views of a trajectory (0 = all).
+    """
 
     truth: Truth
     baseline: Baseline | None
     held_out: frozenset[str]
     error_pictures: bool
-    distances: Mapping[str, Callable[[metrics.Pair], float | None]]
-    """What computes the rows of the table that need weights."""
+    distances: Mapping[str, PairDistance]
     distance_views: int
-    """At so many views of a trajectory, evenly spread."""
 
 
 def run(
@@ -110,45 +124,48 @@ def run(
     """
     if not methods:
         raise UsageError("nothing to score", expected="at least one method with its folder of rendered views")
-    inputs = {"scene": store.digest(scene)} | {name: store.digest(folder) for name, folder in methods.items()}
-    if fused is not None and config.baseline:
-        inputs["fused"] = store.digest(fused)
-    if config.lpips_weights:
-        inputs["lpips_weights"] = store.digest(Path(config.lpips_weights))
-    if truth is not None:
-        inputs["truth"] = store.digest(truth)
-    work = store.RunDir.open(out, "score", configuration.to_dict(config), inputs, version=_VERSION, overwrite=overwrite)
+    refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, "lpips-weights": config.lpips_weights})
+    others = {
+        "fused": fused if config.baseline else None,
+        "lpips_weights": Path(config.lpips_weights) if config.lpips_weights else None,
+        "truth": truth,
+    }
+    given = {"scene": scene, **methods, **{name: path for name, path in others.items() if path is not None}}
+    inputs = {name: store.digest(path) for name, path in given.items()}
+    work = RunDir.open(out, _OUTPUT, configuration.to_dict(config), inputs, overwrite)
     if work.complete:
         return work.reused()
     recorded = read_scene(scene)
-    true = truth_of(recorded) if truth is None else stored_truth(truth)
-    courses = _courses(config, recorded, methods)
-    baseline = baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None
-    held_out = frozenset(f.id for f in recorded.frames_in("test")) or frozenset(f.id for f in recorded.frames)
-    yardstick = Yardstick(true, baseline, held_out, config.error_pictures, _distances(config), config.perceptual_views)
+    trajectories = _trajectories(config, recorded, methods)
+    reference = Reference(
+        truth=truth_of(recorded) if truth is None else stored_truth(truth),
+        baseline=baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None,
+        held_out=frozenset(f.id for f in recorded.frames_in("test") or recorded.frames),
+        error_pictures=config.error_pictures, distances=_distances(config), distance_views=config.perceptual_views,
+    )  # fmt: skip
     results: list[dict[str, Any]] = []
-    with log.task("score", sum(len(course.views) for course in courses)) as bar:
-        for course in courses:
-            bar.update(course.name)
-            results += _score_course(course, yardstick, out, bar.advance)
-    names = [*([BASELINE] if baseline is not None else []), *methods]
+    with log.task("score", sum(len(trajectory.views) for trajectory in trajectories)) as bar:
+        for trajectory in trajectories:
+            bar.update(trajectory.name)
+            results += _score(trajectory, reference, work.path, bar.advance)
+    names = [*([BASELINE] if reference.baseline is not None else []), *methods]
     rows = {
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
         for name, row in metrics.METRICS.items()
     }
-    record = courses_record(courses)
-    document = score_tables.document(recorded, true.exact, record, names, results, rows, DEPTH_LIMIT_M)
-    store.write_json(out / "metrics.json", document)
-    store.write_text(out / "metrics.md", score_tables.markdown(document))
-    work.finish({"trajectories": len(courses), "methods": names})
-    return out
+    records = [trajectory.record() for trajectory in trajectories]
+    document = score_tables.document(recorded, reference.truth.exact, records, names, results, rows, DEPTH_LIMIT_M)
+    store.write_json(work.path / "metrics.json", document)
+    store.write_text(work.path / "metrics.md", score_tables.markdown(document))
+    work.finish({"trajectories": len(trajectories), "methods": names})
+    return work.path
 
 
-def _distances(config: ScoreConfig) -> dict[str, Callable[[metrics.Pair], float | None]]:
+def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     """The rows that need weights and have them."""
-    found: dict[str, Callable[[metrics.Pair], float | None]] = {}
+    found: dict[str, PairDistance] = {}
     if config.perceptual_views:
-        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm.load("embedded").codec))
+        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec))
     if config.lpips_weights:
         state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
         network = LpipsFeatures(state, config.lpips_weights)
@@ -164,18 +181,18 @@ def summary_table(out: Path) -> str:
 # ---- what is compared with what ----
 
 
-def _courses(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[Course]:
+def _trajectories(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[ScoredTrajectory]:
     sets = {
         method: {name: read_observations(path) for name, path in list_observation_sets(folder).items()}
         for method, folder in methods.items()
     }
-    names = sorted({name for of in sets.values() for name in of}, key=_order)
+    names = sorted({name for found in sets.values() for name in found}, key=_order)
     if not names:
         raise InputError(
             "none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
             expected="output of mudg render or mudg synthesize",
         )  # fmt: skip
-    return [_course(config, scene, name, {m: of[name] for m, of in sets.items() if name in of}) for name in names]
+    return [_matched(config, scene, name, {m: found[name] for m, found in sets.items() if name in found}) for name in names]
 
 
 def _order(name: str) -> tuple[str, float, str]:
@@ -183,9 +200,9 @@ def _order(name: str) -> tuple[str, float, str]:
     return (found["camera"], float(found["shift"] or 0), name) if found else (name, 1e9, name)
 
 
-def _course(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, ObservationSet]) -> Course:
+def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, ObservationSet]) -> ScoredTrajectory:
     """Match the methods' views by time; keep those that all have, so that all are scored on the same ones."""
-    times = {m: np.array([v.time_s for v in of.views]) for m, of in sets.items()}
+    times = {m: np.array([v.time_s for v in found.views]) for m, found in sets.items()}
     indices: dict[str, list[int]] = {m: [] for m in sets}
     views: list[View] = []
     for view in next(iter(sets.values())).views:
@@ -193,40 +210,24 @@ def _course(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Obs
         if len(nearest) < len(sets) or any(abs(times[m][i] - view.time_s) > SAME_TIME_S for m, i in nearest.items()):
             continue
         for method, index in nearest.items():
-            apart_m = float(np.linalg.norm(sets[method].views[index].center_world - view.center_world))
-            if apart_m > SAME_PLACE_M:
+            distance_m = apart_m(sets[method].views[index], view)
+            if distance_m > SAME_PLACE_M:
                 raise InputError("two methods rendered one trajectory from different places",
-                                 where=f"{name}: {method}, view {index}", got=f"{apart_m:.3f} m apart")  # fmt: skip
+                                 where=f"{name}: {method}, view {index}", got=f"{distance_m:.3f} m apart")  # fmt: skip
             indices[method].append(index)
-        views.append(_sized(config, scene, view))
+        camera = scene.cameras.get(view.camera.name, view.camera)
+        width = config.width_px or camera.width
+        views.append(view.resized(width, max(1, round(camera.height * width / camera.width))))
     if not views:
         raise InputError("the methods have no view in common", where=name, got=", ".join(sets))
     found = _NAME.fullmatch(name)
     shift_m = float(found["shift"] or 0.0) if found is not None and not found["more"] else None
-    camera = views[0].camera.name
-    frames = tuple(_frame_at(scene, camera, view) if shift_m == 0.0 else None for view in views)
-    return Course(name, camera, shift_m, tuple(views), frames, sets, {m: tuple(i) for m, i in indices.items()})
+    camera_name = views[0].camera.name
+    frames = tuple(_frame_of(scene, camera_name, view) if shift_m == 0.0 else None for view in views)
+    return ScoredTrajectory(name, camera_name, shift_m, tuple(views), frames, sets, {m: tuple(i) for m, i in indices.items()})
 
 
-def courses_record(courses: list[Course]) -> list[dict[str, Any]]:
-    """The trajectories as JSON values."""
-    return [
-        {
-            "name": course.name, "camera": course.camera, "shift_m": course.shift_m, "views": len(course.views),
-            "width": course.views[0].camera.width, "height": course.views[0].camera.height,
-            "methods": list(course.sets), "indices": {m: list(i) for m, i in course.indices.items()},
-        }
-        for course in courses
-    ]  # fmt: skip
-
-
-def _sized(config: ScoreConfig, scene: Scene, view: View) -> View:
-    camera = scene.cameras.get(view.camera.name, view.camera)
-    width = config.width_px or camera.width
-    return view.resized(width, max(1, round(camera.height * width / camera.width)))
-
-
-def _frame_at(scene: Scene, camera: str, view: View) -> Frame | None:
+def _frame_of(scene: Scene, camera: str, view: View) -> Frame | None:
     return next((f for f in scene.frames_of(camera) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None)
 
 
@@ -234,14 +235,13 @@ def _frame_at(scene: Scene, camera: str, view: View) -> Frame | None:
 
 
 def baseline_of(scene: Scene, cloud: FusedCloud) -> Baseline:
-    """The fused points drawn at a view, every hole taking the nearest point in the picture: no learning at all."""
+    """The fused points drawn at a view, every hole taking the nearest point in the image: no learning at all."""
 
-    def at(view: View) -> Observation:
+    def draw(view: View) -> Observation:
         placed = ((track.id, track.pose_at(view.time_s)) for track in scene.tracks)
-        poses = {name: pose for name, pose in placed if pose is not None}
-        return nearest_fill(cloud, poses, view)
+        return nearest_fill(cloud, {name: pose for name, pose in placed if pose is not None}, view)
 
-    return at
+    return draw
 
 
 def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.float64]], view: View) -> Observation:
@@ -274,69 +274,85 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
 # ---- one trajectory ----
 
 
-def _score_course(course: Course, by: Yardstick, out: Path, advance: Callable[[], None]) -> list[dict[str, Any]]:
-    """Score all methods on one trajectory; writes its truth, its baseline and its error pictures."""
-    names = [*([BASELINE] if by.baseline is not None else []), *course.sets]
+@dataclass(frozen=True)
+class MeasuredView:
+    """Truth and methods' views at one place, and by method what the wanted metrics measure there."""
+
+    truth: ViewTruth | None
+    seen: Mapping[str, Observation]
+    measured: Mapping[str, Mapping[str, Any]]
+
+
+def _score(
+    trajectory: ScoredTrajectory, reference: Reference, out: Path, advance: Callable[[], None]
+) -> list[dict[str, Any]]:
+    """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
+    names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
     motion = metrics.StaticMotion()
-    sums = {name: metrics.build_all(by.distances, motion) for name in names}
+    sums = {name: metrics.build_all(reference.distances, motion) for name in names}
     # Recorded training frames were seen by the fit and do not count; views off the path never were.
-    counted = [n for n, frame in enumerate(course.frames) if frame is None or frame.id in by.held_out]
-    wanted = _wanted(course, by, counted)
+    counted = [n for n, frame in enumerate(trajectory.frames) if frame is None or frame.id in reference.held_out]
+    wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
     scored = 0
-    middle = len(course.views) // 2
+
+    def measure(number: int) -> MeasuredView:
+        return _measured(trajectory, reference, number, {m: {k: sums[m][k] for k in wanted[number]} for m in names})
+
     with contextlib.ExitStack() as stack:
         truths = fills = None
-        if not by.truth.stored and (by.truth.exact or all(frame is not None for frame in course.frames)):
-            writer = ObservationWriter(out / "truth" / course.name, course.name, "truth", "recorded")
-            truths = stack.enter_context(writer)
-        if by.baseline is not None:
-            fills = stack.enter_context(ObservationWriter(out / BASELINE / course.name, course.name, BASELINE))
-        made = _ahead(lambda number: _measured(course, by, number, wanted[number], sums), len(course.views))
-        for number, (true, found, measured) in enumerate(made):
+        exact = reference.truth.exact
+        if not reference.truth.stored and (exact or all(frame is not None for frame in trajectory.frames)):
+            truths = stack.enter_context(
+                ObservationWriter(out / "truth" / trajectory.name, trajectory.name, "truth", "recorded")
+            )
+        if reference.baseline is not None:
+            fills = stack.enter_context(ObservationWriter(out / BASELINE / trajectory.name, trajectory.name, BASELINE))
+        for number, made in enumerate(_computed_ahead(measure, len(trajectory.views))):
             if fills is not None:
-                fills.add(found[BASELINE])
-            if true is not None:
+                fills.add(made.seen[BASELINE])
+            if made.truth is not None:
                 if truths is not None:
-                    truths.add(true.seen)
+                    truths.add(made.truth.seen)
                 if number in counted:
                     scored += 1
-                    truth_has |= _contents(true, by.truth.exact)
-                for name, of in measured.items():
-                    for metric, value in of.items():
+                    truth_has |= _contents(made.truth, exact)
+                for name, values in made.measured.items():
+                    for metric, value in values.items():
                         sums[name][metric].add(value)
-                if by.error_pictures and number == middle:
-                    _write_error_picture(out / "errors" / f"{course.name}.png", found, true.seen)
+                if reference.error_pictures and number == len(trajectory.views) // 2:
+                    _write_error_picture(out / "errors" / f"{trajectory.name}.png", made.seen, made.truth.seen)
             advance()
     return [
-        {"method": name, "trajectory": course.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
+        {"method": name, "trajectory": trajectory.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
         for name, of in sums.items()
     ]
 
 
-def _wanted(course: Course, by: Yardstick, counted: Sequence[int]) -> list[set[str]]:
+def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequence[int]) -> list[set[str]]:
     """The metrics that each view of a trajectory enters."""
-    looked_at = set(evenly(counted, by.distance_views or len(counted)))
-    every_frame = {"flicker"} if by.truth.exact else set()  # wants all frames, in order
-    usual = metrics.METRICS.keys() - by.distances.keys() - {"flicker"}
+    sampled = set(evenly(counted, reference.distance_views or len(counted)))
+    every_frame = {"flicker"} if reference.truth.exact else set()  # wants all frames, in order
+    needs_weights = reference.distances.keys()
+    usual = {name for name, row in metrics.METRICS.items() if row.build is not None} - needs_weights - {"flicker"}
     return [
-        every_frame | (usual if n in counted else set()) | (by.distances.keys() if n in looked_at else set())
-        for n in range(len(course.views))
+        every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
+        for n in range(len(trajectory.views))
     ]
 
 
 def _measured(
-    course: Course, by: Yardstick, number: int, wanted: set[str], sums: Mapping[str, Mapping[str, metrics.Metric]]
-) -> tuple[TrueView | None, dict[str, Observation], dict[str, dict[str, Any]]]:
-    """Truth and methods' views of one number, and by method what the wanted metrics measure there; adds nothing to the sums."""
-    true, found = _seen(course, by, number)
-    if true is None:
-        return true, found, {}
-    measured = {}
-    for name, seen in found.items():
-        pair = pair_of(seen, true.seen, true.moving)
-        measured[name] = metrics.measure(pair, {m: of for m, of in sums[name].items() if m in wanted})
-    return true, found, measured
+    trajectory: ScoredTrajectory, reference: Reference, number: int, wanted: Mapping[str, Mapping[str, metrics.Metric]]
+) -> MeasuredView:
+    """Measure one view; threads may call, for it adds nothing to the sums."""
+    view = trajectory.views[number]
+    truth = reference.truth.at_view(view, trajectory.frames[number], trajectory.name)
+    seen = {m: found[trajectory.indices[m][number]] for m, found in trajectory.sets.items()}
+    if reference.baseline is not None:
+        seen = {BASELINE: reference.baseline(view), **seen}
+    if truth is None:
+        return MeasuredView(None, seen, {})
+    return MeasuredView(truth, seen, {m: metrics.measure(pair_of(o, truth), wanted[m]) for m, o in seen.items()})
 
 
 def evenly(items: Sequence[int], count: int) -> list[int]:
@@ -345,30 +361,23 @@ def evenly(items: Sequence[int], count: int) -> list[int]:
     return [items[int((k + 0.5) * len(items) / kept)] for k in range(kept)]
 
 
-def _contents(true: TrueView, exact: bool) -> set[str]:
-    """What a true view can be asked for, in the words of ``MetricRow.needs``."""
-    has = {m for m in ("rgb", "depth", "semantics") if getattr(true.seen, m) is not None}
+def _contents(truth: ViewTruth, exact: bool) -> set[str]:
+    """What the truth of a view holds, as ``MetricRow.needs`` names it."""
+    has = {m for m in ("rgb", "depth", "semantics") if getattr(truth.seen, m) is not None}
     if exact:
         has.add("every frame")
-    if true.moving is not None and float(true.moving.float().mean()) >= metrics.SMALLEST_SHARE:
-        has.add("movers")
+    if truth.moving is not None and float(truth.moving.float().mean()) >= metrics.SMALLEST_SHARE:
+        has.add("dynamic objects")
     return has
 
 
-def _seen(course: Course, by: Yardstick, number: int) -> tuple[TrueView | None, dict[str, Observation]]:
-    """Truth and what each method has for one view."""
-    true = by.truth.at(course.views[number], course.frames[number], course.name)
-    found = {m: of[course.indices[m][number]] for m, of in course.sets.items()}
-    return true, found if by.baseline is None else {BASELINE: by.baseline(course.views[number]), **found}
-
-
-def _ahead(make: Callable[[int], Made], count: int) -> Iterator[Made]:
-    """``make(0)``, ``make(1)``, ... in order, a few of them made beforehand by other threads."""
+def _computed_ahead(compute: Callable[[int], Result], count: int) -> Iterator[Result]:
+    """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads."""
     threads = native.threads()
     with _one_thread_each(), ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[Made]] = deque()
+        waiting: deque[Future[Result]] = deque()
         for number in range(count):
-            waiting.append(pool.submit(make, number))
+            waiting.append(pool.submit(compute, number))
             if len(waiting) > 2 * threads:
                 yield waiting.popleft().result()
         while waiting:
@@ -390,55 +399,49 @@ def _one_thread_each() -> Iterator[None]:
             native.set_threads(before[1])
 
 
-def _values(of: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str, float | str]:
+def _values(sums: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str, float | str]:
     """A number per metric, or why there is none: no truth, not produced by the method, not computed by this build."""
-    values = metrics.results(dict(of))
-    if "perceptual" not in of:
-        values["perceptual"] = score_tables.NOT_ASKED  # its weights are part of every build
+    values = metrics.results(sums)
+    if "perceptual" not in sums:
+        values["perceptual"] = score_tables.NOT_REQUESTED  # its weights are part of every build
     for name, row in metrics.METRICS.items():
-        if name in of and row.needs[0] not in truth_has:
+        if name in sums and row.needs[0] not in truth_has:
             values[name] = score_tables.NO_TRUTH
     return {n: round(v, 6) if isinstance(v, float) else v for n, v in values.items()}
 
 
-def _iou(of: Mapping[str, metrics.Metric]) -> dict[str, float]:
-    segmentation = of["miou"]
+def _iou(sums: Mapping[str, metrics.Metric]) -> dict[str, float]:
+    segmentation = sums["miou"]
     if not isinstance(segmentation, metrics.Segmentation) or not int(segmentation.counts.sum()):
         return {}
     return {name: round(value, 4) for name, value in metrics.iou_of(segmentation.counts).items()}
 
 
-def pair_of(seen: Observation, true: Observation, moving: Tensor | None = None) -> metrics.Pair:
-    """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
-
-    ``moving`` bool[1, H, W]: where moving objects are in truth, if that is known.
-    """
+def pair_of(seen: Observation, truth: ViewTruth) -> metrics.Pair:
+    """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m)."""
+    true = truth.seen
     height, width = true.view.camera.height, true.view.camera.width
-    depth = None
+    depth: Tensor | None = None
     if seen.depth is not None:
         depth = resize_nearest(seen.depth, height, width)
         given = torch.isfinite(depth) & (depth > 0)
-        depth = torch.where(given, depth, torch.full_like(depth, DEPTH_LIMIT_M)).clamp(max=DEPTH_LIMIT_M)
+        depth = torch.where(given, depth, DEPTH_LIMIT_M).clamp(max=DEPTH_LIMIT_M)
     valid = None
     if true.depth is not None:
         valid = torch.isfinite(true.depth) & (true.depth > 0) & (true.depth <= DEPTH_LIMIT_M)
     return metrics.Pair(
         rgb=resize_rgb(seen.rgb, height, width), depth=depth,
-        semantics=None if seen.semantics is None else resize_nearest(seen.semantics[None], height, width)[0],
+        semantics=None if seen.semantics is None else resize_nearest(seen.semantics, height, width),
         truth_rgb=true.rgb, truth_depth=true.depth, truth_depth_valid=valid, truth_semantics=true.semantics,
-        mask=true.mask, moving=moving, view=true.view,
+        mask=true.mask, moving=truth.moving, view=true.view,
     )  # fmt: skip
 
 
-
-def _write_error_picture(path: Path, found: Mapping[str, Observation], true: Observation) -> None:
+def _write_error_picture(path: Path, seen: Mapping[str, Observation], true: Observation) -> None:
     """Truth and the methods beside each other, their colour errors below."""
     height, width = true.view.camera.height, true.view.camera.width
-    picture = np.zeros((2 * height, (len(found) + 1) * width, 3), np.uint8)
-    picture[:height, :width] = to_bytes(true.rgb)
-    for column, seen in enumerate(found.values(), start=1):
-        rgb = resize_rgb(seen.rgb, height, width)
-        picture[:height, column * width : (column + 1) * width] = to_bytes(rgb)
-        picture[height:, column * width : (column + 1) * width] = error_image(rgb, true.rgb)
+    images = [true.rgb, *(resize_rgb(observation.rgb, height, width) for observation in seen.values())]
+    errors = [np.zeros((height, width, 3), np.uint8), *(error_image(rgb, true.rgb) for rgb in images[1:])]
+    picture = np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])
     with store.atomic_path(path) as temporary:
         Image.fromarray(picture).save(temporary, optimize=False, compress_level=1)

@@ -1,7 +1,7 @@
 """What views are held against: the generated city drawn again, held-out recorded frames, or truth drawn by an earlier run.
 
 A folder of truth (``write_truth``) holds one observation folder per trajectory and, beside the observations,
-``moving.safetensors``: u8[T, H, W], 1 where a moving object is seen.
+``moving.safetensors``: u8[T, H, W], 1 where a dynamic object is seen.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -18,23 +18,24 @@ from torch import Tensor
 
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Frame, Observation, Scene, Trajectory, View
 from mudg.core.pictures import resize_nearest, resize_rgb
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
-from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 
 MOVING_FILE: Final = "moving.safetensors"
 SAME_SWEEP_S: Final = 0.05
 SAME_TIME_S: Final = 1e-4
 SAME_PLACE_M: Final = 1e-3
-_VERSION = 1
+_OUTPUT: Final = VerbOutput("truth", 1, below("*", (*OBSERVATION_FILES, MOVING_FILE)))
 
 
 @dataclass(frozen=True)
-class TrueView:
-    """The truth at a view; ``moving`` bool[1, H, W], true pixels of moving objects, or None where they are not known."""
+class ViewTruth:
+    """The truth at a view; ``moving`` bool[1, H, W], true pixels of dynamic objects, or None where they are not known."""
 
     seen: Observation
     moving: Tensor | None = None
@@ -42,15 +43,20 @@ class TrueView:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where truth comes from: ``at(view, frame, trajectory)`` is None where there is none.
+    """Where truth comes from: ``at_view(view, frame, trajectory)`` is None where there is none.
 
     Args:
         exact: truth exists at every pixel of every view. stored: it lies on disk already and need not be written again.
     """
 
     exact: bool
-    at: Callable[[View, Frame | None, str], TrueView | None]
+    at_view: Callable[[View, Frame | None, str], ViewTruth | None]
     stored: bool = False
+
+
+def apart_m(a: View, b: View) -> float:
+    """Distance of two cameras, metres."""
+    return float(np.linalg.norm(a.center_world - b.center_world))
 
 
 def truth_of(scene: Scene) -> Truth:
@@ -59,12 +65,12 @@ def truth_of(scene: Scene) -> Truth:
         world = CityWorld.from_source(scene.source)
         moving = np.array(city_logs.moving_instances(world), np.int32)
         return Truth(True, lambda view, _frame, _name: _city_view(world, moving, view))
-    return Truth(False, lambda view, frame, _name: None if frame is None else TrueView(_recorded(scene, frame, view)))
+    return Truth(False, lambda view, frame, _name: None if frame is None else ViewTruth(_recorded(scene, frame, view)))
 
 
-def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> TrueView:
+def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> ViewTruth:
     truth = world.render(view)
-    return TrueView(world.observation(view, truth), torch.from_numpy(np.isin(truth.instance, moving))[None])
+    return ViewTruth(world.observation(view, truth), torch.from_numpy(np.isin(truth.instance, moving))[None])
 
 
 def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
@@ -73,11 +79,12 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
     Raises:
         InputError: the scene was not generated.
     """
+    refuse_overlap(out, {"scene": scene})
     views = [
         [v.time_s, *v.world_from_cam.ravel().tolist(), v.camera.width] for path in trajectories for v in path.views
     ]
     asked = {"trajectories": [path.name for path in trajectories], "views": views}
-    folder = store.RunDir.open(out, "truth", asked, {"scene": store.digest(scene)}, _VERSION, overwrite)
+    folder = RunDir.open(out, _OUTPUT, asked, {"scene": store.digest(scene)}, overwrite)
     if folder.complete:
         return folder.reused()
     truth = truth_of(read_scene(scene))
@@ -86,9 +93,9 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
     with log.task("truth", sum(map(len, trajectories))) as bar:
         for path in trajectories:
             masks = []
-            with ObservationWriter(out / path.name, path.name, "truth", "recorded") as writer:
+            with ObservationWriter(folder.path / path.name, path.name, "truth", "recorded") as writer:
                 for view in path.views:
-                    true = truth.at(view, None, path.name)
+                    true = truth.at_view(view, None, path.name)
                     if true is None or true.moving is None:
                         raise InputError("the city has no truth here", where=f"{path.name}, {view.time_s:g} s")
                     masks.append(true.moving[0].numpy().astype(np.uint8))
@@ -97,9 +104,9 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
                     else:
                         writer.add(true.seen)
                     bar.advance()
-            store.write_safetensors(out / path.name / MOVING_FILE, {"moving": np.stack(masks)})
+            store.write_safetensors(folder.path / path.name / MOVING_FILE, {"moving": np.stack(masks)})
     folder.finish({"trajectories": [path.name for path in trajectories]})
-    return out
+    return folder.path
 
 
 def stored_truth(folder: Path) -> Truth:
@@ -107,47 +114,47 @@ def stored_truth(folder: Path) -> Truth:
     sets = {name: read_observations(path) for name, path in list_observation_sets(folder).items()}
     masks = {name: store.read_safetensors(folder / name / MOVING_FILE)["moving"] for name in sets}
 
-    def at(view: View, _frame: Frame | None, name: str) -> TrueView:
-        of = sets.get(name)
-        if of is None:
+    def find(view: View, _frame: Frame | None, name: str) -> ViewTruth:
+        stored = sets.get(name)
+        if stored is None:
             raise InputError(
                 "the folder of truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
             )
-        index = min(range(len(of)), key=lambda i: abs(of.views[i].time_s - view.time_s))
-        there = of.views[index]
-        apart_m = float(np.linalg.norm(there.center_world - view.center_world))
+        index = min(range(len(stored)), key=lambda i: abs(stored.views[i].time_s - view.time_s))
+        there = stored.views[index]
+        distance_m = apart_m(there, view)
         same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
-        if abs(there.time_s - view.time_s) > SAME_TIME_S or apart_m > SAME_PLACE_M or not same_size:
+        if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
             raise InputError(
                 "the stored truth shows another view", where=f"{folder / name}, view {index}",
                 expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
-                got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {apart_m:.3f} m apart",
+                got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
             )  # fmt: skip
-        return TrueView(of[index], torch.from_numpy(masks[name][index].astype(bool))[None])
+        return ViewTruth(stored[index], torch.from_numpy(masks[name][index].astype(bool))[None])
 
-    return Truth(True, at, stored=True)
+    return Truth(True, find, stored=True)
 
 
 def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
     """A recorded frame at the common size, with measured depth and the labels the log came with, never guessed ones."""
     height, width = view.camera.height, view.camera.width
-    rgb = torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255
-    semantics = None
-    if "semantics" in frame.labels and "semantics_confidence" not in frame.labels:  # else a labeller made them
-        labels = torch.from_numpy(read_label(scene, frame, "semantics").astype(np.int64))[None]
-        semantics = resize_nearest(labels, height, width)[0]
-    if "depth" in frame.labels and "depth_confidence" not in frame.labels:
-        measured = torch.from_numpy(read_label(scene, frame, "depth").copy())[None]
-        depth: Tensor | None = resize_nearest(measured, height, width)
-    else:
-        depth = _lidar_depth(scene, view)
-    keep = torch.ones(1, height, width, dtype=torch.bool)
-    if "ego" in frame.labels:
-        ego = torch.from_numpy(read_label(scene, frame, "ego").astype(bool))[None]
-        keep = ~resize_nearest(ego, height, width)
+
+    def label(name: str) -> NDArray[Any] | None:
+        if (
+            name not in frame.labels or f"{name}_confidence" in frame.labels
+        ):  # a label with a confidence is a labeller's
+            return None
+        return resize_nearest(read_label(scene, frame, name), height, width)
+
+    semantics, depth, ego = label("semantics"), label("depth"), label("ego")
     return Observation(
-        view=view, rgb=resize_rgb(rgb, height, width), depth=depth, semantics=semantics,
-        confidence=torch.ones(1, height, width), mask=keep, kind="recorded", source="camera",
+        view=view,
+        rgb=resize_rgb(torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255, height, width),
+        depth=_lidar_depth(scene, view) if depth is None else torch.from_numpy(depth.copy())[None],
+        semantics=None if semantics is None else torch.from_numpy(semantics.astype(np.int64)),
+        confidence=torch.ones(1, height, width),
+        mask=torch.ones(1, height, width, dtype=torch.bool) if ego is None else torch.from_numpy(ego == 0)[None],
+        kind="recorded", source="camera",
     )  # fmt: skip
 
 

@@ -28,26 +28,29 @@ from torch.nn import functional
 
 from mudg.base import log, palette, store
 from mudg.base.config import to_dict
-from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Condition, FusedCloud, Observation, Scene, Trajectory, View
+from mudg.base.errors import UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
+from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.clips.condition import ConditionRules, Recorded, Source, Sparse, build_conditions
+from mudg.data.clips.condition import ConditionRules, ProjectedPoints, WarpSource, build_conditions
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationWriter
+from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import GeneratedClip
 from mudg.models.mdm.codec import Modality
-from mudg.models.mdm.model import MDM, Sample
-from mudg.models.published.model import PublishedMDM
+from mudg.models.mdm.files import digest, folder_of
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.fit import NEAR_M, load_model, render_view
-from mudg.stages.learning import published_model
+from mudg.stages.learning import loading
 from mudg.stages.learning.precision import choose_bf16
-from mudg.stages.learning.score import class_image, depth_image, rgb_image
 
 SOURCE = "mudg_r"
-_VERSION = 1
+SKY = palette.ID["sky"]
+FITS = "depth_fits.json"
+"""Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
+_OUTPUT = VerbOutput("synthesize", 1, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
 
 
 @dataclass(frozen=True)
@@ -73,30 +76,24 @@ def run(
         scene: scene directory or stored zip. fused: output of fuse for this scene.
         out: a finished result of the same configuration and inputs is verified and reused.
         fitted: output of fit for this scene, whose renders tell what stands where no point was measured (above the LiDAR's
-            beams, beyond its range), and may be started from (`config.start`). Not used by published-type models.
+            beams, beyond its range). Not used by published-type models.
 
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
-    if published_model.is_published(config.model):
-        if fitted is not None:
-            raise UsageError("a published-type model takes points only", where="--fitted", remedy="leave it out")
-        config = replace(config, processes=config.processes or 1)  # one copy of a large model in memory
-    else:
-        mdm.load(config.model)  # fails now rather than in every process
-    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": mdm.digest(config.model)}
+    refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "model": folder_of(config.model)})
+    config = loading.check_config(config, fitted is not None)
+    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": digest(config.model)}
     if fitted is not None:
         inputs["fitted"] = store.digest(fitted)
-    elif config.start == "render":
-        raise UsageError("nothing to start from", where="--start render", remedy="give the fitted scene with --fitted")
-    directory = store.RunDir.open(out, "synthesize", to_dict(config), inputs, _VERSION, overwrite)
+    directory = RunDir.open(out, _OUTPUT, to_dict(config), inputs, overwrite)
     if directory.complete:
         return directory.reused()
     loaded = read_scene(scene)
     cameras = config.cameras or tuple(loaded.cameras)[:1]
     if not cameras or not config.shifts_m:
         raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
-    jobs = [Job(config, Path(scene), Path(fused), Path(out), c, s, fitted) for c in cameras for s in config.shifts_m]
+    jobs = [Job(config, Path(scene), Path(fused), directory.path, c, s, fitted) for c in cameras for s in config.shifts_m]
     names = [trajectory_of(loaded, job).name for job in jobs]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
@@ -106,7 +103,7 @@ def run(
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
-    return out
+    return directory.path
 
 
 def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
@@ -191,31 +188,11 @@ def windows(frames: int, window: int, overlap: int) -> list[range]:
     return [range(start, start + window) for start in starts]
 
 
-def model_size(width: int, height: int, multiple: int, area: int, width_px: int = 0) -> tuple[int, int]:
-    """Width and height for the model: multiples of `multiple` near `area` pixels in the aspect of width x height.
-
-    With `width_px` that width (rounded to the multiple) is used. Of the candidates the one with the least distortion
-    of aspect plus half the deviation of area, both as logarithms, wins.
-    """
-    aspect = width / height
-    if width_px:
-        w = max(multiple, round(width_px / multiple) * multiple)
-        return w, max(multiple, round(w / aspect / multiple) * multiple)
-    best, chosen = math.inf, (multiple, multiple)
-    for rows in range(1, 64):
-        for columns in range(1, 128):
-            w, h = columns * multiple, rows * multiple
-            cost = abs(math.log(w / h / aspect)) + 0.5 * abs(math.log(w * h / area))
-            if cost < best:
-                best, chosen = cost, (w, h)
-    return chosen
-
-
-def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Recorded]:
+def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
     frames = scene.frames if config.held_out_images else scene.frames_in("train")
     classes = lambda frame: read_trusted_classes(scene, frame, config.label_confidence) if config.given_classes else None  # noqa: E731
-    return [Recorded(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
+    return [Photo(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
 
 
 def without_classes(cloud: FusedCloud) -> FusedCloud:
@@ -233,20 +210,15 @@ def make_trajectory(job: Job) -> int:
     folder = job.out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
-    model = published_model.load_any(config)
+    model = loading.load_any(config)
     camera = path.views[0].camera
-    if isinstance(model, PublishedMDM):
-        model.check_frames(min(len(path), model.config.window))
-        width, height = published_model.model_size(model.config, config.width_px)
-        rules = ConditionRules(width, height, camera.width, camera.height, published=True)
-    else:
-        area = model.config.area_px
-        width, height = model_size(camera.width, camera.height, model.config.pixel_multiple, area, config.width_px)
-        fine = (camera.width, camera.height) if config.full_size else (2 * width, 2 * height)
-        rules = ConditionRules(width, height, *fine)
+    width, height = model.image_size(camera.width, camera.height, config.width_px)
+    model.check_clip(min(len(path), model.config.window), height, width)
+    fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
+    rules = ConditionRules(width, height, *fine, published=model.points_alone)
     recorded = recorded_images(scene, config)
-    look = None if job.fitted is None else Renders(job.fitted)
-    maker = ViewMaker(model, scene, cloud, recorded, rules, config, look)
+    renders = None if job.fitted is None else Renders(job.fitted)
+    maker = ViewMaker(model, scene, cloud, recorded, rules, config, renders)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -285,10 +257,6 @@ def make_trajectory(job: Job) -> int:
     return len(path)
 
 
-FITS = "depth_fits.json"
-"""Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
-
-
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     """Number of finished windows and the latents of the last one."""
     files = sorted(state.glob("[0-9]*.safetensors"))
@@ -299,7 +267,7 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
 
 
 class Renders:
-    """What a fitted scene shows at a view, in the words of a condition; the last views are kept."""
+    """What a fitted scene shows at a view, in the form that conditions are made of."""
 
     def __init__(self, folder: Path) -> None:
         self._model = load_model(folder)
@@ -309,118 +277,94 @@ class Renders:
         """Colour, depth (NaN in the sky and where nothing is) and classes."""
         return render_view(self._model, view, self._raster)
 
-    def at(self, view: View) -> Sparse:
+    def sparse(self, view: View) -> ProjectedPoints:
         """Everything that is covered and not sky."""
         seen = self.observation(view)
         depth = torch.full(seen.rgb.shape[-2:], torch.nan) if seen.depth is None else seen.depth[0]
         ids = torch.full(depth.shape, palette.UNLABELLED) if seen.semantics is None else seen.semantics
         valid = torch.isfinite(depth)
-        return Sparse(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
-
-    def latents(self, model: MDM, views: Sequence[View]) -> dict[Modality, Tensor]:
-        """Renders of the views as latents to start from; what has no depth is as far as the model can say."""
-        seen = [self.observation(view) for view in views]
-        far = torch.tensor(model.config.codec.far_m)
-        depth = torch.stack([torch.where(torch.isfinite(o.depth), o.depth, far).clamp(max=far) for o in seen])  # type: ignore[arg-type, type-var]
-        unknown = torch.full(depth.shape[-2:], palette.UNLABELLED)
-        ids = torch.stack([unknown if o.semantics is None else o.semantics.long() for o in seen])
-        latents = model.encode_truth(torch.stack([o.rgb for o in seen])[None], depth[None], ids[None])
-        return {name: value[0] for name, value in latents.items()}
+        return ProjectedPoints(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
 
 
 class ViewMaker:
     """Conditions, samples and observations of one scene at one size."""
 
     def __init__(
-        self,
-        model: MDM | PublishedMDM,
-        scene: Scene,
-        cloud: FusedCloud,
-        recorded: Sequence[Recorded],
-        rules: ConditionRules,
-        config: SynthesizeConfig,
-        renders: Renders | None = None,
-    ) -> None:
-        model.check_size(rules.height, rules.width)
+        self, model: loading.DiffusionModel, scene: Scene, cloud: FusedCloud, recorded: Sequence[Photo], rules: ConditionRules,
+        config: SynthesizeConfig, renders: Renders | None = None,
+    ) -> None:  # fmt: skip
         if not recorded:
             log.warn("synthesize: no recorded image may be used; holes take the nearest point's colour")
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
-        self._rules, self._config = rules, config
+        self._rules, self._full_size = rules, config.full_size
         self._renders = renders
-        self._sources: dict[int, Source] = {}
-        self._bf16 = choose_bf16(config.precision)
+        self._sources: dict[int, WarpSource] = {}
+        self._request = loading.request_of(config, choose_bf16(config.precision))
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
-        return view if self._config.full_size else view.resized(self._rules.width, self._rules.height)
+        return view if self._full_size else view.resized(self._rules.width, self._rules.height)
 
     def make(
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
-    ) -> tuple[Sample, Condition, list[Observation]]:
+    ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
         condition, fine = build_conditions(
             self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources,
-            None if self._renders is None else self._renders.at,
+            None if self._renders is None else self._renders.sparse,
         )  # fmt: skip
-        config = self._config
-        start = self._start(condition)
-        sample = self._model.sample(
-            condition, steps=config.steps, seed=config.seed, index=number, sampler=config.sampler, eta=config.eta,
-            n_samples=config.samples, known=known, start=start, strength=config.strength, align=config.align_depth,
-            bf16=self._bf16,
-        )  # fmt: skip
-        if sample.rgb is None or sample.depth is None or sample.semantics is None:
-            raise InputError("the model does not produce all modalities", where=config.model)
-        sky = (sample.semantics == mdm.SKY).unsqueeze(1) & ~condition.valid
-        depth = torch.where(sky, torch.nan, sample.depth)
-        rgb, ids, trust = sample.rgb, sample.semantics, sample.confidence
-        shown_views = condition.views
-        if config.full_size and isinstance(self._model, PublishedMDM):
-            rgb, depth, ids, trust = published_model.at_camera_size(sample, depth, views[0])
-            shown_views = tuple(views)
-        elif config.full_size:
-            rgb, depth, ids, trust = enlarge(sample, depth, condition, fine)
-            shown_views = fine.views
-        usable = torch.ones_like(trust, dtype=torch.bool)
-        if isinstance(self._model, PublishedMDM) and not published_model.reference_fits(views[0], self._recorded):
+        sample = self._model.sample(condition, replace(self._request, index=number, known=known))
+        sky = (sample.semantics == SKY).unsqueeze(1) & ~condition.valid
+        made, made_views = replace(sample, depth=torch.where(sky, torch.nan, sample.depth)), condition.views
+        if self._full_size:
+            size = views[0].camera.height, views[0].camera.width
+            made = enlarge(made, size, None if self._model.points_alone else (condition, fine))
+            made_views = tuple(views)
+        usable = torch.ones_like(made.confidence, dtype=torch.bool)
+        if self._model.points_alone and not taken_there(views[0], self._recorded):
             usable[0] = False
-        made = [
-            Observation(view, rgb[i], depth[i], ids[i], trust[i] * usable[i], usable[i], "virtual", SOURCE)
-            for i, view in enumerate(shown_views)
+        trust = made.confidence * usable
+        observations = [
+            Observation(view, made.rgb[i], made.depth[i], made.semantics[i], trust[i], usable[i], "virtual", SOURCE)
+            for i, view in enumerate(made_views)
         ]
-        return sample, condition, made
+        return sample, condition, observations
 
 
-    def _start(self, condition: Condition) -> dict[Modality, Tensor] | None:
-        """Latents that sampling starts from, None for noise."""
-        if self._config.start == "condition":
-            return self._model.condition_latents(condition)
-        if self._config.start == "render" and self._renders is not None and isinstance(self._model, MDM):
-            return self._renders.latents(self._model, condition.views)
-        return None
+def taken_there(view: View, recorded: Sequence[Photo]) -> bool:
+    """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
+
+    The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a
+    picture from another place, and must not be used as if it were one from there.
+    """
+    for image in recorded:
+        moved = image.view.cam_from_world @ view.world_from_cam
+        if np.linalg.norm(moved[:3, 3]) < 0.05 and np.abs(moved[:3, :3] - np.eye(3)).max() < 0.01:
+            return True
+    return False
 
 
 def enlarge(
-    sample: Sample, depth: Tensor, condition: Condition, fine: Condition
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colour, depth, classes and confidence of a sample at the size of the fine condition.
+    clip: GeneratedClip, size: tuple[int, int], conditions: tuple[Condition, Condition] | None
+) -> GeneratedClip:
+    """A clip at the size (height, width): colour bicubic, depth f32[T,1,h,w] (NaN = none) and classes nearest, confidence bilinear.
 
-    Colour: see `add_detail`. Depth f32[T,1,h,w] (NaN = none): nearest pixel, then the fine measured depth where it is
-    within a tenth of that. Classes: nearest pixel, then the class that the fine condition has there if the sample has it in
-    that pixel or beside it. Confidence: bilinear.
+    With the clip's condition and the same at the new size, detail is put back: in colour by `add_detail`; the fine measured depth
+    where it is within a tenth of the generated one; and the fine class where the clip has it in that pixel or beside it.
     """
-    if sample.rgb is None or sample.semantics is None:
-        raise InputError("a sample without colour or classes cannot be enlarged", where="synthesize.enlarge")
-    size = fine.color.shape[-2:]
-    rgb = add_detail(sample.rgb, condition, fine)
-    big_depth = functional.interpolate(depth, size=size, mode="nearest-exact")
-    close = fine.valid & ((fine.depth - big_depth).abs() < 0.1 * big_depth)
-    big_depth = torch.where(close, fine.depth, big_depth)
-    ids = functional.interpolate(sample.semantics.unsqueeze(1).float(), size=size, mode="nearest-exact")[:, 0].long()
-    if fine.semantics is not None:
-        ids = finer_classes(ids, sample.semantics, fine.semantics)
-    trust = functional.interpolate(sample.confidence, size=size, mode="bilinear", align_corners=False)
-    return rgb, big_depth, ids, trust
+    nearest = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
+    depth, ids = nearest(clip.depth), nearest(clip.semantics.unsqueeze(1).float())[:, 0].long()
+    if conditions is None:
+        rgb = functional.interpolate(clip.rgb, size=size, mode="bicubic", align_corners=False).clamp(0, 1)
+    else:
+        small, fine = conditions
+        rgb = add_detail(clip.rgb, small, fine)
+        close = fine.valid & ((fine.depth - depth).abs() < 0.1 * depth)
+        depth = torch.where(close, fine.depth, depth)
+        if fine.semantics is not None:
+            ids = finer_classes(ids, clip.semantics, fine.semantics)
+    trust = functional.interpolate(clip.confidence, size=size, mode="bilinear", align_corners=False)
+    return replace(clip, rgb=rgb, depth=depth, semantics=ids, confidence=trust)
 
 
 def finer_classes(enlarged: Tensor, made: Tensor, given: Tensor) -> Tensor:
@@ -454,11 +398,10 @@ def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
     return (larger(rgb) + weight * detail).clamp(0, 1)
 
 
-def _sheet_row(condition: Condition, sample: Sample, i: int) -> np.ndarray:
+def _sheet_row(condition: Condition, sample: GeneratedClip, i: int) -> np.ndarray:
     """Condition, colour, depth, classes and confidence of one frame side by side, u8[H,5W,3]."""
-    trust = (sample.confidence[i, 0].clamp(0, 1) * 255).byte().numpy()
     cells = [
-        rgb_image(condition.color[i]), rgb_image(sample.rgb[i]), depth_image(sample.depth[i]), class_image(sample.semantics[i]),  # type: ignore[index]
-        np.repeat(trust[..., None], 3, 2),
+        to_bytes(condition.color[i]), to_bytes(sample.rgb[i]), depth_colors(sample.depth[i, 0].numpy()),
+        class_colors(sample.semantics[i].numpy()), gray(sample.confidence[i, 0].numpy()),
     ]  # fmt: skip
     return np.concatenate(cells, 1)

@@ -27,7 +27,7 @@ def furnish(config: CityConfig, plan: StreetPlan) -> list[list[float]]:
     return f.rows
 
 
-def _facade(f: Furnisher, tall: bool, shop: bool) -> tuple[float, ...]:
+def _facade(f: Furnisher, shop: bool) -> tuple[float, ...]:
     bay = f.uniform(2.2, 4.0)
     modern = f.chance(0.3)
     width = f.uniform(0.6, 0.85) if modern else f.uniform(0.32, 0.55)
@@ -53,7 +53,7 @@ def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: in
     else:
         height = f.uniform(3.3, 6.8)
         gable = f.chance(0.85)
-    facade = _facade(f, urban, shop)
+    facade = _facade(f, shop)
     floors = max(1, round((height - facade[2]) / facade[1]))
     height = facade[2] + floors * facade[1] + (0.2 if gable else 0.7)
     if not urban and f.chance(0.4):
@@ -104,20 +104,23 @@ def _front_garden(f: Furnisher, side: int, front: float, s: float, length: float
     extent = length + (0 if plan.urban else 2.0)
     if draw < 0.3:
         height = f.uniform(0.8, 1.6)
-        f.place(rec.HEDGE, middle, u + side * 0.2, 0, (extent, f.uniform(0.6, 0.9), height), f.pick(LEAF_COLORS[:3]),
+        f.place(rec.HEDGE, (middle, u + side * 0.2), 0, (extent, f.uniform(0.6, 0.9), height), f.pick(LEAF_COLORS[:3]),
                 parameters=(0, 0, 0, 0.17))  # fmt: skip
     elif draw < 0.55:
         brick = f.chance(0.5)
         color = f.pick(BRICK_COLORS if brick else RENDER_COLORS)
-        f.place(rec.WALL, middle, u, 0, (extent, 0.24, f.uniform(0.6, 1.5)), color, (0.5, 0.49, 0.46), (float(brick),))
+        f.place(
+            rec.WALL, (middle, u), 0, (extent, 0.24, f.uniform(0.6, 1.5)), color, (0.5, 0.49, 0.46), (float(brick),)
+        )
     elif draw < 0.9:
         _fence(f, middle, u, 0, extent)
     if setback > 3.0:
         for _ in range(int(f.rng.integers(0, 3))):
             bush = side * (front + f.uniform(1.2, setback - 0.8))
             size = f.uniform(0.9, 1.7)
-            f.place(rec.BUSH, s + f.uniform(0.5, length - 0.5), bush, f.uniform(0, 3), (size, size, size * f.uniform(0.7, 1.1)),
-                    f.pick(LEAF_COLORS), parameters=(0, 0, 0, 0.15), z=0.08)  # fmt: skip
+            f.place(rec.BUSH, (s + f.uniform(0.5, length - 0.5), bush), f.uniform(0, 3),
+                    (size, size, size * f.uniform(0.7, 1.1)), f.pick(LEAF_COLORS), parameters=(0, 0, 0, 0.15),
+                    z=0.08)  # fmt: skip
         if f.chance(0.5) and setback > 4:
             plant_tree(f, s + f.uniform(1, length - 1), side * (front + setback * 0.5), garden=True)
 
@@ -128,7 +131,7 @@ def _fence(f: Furnisher, s: float, u: float, turn: float, length: float) -> None
     if style == 0 and f.chance(0.4):
         color = (0.6, 0.6, 0.58)
     wide = f.chance(0.35)
-    f.place(rec.FENCE, s, u, turn, (length, 0.05, f.uniform(0.9, 1.8)), color,
+    f.place(rec.FENCE, (s, u), turn, (length, 0.05, f.uniform(0.9, 1.8)), color,
             parameters=(float(style), 0.16 if wide else 0.13, 0.09 if wide else 0.025))  # fmt: skip
 
 
@@ -140,7 +143,7 @@ def _green_lot(f: Furnisher, side: int, front: float, s: float, length: float) -
             _fence(f, middle, u, 0, length)
         else:
             brick = f.chance(0.5)
-            f.place(rec.WALL, middle, u, 0, (length, 0.26, f.uniform(1.0, 2.3)), f.pick(BRICK_COLORS if brick else RENDER_COLORS),
+            f.place(rec.WALL, (middle, u), 0, (length, 0.26, f.uniform(1.0, 2.3)), f.pick(BRICK_COLORS if brick else RENDER_COLORS),
                     (0.5, 0.49, 0.46), (float(brick),))  # fmt: skip
     for _ in range(int(length / 5)):
         plant_tree(f, s + f.uniform(0, length), side * (front + f.uniform(2.5, 12)), garden=True)
@@ -152,7 +155,7 @@ def _crossing_surroundings(f: Furnisher) -> None:
         return
     edge = crossing.half_width + crossing.sidewalk
     for arm in (-1, 1):
-        if (arm > 0 and crossing.end <= 0) or (arm < 0 and crossing.start >= 0):
+        if not crossing.has_arm(arm):
             _close_arm(f, arm)
             continue
         inner = abs(plan.kerb(arm)) + plan.sidewalk(arm) + (14 if plan.urban else 19)
@@ -170,20 +173,17 @@ def _crossing_surroundings(f: Furnisher) -> None:
                                          (0.13, 0.10, 0.075), (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15)))  # fmt: skip
                 a += length + (0.05 if plan.urban else f.uniform(3, 8))
         x, y = crossing.at(arm * 125.0, 0.0)  # something closes the view
-        f.rows.append(
-            record(
-                rec.BUILDING,
-                (x, y, 0),
-                crossing.yaw + arm * -math.pi / 2,
-                (40, 12, f.uniform(9, 16)),
-                f.seed(),
-                f.pick(RENDER_COLORS),
-                (0.6, 0.58, 0.55),
-                (*_facade(f, True, False), 0.0, 0.0, 0.0),
-            )
-        )
+        _block(f, (x, y), crossing.yaw + arm * -math.pi / 2, (40, 12, f.uniform(9, 16)))
     if plan.urban or f.chance(0.3):
         _signals(f)
+
+
+def _block(f: Furnisher, xy: tuple[float, float], yaw: float, size: tuple[float, float, float]) -> None:
+    """A plain building at a place in the world."""
+    f.rows.append(
+        record(rec.BUILDING, (*xy, 0), yaw, size, f.seed(), f.pick(RENDER_COLORS), (0.6, 0.58, 0.55),
+               (*_facade(f, False), 0.0, 0.0, 0.0))
+    )  # fmt: skip
 
 
 def _close_arm(f: Furnisher, arm: int) -> None:
@@ -208,43 +208,25 @@ def _signals(f: Furnisher) -> None:
     tone = f.uniform(0.03, 0.3)
     for side, along, towards in ((-1, -gap, math.pi), (-1, gap + 4, math.pi), (1, gap, 0.0), (1, -gap - 4, 0.0)):
         s = crossing.s + along
-        u = f.free_u(
-            s, side * (abs(plan.kerb(side)) + 0.6), 0.5, 0.4, side, side * (abs(plan.kerb(side)) + plan.sidewalk(side))
-        )
+        kerb = abs(plan.kerb(side))
+        u = f.free_u(s, side * (kerb + 0.6), 0.5, 0.4, side, side * (kerb + plan.sidewalk(side)))
         if u is None:
             continue
         arm = f.uniform(2.5, 4.5) if f.chance(0.5) and not f.blocked(s, u - side * 4, 1.0, 1.0) else 0.0
         # the mast arm of local +y reaches over the road on the driver's side
-        f.place(
-            rec.SIGNAL,
-            s,
-            u,
-            towards,
-            (0.3, 0.3, f.uniform(3.4, 3.8) if not arm else 5.6),
-            (tone, tone, tone),
-            parameters=(arm, lit),
-        )
+        size = (0.3, 0.3, f.uniform(3.4, 3.8) if not arm else 5.6)
+        f.place(rec.SIGNAL, (s, u), towards, size, (tone, tone, tone), parameters=(arm, lit))
     for arm_side in (-1, 1):
-        if (arm_side > 0 and crossing.end <= 0) or (arm_side < 0 and crossing.start >= 0):
+        if not crossing.has_arm(arm_side):
             continue
         a = arm_side * (abs(plan.kerb(arm_side)) + crossing.corner * 0.6 + 1.0)
         x, y = crossing.at(a, arm_side * (crossing.half_width + 0.7))
-        s = crossing.s
-        if f.blocked(s, a, 1.0, crossing.half_width + 1.5):
+        if f.blocked(crossing.s, a, 1.0, crossing.half_width + 1.5):
             continue
         facing = crossing.yaw + (0.0 if arm_side > 0 else math.pi)
-        f.rows.append(
-            record(
-                rec.SIGNAL,
-                (x, y, KERB_M),
-                facing,
-                (0.3, 0.3, 3.5),
-                f.seed(),
-                (tone, tone, tone),
-                (0.5, 0.5, 0.5),
-                (0.0, 2.0 - lit),
-            )
-        )
+        row = record(rec.SIGNAL, (x, y, KERB_M), facing, (0.3, 0.3, 3.5), f.seed(), (tone, tone, tone),
+                     parameters=(0.0, 2.0 - lit))  # fmt: skip
+        f.rows.append(row)
 
 
 def _background(f: Furnisher) -> None:
@@ -253,22 +235,12 @@ def _background(f: Furnisher) -> None:
     end = plan.drive_length + AHEAD_M - 22
     x, y, heading = plan.line.point(end, 0)
     if plan.urban:
-        f.rows.append(
-            record(
-                rec.BUILDING,
-                (x + 8 * math.cos(heading), y + 8 * math.sin(heading), 0),
-                heading - math.pi / 2,
-                (60, 12, f.uniform(12, 24)),
-                f.seed(),
-                f.pick(RENDER_COLORS),
-                (0.6, 0.58, 0.55),
-                (*_facade(f, True, False), 0.0, 0.0, 0.0),
-            )
-        )
+        place = (x + 8 * math.cos(heading), y + 8 * math.sin(heading))
+        _block(f, place, heading - math.pi / 2, (60, 12, f.uniform(12, 24)))
     for i in range(14):
         u = (i - 6.5) * 7.0 + f.uniform(-2, 2)
         size = f.uniform(9, 16)
-        f.place(rec.TREE, end + f.uniform(16, 30), u, 0, (1, 1, size), f.pick(LEAF_COLORS[:4]), (0.13, 0.10, 0.075),
+        f.place(rec.TREE, (end + f.uniform(16, 30), u), 0, (1, 1, size), f.pick(LEAF_COLORS[:4]), (0.13, 0.10, 0.075),
                 (size * 0.34, 0.8, 0.0, 0.6, 0.25), z=0.0)  # fmt: skip
     if plan.urban or f.chance(0.4):
         for side in (-1, 1):
@@ -276,28 +248,13 @@ def _background(f: Furnisher) -> None:
                 s, u = f.uniform(20, end), side * f.uniform(38, 75)
                 if f.near_crossing(s, 16):
                     continue
-                f.place(
-                    rec.BUILDING,
-                    s,
-                    u,
-                    0 if side > 0 else math.pi,
-                    (f.uniform(12, 24), f.uniform(12, 20), f.uniform(20, 48)),
-                    f.pick(RENDER_COLORS),
-                    (0.5, 0.5, 0.5),
-                    (*_facade(f, True, False), 0.0, 0.0, 0.0),
-                    z=0.0,
-                )
+                size = (f.uniform(12, 24), f.uniform(12, 20), f.uniform(20, 48))
+                f.place(rec.BUILDING, (s, u), 0 if side > 0 else math.pi, size, f.pick(RENDER_COLORS),
+                        parameters=(*_facade(f, False), 0.0, 0.0, 0.0), z=0.0)  # fmt: skip
     for i in range(8):
         angle, distance = heading + (i - 3.5) * 0.42, f.uniform(260, 480)
         height = f.uniform(10, 42)
-        f.rows.append(
-            record(
-                rec.HILL,
-                (x + distance * math.cos(angle), y + distance * math.sin(angle), -2.0),
-                f.uniform(0, 3),
-                (f.uniform(160, 320), f.uniform(120, 220), height),
-                f.seed(),
-                f.pick(LEAF_COLORS[:3]),
-                parameters=(float(np.sign(height - 14) > 0),),
-            )
-        )
+        place = (x + distance * math.cos(angle), y + distance * math.sin(angle), -2.0)
+        row = record(rec.HILL, place, f.uniform(0, 3), (f.uniform(160, 320), f.uniform(120, 220), height), f.seed(),
+                     f.pick(LEAF_COLORS[:3]), parameters=(float(np.sign(height - 14) > 0),))  # fmt: skip
+        f.rows.append(row)

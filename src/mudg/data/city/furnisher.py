@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from mudg.base import seeds
 from mudg.data.city import records as rec
 from mudg.data.city.config import CityConfig
 from mudg.data.city.layout import StreetPlan
-from mudg.data.city.records import Color, record
+from mudg.data.city.records import Color, Draws, record
 
 KERB_M = 0.13
 RENDER_COLORS: tuple[Color, ...] = (
@@ -15,36 +14,20 @@ RENDER_COLORS: tuple[Color, ...] = (
 )  # fmt: skip
 BRICK_COLORS: tuple[Color, ...] = ((0.30, 0.13, 0.085), (0.36, 0.19, 0.12), (0.24, 0.12, 0.09), (0.42, 0.30, 0.20))
 LEAF_COLORS: tuple[Color, ...] = (
-    (0.085, 0.15, 0.035),
-    (0.11, 0.17, 0.04),
-    (0.06, 0.115, 0.03),
-    (0.15, 0.17, 0.045),
-    (0.20, 0.13, 0.03),
-)
+    (0.085, 0.15, 0.035), (0.11, 0.17, 0.04), (0.06, 0.115, 0.03), (0.15, 0.17, 0.045), (0.20, 0.13, 0.03),
+)  # fmt: skip
 CLEARANCE_M = 1.0
 
 
-class Furnisher:
+class Furnisher(Draws):
     """Collects the records of static things; keeps the corridor of the shifted cameras free."""
 
     def __init__(self, config: CityConfig, plan: StreetPlan) -> None:
-        self.rng = seeds.numpy_rng(config.seed, 0, "city furniture")
+        super().__init__(config.seed, "city furniture")
         self.plan = plan
         self.rows: list[list[float]] = []
         self.reach = config.shift_margin_m + CLEARANCE_M
         self._from_s, self._to_s = -2.5, plan.drive_length + 4.5
-
-    def seed(self) -> int:
-        """A fresh seed for one thing."""
-        return int(self.rng.integers(1, 1 << 24))
-
-    def uniform(self, low: float, high: float) -> float:
-        """A uniform number."""
-        return low + (high - low) * float(self.rng.random())
-
-    def chance(self, probability: float) -> bool:
-        """True with this probability."""
-        return float(self.rng.random()) < probability
 
     def pick(self, items: tuple[Color, ...], spread: float = 0.15) -> Color:
         """One of the colours, a little lighter or darker."""
@@ -69,11 +52,11 @@ class Furnisher:
         return crossing is not None and abs(s - crossing.s) < crossing.half_width + margin
 
     def place(
-        self, kind: int, s: float, u: float, turn: float, size: tuple[float, float, float], rgb: Color,
+        self, kind: int, place: tuple[float, float], turn: float, size: tuple[float, float, float], rgb: Color,
         rgb2: Color = (0.5, 0.5, 0.5), parameters: tuple[float, ...] = (), z: float = KERB_M,
     ) -> None:  # fmt: skip
-        """Add a thing at street coordinates; ``turn`` is its heading relative to the street."""
-        x, y, heading = self.plan.line.point(s, u)
+        """Add a thing at street coordinates (s, u); ``turn`` is its heading relative to the street."""
+        x, y, heading = self.plan.line.point(*place)
         self.rows.append(record(kind, (x, y, z), heading + turn, size, self.seed(), rgb, rgb2, parameters))
 
 
@@ -84,5 +67,5 @@ def plant_tree(f: Furnisher, s: float, u: float, garden: bool = False) -> None:
     height = f.uniform(6.0, 11.0) if habit == 0 else f.uniform(7, 12)
     radius = height * f.uniform(0.24, 0.32) if habit == 0 else f.uniform(1.0, 1.7)
     cell = f.uniform(0.20, 0.27) * (1 + 0.05 * max(0.0, height - 7))
-    f.place(rec.TREE, s, u, f.uniform(0, 6.28), (1.0, 1.0, height), f.pick(LEAF_COLORS), (0.13, 0.10, 0.075),
+    f.place(rec.TREE, (s, u), f.uniform(0, 6.28), (1.0, 1.0, height), f.pick(LEAF_COLORS), (0.13, 0.10, 0.075),
             (radius, f.uniform(0.45, 0.72), habit, cell, f.uniform(0.11, 0.2)))  # fmt: skip

@@ -58,6 +58,10 @@ class Crossing:
     start: float
     end: float
 
+    def has_arm(self, side: int) -> bool:
+        """Whether the street goes on to the left (+1) or right (-1) of the main street."""
+        return self.end > 0 if side > 0 else self.start < 0
+
     def at(self, a: float, b: float) -> tuple[float, float]:
         """World x, y of crossing coordinates."""
         c, n = np.cos(self.yaw), np.sin(self.yaw)
@@ -109,16 +113,18 @@ def plan_streets(config: CityConfig) -> StreetPlan:
     times, drive_s = _drive(rng, config)
     drive_length = float(np.interp((config.n_frames - 1) / config.rate_hz, times, drive_s))
     lane = float(rng.uniform(3.2, 3.6))
-    forward, backward, median, ego_lane, park_left, park_right = _lanes(rng, urban)
-    forward_u = tuple(-(median / 2 + (i + 0.5) * lane) for i in range(forward))
-    backward_u = tuple(median / 2 + (i + 0.5) * lane for i in range(backward))
-    left = median / 2 + backward * lane + park_left + (rng.uniform(0.3, 0.6) if not park_left else 0.0)
-    right = -(median / 2 + forward * lane + park_right + (rng.uniform(0.3, 1.0) if not park_right else 0.0))
-    ego_u = forward_u[ego_lane]
+    lanes = _lanes(rng, urban)
+    half, park_left, park_right = lanes.median / 2, lanes.park_left, lanes.park_right
+    forward_u = tuple(-(half + (i + 0.5) * lane) for i in range(lanes.forward))
+    backward_u = tuple(half + (i + 0.5) * lane for i in range(lanes.backward))
+    left = half + lanes.backward * lane + park_left + (rng.uniform(0.3, 0.6) if not park_left else 0.0)
+    right = -(half + lanes.forward * lane + park_right + (rng.uniform(0.3, 1.0) if not park_right else 0.0))
+    ego_u = forward_u[lanes.ego]
     line = _centreline(rng, drive_length, ego_u, urban)
     walks = [float(rng.uniform(2.6, 5.2)) if urban else float(rng.uniform(1.7, 3.2)) for _ in range(2)]
     crossing = _crossing(rng, config, line, drive_length, urban)
-    marks, crosswalks = _paint(rng, forward, backward, median, lane, left, right, park_left, park_right, crossing)
+    marks = _paint(rng, lanes, lane, (left, right))
+    crosswalks = _crosswalks(rng, (left, right), crossing)
     return StreetPlan(
         line, urban, lane, forward_u, backward_u, ego_u, float(left), float(right), park_left, park_right,
         walks[0], walks[1], urban or rng.random() < 0.1, urban or rng.random() < 0.1, crossing, marks, crosswalks,
@@ -138,19 +144,30 @@ def _drive(rng: np.random.Generator, config: CityConfig) -> tuple[Array, Array]:
     return times, s - np.interp(0.0, times, s)
 
 
-def _lanes(rng: np.random.Generator, urban: bool) -> tuple[int, int, float, int, float, float]:
-    """(lanes forward, lanes backward, median, lane of the vehicle, parking left, parking right)."""
+@dataclass(frozen=True, slots=True)
+class _Lanes:
+    """Lanes in either direction, width of the median, lane of the vehicle, widths of the parking bands."""
+
+    forward: int
+    backward: int
+    median: float
+    ego: int
+    park_left: float
+    park_right: float
+
+
+def _lanes(rng: np.random.Generator, urban: bool) -> _Lanes:
     park = float(rng.uniform(2.1, 2.4))
     kind = rng.choice(5, p=[0.3, 0.3, 0.22, 0.06, 0.12] if urban else [0.12, 0.2, 0.38, 0.28, 0.02])
     if kind == 0:  # two lanes each way, driving on the outer one
-        return 2, int(rng.integers(1, 3)), 0.0, 1, park * (rng.random() < 0.7), 0.0
+        return _Lanes(2, int(rng.integers(1, 3)), 0.0, 1, park * (rng.random() < 0.7), 0.0)
     if kind == 1:  # wide median, driving on the inner lane, cars parked on both sides
-        return 2, int(rng.integers(1, 3)), float(rng.uniform(2.9, 3.4)), 0, park * (rng.random() < 0.7), park
+        return _Lanes(2, int(rng.integers(1, 3)), float(rng.uniform(2.9, 3.4)), 0, park * (rng.random() < 0.7), park)
     if kind == 2:  # one lane each way with a painted median
-        return 1, 1, float(rng.uniform(2.9, 3.4)), 0, park * (rng.random() < 0.8), 0.0
+        return _Lanes(1, 1, float(rng.uniform(2.9, 3.4)), 0, park * (rng.random() < 0.8), 0.0)
     if kind == 3:  # plain two-lane street
-        return 1, 1, 0.0, 0, park, 0.0
-    return 3, 0, 0.0, 1, park, park  # one-way street
+        return _Lanes(1, 1, 0.0, 0, park, 0.0)
+    return _Lanes(3, 0, 0.0, 1, park, park)  # one-way street
 
 
 def _centreline(rng: np.random.Generator, drive_length: float, ego_u: float, urban: bool) -> Centreline:
@@ -191,43 +208,45 @@ def _crossing(
     )
 
 
-def _paint(
-    rng: np.random.Generator, forward: int, backward: int, median: float, lane: float, left: float, right: float,
-    park_left: float, park_right: float, crossing: Crossing | None,
-) -> tuple[Array, Array]:  # fmt: skip
+def _paint(rng: np.random.Generator, lanes: _Lanes, width: float, kerbs: tuple[float, float]) -> Array:
+    """Lines along the main street, f64[k, 6]; see ``StreetPlan.marks``."""
+    median = lanes.median
     yellow = float(rng.random() < 0.45)
     half = float(rng.uniform(0.055, 0.08))
     period, dash = float(rng.uniform(6, 12)), float(rng.uniform(2.4, 4.0))
-    rows: list[list[float]] = []
-    for i in range(1, forward):
-        rows.append([-(median / 2 + i * lane), half, period, dash, MARK_DASHED, 0.0])
-    for i in range(1, backward):
-        rows.append([median / 2 + i * lane, half, period, dash, MARK_DASHED, 0.0])
-    if backward and median > 0:
+    rows = [[-(median / 2 + i * width), half, period, dash, MARK_DASHED, 0.0] for i in range(1, lanes.forward)]
+    rows += [[median / 2 + i * width, half, period, dash, MARK_DASHED, 0.0] for i in range(1, lanes.backward)]
+    if lanes.backward and median > 0:
         rows += [[side * median / 2, half, 1.0, 1.0, MARK_SOLID, yellow] for side in (-1, 1)]
         if rng.random() < 0.7:
             rows.append([0.0, median / 2 - 0.15, 3.2, 0.55, MARK_HATCHED, yellow])
-    elif backward:
+    elif lanes.backward:
         kind = rng.choice([MARK_DOUBLE, MARK_DASHED, MARK_SOLID])
         rows.append([0.0, half, period, dash, float(kind), yellow])
     edge = rng.random() < 0.6
-    for kerb, park in ((left, park_left), (right, park_right)):
+    for kerb, park in zip(kerbs, (lanes.park_left, lanes.park_right), strict=True):
         inner = abs(kerb) - park
         if park and rng.random() < 0.7:
             rows.append([np.sign(kerb) * inner, half, 2.0, 1.0, MARK_DASHED, 0.0])
         elif not park and edge:
             rows.append([np.sign(kerb) * (inner - 0.25), half, 1.0, 1.0, MARK_SOLID, 0.0])
+    return np.array(rows, np.float64).reshape(-1, 6)
+
+
+def _crosswalks(rng: np.random.Generator, kerbs: tuple[float, float], crossing: Crossing | None) -> Array:
+    """f64[c, 3]; see ``StreetPlan.crosswalks``."""
+    left, right = kerbs
     walks: list[list[float]] = []
     length = float(rng.uniform(2.8, 4.0))
     if crossing is not None:
+        clear = crossing.corner * 0.6 + 1.0
         gap = crossing.half_width + crossing.corner * 0.6 + 1.0
         walks.append([crossing.s - gap - length, length, 0.0])
         walks.append([crossing.s + gap, length, 0.0])
-        clear = crossing.corner * 0.6 + 1.0
-        if crossing.end > 0:
+        if crossing.has_arm(1):
             walks.append([left + clear, length, 1.0])
-        if crossing.start < 0:
+        if crossing.has_arm(-1):
             walks.append([right - clear - length, length, 1.0])
     elif rng.random() < 0.6:
         walks.append([float(rng.uniform(14, 55)), length, 0.0])
-    return np.array(rows, np.float64).reshape(-1, 6), np.array(walks, np.float64).reshape(-1, 3)
+    return np.array(walks, np.float64).reshape(-1, 3)

@@ -36,13 +36,13 @@ class LogChoice:
     """Which logs enter a list.
 
     Args:
-        movers: at least so many moving vehicles are in view of the front camera.
-        smallest_share: in view means: covers this share of the picture,
+        moving: at least so many moving vehicles are in view of the front camera.
+        smallest_share: in view means: covers this share of the image,
         frames_share: in this share of the frames.
         curved_deg: half of the list turns by at least this angle.
     """
 
-    movers: int = 2
+    moving: int = 2
     smallest_share: float = 1e-3
     frames_share: float = 0.25
     curved_deg: float = 5.0
@@ -51,14 +51,14 @@ class LogChoice:
 @dataclass(frozen=True)
 class LogFacts:
     """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front camera, the
-    share of the picture they cover together on average, and the generator's line about the city."""
+    share of the image they cover together on average, and the generator's line about the city."""
 
     seed: int
     turn_deg: float
     length_m: float
-    movers: int
-    mover_share: float
-    words: str
+    moving: int
+    moving_share: float
+    description: str
 
 
 STANDARD: Final = LogRules()
@@ -88,23 +88,15 @@ def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> 
 
 
 def facts(seed: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> LogFacts:
-    """What the log of a seed holds, from small pictures of every fourth frame."""
+    """What the log of a seed holds, from small images of every fourth frame."""
     world = CityWorld(log_config(seed, rules))
     views = [view.resized(96, 64) for view in world.frame_views("front")[::4]]
     seen = np.stack([world.render(view, supersample=1).instance for view in views])
     moving = moving_instances(world, VEHICLES)
-    shares = np.array([[float((picture == i).mean()) for picture in seen] for i in moving]).reshape(
-        len(moving), len(views)
-    )
-    in_view = (shares >= choice.smallest_share).mean(1) >= choice.frames_share
-    return LogFacts(
-        seed,
-        turn_deg(world.config),
-        world.plan.drive_length,
-        int(in_view.sum()),
-        float(shares.sum(0).mean()),
-        world.describe(),
-    )
+    shares = np.array([[float((image == i).mean()) for image in seen] for i in moving]).reshape(-1, len(views))
+    count = int(((shares >= choice.smallest_share).mean(1) >= choice.frames_share).sum())
+    share = float(shares.sum(0).mean())
+    return LogFacts(seed, turn_deg(world.config), world.plan.drive_length, count, share, world.describe())
 
 
 def turn_deg(config: CityConfig) -> float:
@@ -127,7 +119,7 @@ def choose(first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogC
     seed = first_seed
     while min(map(len, kept.values())) < count // 2:
         curved = turn_deg(log_config(seed, rules)) >= choice.curved_deg
-        if len(kept[curved]) < count // 2 and facts(seed, rules, choice).movers >= choice.movers:
+        if len(kept[curved]) < count // 2 and facts(seed, rules, choice).moving >= choice.moving:
             kept[curved].append(seed)
         seed += 1
     return tuple(sorted(kept[True] + kept[False]))

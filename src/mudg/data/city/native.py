@@ -45,13 +45,8 @@ class CityHandle:
     """Owns one native world."""
 
     def __init__(
-        self,
-        records: NDArray[np.float64],
-        plan: StreetPlan,
-        road: NDArray[np.float64],
-        light: NDArray[np.float64],
-        seed: int,
-    ) -> None:
+        self, records: NDArray[np.float64], plan: StreetPlan, road: NDArray[np.float64], light: NDArray[np.float64], seed: int
+    ) -> None:  # fmt: skip
         self._lib = library()
         line = _f64(np.stack([plan.line.s, plan.line.x, plan.line.y, plan.line.heading], 1))
         records, marks, walks = _f64(records), _f64(plan.marks), _f64(plan.crosswalks)
@@ -59,12 +54,8 @@ class CityHandle:
         got = (len(road), len(light), records.shape[1])
         expected = tuple(self._lib.mudg_city_number_counts(which) for which in range(3))
         if got != expected:
-            raise ResourceError(
-                "the native library belongs to another version of the city",
-                expected=str(got),
-                got=str(expected),
-                remedy="build it again",
-            )
+            raise ResourceError("the native library belongs to another version of the city", expected=str(got),
+                got=str(expected), remedy="build it again")  # fmt: skip
         self._handle = self._lib.mudg_city_create(
             records.ctypes.data, len(records), line.ctypes.data, len(line), marks.ctypes.data, len(marks), walks.ctypes.data,
             len(walks), road.ctypes.data, light.ctypes.data, seed & 0x7FFFFFFF,

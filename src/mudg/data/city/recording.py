@@ -18,13 +18,9 @@ SENSOR = "lidar"
 
 
 def write_city(
-    config: CityConfig,
-    out_dir: Path | str,
-    *,
-    scene_id: str | None = None,
-    test_every: int = 4,
+    config: CityConfig, out_dir: Path | str, *, scene_id: str | None = None, test_every: int = 4,
     jpeg_quality: int | None = None,
-) -> Scene:
+) -> Scene:  # fmt: skip
     """Generate the log of ``config`` and write it with its exact labels (depth, semantics, sky, dynamic, instance).
 
     All cores work: the rays of a frame on the native threads, encoding and writing on the writer's. The scene is moved
@@ -48,7 +44,7 @@ def write_city(
         raise UsageError("test_every cannot be negative", got=str(test_every))
     world = CityWorld(config)
     log.info(f"city {config.seed}: {world.describe()}")
-    moving = np.array([0, *(int(mover.moving) for mover in world.movers)], bool)
+    moving = np.array([0, *(int(posed.moving) for posed in world.objects)], bool)
     split: dict[str, str] = {}
     with SceneWriter(out_dir, scene_id or f"city-{config.seed}", world.source(), jpeg_quality) as writer:
         for camera in world.cameras().values():
@@ -75,10 +71,7 @@ def write_city(
 def _write_frame(writer: SceneWriter, world: CityWorld, frame_id: str, view: View, moving: NDArray[np.bool_]) -> None:
     truth = world.render(view, sensor_noise=world.config.sensor_noise)
     labels = {
-        "depth": truth.depth,
-        "semantics": truth.semantics,
-        "sky": truth.sky,
-        "dynamic": moving[truth.instance],
+        "depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky, "dynamic": moving[truth.instance],
         "instance": truth.instance,
-    }
+    }  # fmt: skip
     writer.add_frame(frame_id, view, truth.rgb_u8, labels)

@@ -7,6 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base import seeds
+
 COLUMNS: Final = 28
 
 # kinds of things; the same numbers stand in native/city_world.h
@@ -28,12 +30,30 @@ def record(
     rgb: Color = (0.5, 0.5, 0.5),
     rgb2: Color = (0.5, 0.5, 0.5),
     parameters: tuple[float, ...] = (),
-    public_id: int = 0,
 ) -> list[float]:
     """One row: position (metres, world), heading (radians), size (length, width, height in metres), linear colours,
-    up to 12 parameters whose meaning depends on the kind (see native/city_build.cpp), public instance id."""
+    up to 12 parameters whose meaning depends on the kind (see native/city_build.cpp), public instance id (0 = none)."""
     padded = (*parameters, *(0.0,) * (12 - len(parameters)))
-    return [float(kind), *xyz, yaw, *size, float(seed), *rgb, *rgb2, *padded, float(public_id)]
+    return [float(kind), *xyz, yaw, *size, float(seed), *rgb, *rgb2, *padded, 0.0]
+
+
+class Draws:
+    """Random numbers for one purpose."""
+
+    def __init__(self, seed: int, purpose: str) -> None:
+        self.rng = seeds.numpy_rng(seed, 0, purpose)
+
+    def seed(self) -> int:
+        """A fresh seed for one thing."""
+        return int(self.rng.integers(1, 1 << 24))
+
+    def uniform(self, low: float, high: float) -> float:
+        """A uniform number."""
+        return low + (high - low) * float(self.rng.random())
+
+    def chance(self, probability: float) -> bool:
+        """True with this probability."""
+        return float(self.rng.random()) < probability
 
 
 def to_array(rows: list[list[float]]) -> NDArray[np.float64]:

@@ -52,10 +52,8 @@ def ego_from_lidar() -> NDArray[np.float64]:
 def lidar_elevations(config: CityConfig) -> NDArray[np.float64]:
     """Elevation of every beam in radians, denser around the horizon as in common 64-beam sensors."""
     u = np.linspace(-1.0, 1.0, config.lidar_beams)
-    middle, half = (
-        0.5 * (config.lidar_lower_deg + config.lidar_upper_deg),
-        0.5 * (config.lidar_upper_deg - config.lidar_lower_deg),
-    )
+    middle = 0.5 * (config.lidar_lower_deg + config.lidar_upper_deg)
+    half = 0.5 * (config.lidar_upper_deg - config.lidar_lower_deg)
     return np.deg2rad(middle + half * (0.75 * u + 0.25 * u**3))
 
 

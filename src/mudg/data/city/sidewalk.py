@@ -26,18 +26,21 @@ class Sidewalk:
         self.facing_back = 0.0 if side < 0 else math.pi
 
     def put(
-        self, kind: int, s: float, from_kerb: float, across: float, turn: float, size: Size, rgb: Color,
+        self, kind: int, place: tuple[float, float], across: float, turn: float, size: Size, rgb: Color,
         rgb2: Color = (0.5, 0.5, 0.5), parameters: tuple[float, ...] = (),
     ) -> None:  # fmt: skip
-        """Place a thing of half width ``across`` unless it stands in a crossing or there is no room beside the corridor."""
-        f = self.f
+        """Place a thing of half width ``across`` unless it stands in a crossing or there is no room beside the corridor.
+
+        ``place``: metres along the street and from the kerb.
+        """
+        f, (s, from_kerb) = self.f, place
         if f.near_crossing(s, self.corner + across):
             return
         u = f.free_u(
             s, self.side * (self.kerb + from_kerb), max(across, 0.3), across, self.side, self.side * (self.front - 0.1)
         )
         if u is not None:
-            f.place(kind, s, u, turn, size, rgb, rgb2, parameters)
+            f.place(kind, (s, u), turn, size, rgb, rgb2, parameters)
 
 
 def furnish_sidewalk(f: Furnisher, side: int, front: float) -> None:
@@ -53,7 +56,7 @@ def furnish_sidewalk(f: Furnisher, side: int, front: float) -> None:
     if f.plan.urban and f.chance(0.35):
         s, step = f.uniform(0, 40), f.uniform(1.4, 2.2)
         for i in range(int(f.rng.integers(5, 14))):
-            walk.put(rec.BOLLARD, s + i * step, 0.4, 0.1, 0, (0.12, 0.12, 0.95), (0.03, 0.03, 0.035))
+            walk.put(rec.BOLLARD, (s + i * step, 0.4), 0.1, 0, (0.12, 0.12, 0.95), (0.03, 0.03, 0.035))
 
 
 def _street_trees(walk: Sidewalk) -> None:
@@ -80,9 +83,8 @@ def _lamps(walk: Sidewalk) -> None:
     while s < walk.end:
         size = (0.2, f.uniform(0.11, 0.17), height)
         reach = f.uniform(1.2, 2.4)
-        walk.put(
-            rec.LAMP, s, 0.5, 0.15, walk.facing_street, size, (tone, tone, tone * 1.03), parameters=(reach, old_style)
-        )
+        rgb = (tone, tone, tone * 1.03)
+        walk.put(rec.LAMP, (s, 0.5), 0.15, walk.facing_street, size, rgb, parameters=(reach, old_style))
         s += spacing
 
 
@@ -93,7 +95,7 @@ def _wooden_poles(walk: Sidewalk) -> None:
     s = -20 + f.uniform(0, 25)
     while s < walk.end:
         size = (0.26, 0.26, f.uniform(7.5, 9.0))
-        walk.put(rec.POLE, s, walk.width - 0.5, 0.15, 0, size, (0.16, 0.11, 0.075), parameters=(1.0,))
+        walk.put(rec.POLE, (s, walk.width - 0.5), 0.15, 0, size, (0.16, 0.11, 0.075), parameters=(1.0,))
         s += 28
 
 
@@ -103,19 +105,19 @@ def _furniture(walk: Sidewalk, s: float) -> None:
     if what < 0.3:
         size = (0.45, 0.5, f.uniform(0.9, 1.3))
         rgb = f.pick(((0.03, 0.09, 0.05), (0.05, 0.07, 0.16), (0.09, 0.09, 0.09), (0.2, 0.16, 0.02)))
-        walk.put(rec.BIN, s, 0.6, 0.3, walk.facing_street, size, rgb)
+        walk.put(rec.BIN, (s, 0.6), 0.3, walk.facing_street, size, rgb)
     elif what < 0.5:
-        walk.put(rec.BENCH, s, walk.width * 0.7, 0.35, walk.facing_back, (1.7, 0.5, 0.9), (0.2, 0.1, 0.05))
+        walk.put(rec.BENCH, (s, walk.width * 0.7), 0.35, walk.facing_back, (1.7, 0.5, 0.9), (0.2, 0.1, 0.05))
     elif what < 0.7 and f.plan.urban:
         leaves = f.pick(LEAF_COLORS)
-        walk.put(rec.PLANTER, s, walk.width - 0.8, 0.4, 0, (1.4, 0.6, 0.5), (0.4, 0.39, 0.37), leaves)
+        walk.put(rec.PLANTER, (s, walk.width - 0.8), 0.4, 0, (1.4, 0.6, 0.5), (0.4, 0.39, 0.37), leaves)
     elif what < 0.85:
         turn = f.uniform(-0.3, 0.3) + (math.pi if f.chance(0.5) else 0)
         rgb = f.pick(((0.4, 0.02, 0.02), (0.02, 0.02, 0.03), (0.05, 0.1, 0.35)))
-        walk.put(rec.MOTORBIKE, s, 0.75, 0.4, turn, (2.0, 0.7, 1.1), rgb)
+        walk.put(rec.MOTORBIKE, (s, 0.75), 0.4, turn, (2.0, 0.7, 1.1), rgb)
     elif walk.width > 3.0:
         rgb = f.pick(((0.5, 0.1, 0.1), (0.1, 0.3, 0.5)))
-        walk.put(rec.SHELTER, s, 1.5, 0.9, walk.facing_back, (3.6, 1.5, 2.5), rgb)
+        walk.put(rec.SHELTER, (s, 1.5), 0.9, walk.facing_back, (3.6, 1.5, 2.5), rgb)
 
 
 def _sign(walk: Sidewalk, s: float) -> None:
@@ -135,14 +137,5 @@ def _sign(walk: Sidewalk, s: float) -> None:
         rgb = ((0.02, 0.08, 0.35), (0.03, 0.22, 0.10), (0.72, 0.72, 0.7))[int(f.rng.integers(3))]
     width = size * f.uniform(1.6, 2.6) if mask == 0 else 0.0
     ink = (0.75, 0.75, 0.74) if rgb[0] < 0.5 else (0.03, 0.03, 0.03)
-    walk.put(
-        rec.SIGN,
-        s,
-        f.uniform(0.35, 0.7),
-        0.3,
-        towards,
-        (0.1, width, f.uniform(2.1, 2.7)),
-        rgb,
-        ink,
-        (float(mask), size, float(f.chance(0.25)), motif),
-    )
+    walk.put(rec.SIGN, (s, f.uniform(0.35, 0.7)), 0.3, towards, (0.1, width, f.uniform(2.1, 2.7)), rgb, ink,
+             (float(mask), size, float(f.chance(0.25)), motif))  # fmt: skip

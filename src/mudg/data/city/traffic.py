@@ -13,25 +13,18 @@ from mudg.data.city import records as rec
 from mudg.data.city.config import CityConfig
 from mudg.data.city.furnisher import KERB_M
 from mudg.data.city.layout import StreetPlan
-from mudg.data.city.records import Color, record
+from mudg.data.city.records import Color, Draws, record
 
 Array = NDArray[np.float64]
 
 PAINTS: tuple[Color, ...] = (
-    (0.62, 0.62, 0.62),
-    (0.70, 0.70, 0.69),
-    (0.018, 0.018, 0.02),
-    (0.05, 0.052, 0.056),
-    (0.16, 0.165, 0.17),
-    (0.32, 0.33, 0.34),
-    (0.30, 0.018, 0.018),
-    (0.02, 0.05, 0.20),
-    (0.05, 0.10, 0.24),
-    (0.16, 0.12, 0.08),
-    (0.03, 0.09, 0.06),
-    (0.42, 0.18, 0.03),
-    (0.50, 0.42, 0.05),
-)
+    (0.62, 0.62, 0.62), (0.70, 0.70, 0.69), (0.018, 0.018, 0.02), (0.05, 0.052, 0.056), (0.16, 0.165, 0.17),
+    (0.32, 0.33, 0.34), (0.30, 0.018, 0.018), (0.02, 0.05, 0.20), (0.05, 0.10, 0.24), (0.16, 0.12, 0.08),
+    (0.03, 0.09, 0.06), (0.42, 0.18, 0.03), (0.50, 0.42, 0.05),
+)  # fmt: skip
+BUS_COLORS: tuple[Color, ...] = (
+    (0.45, 0.03, 0.03), (0.55, 0.42, 0.03), (0.6, 0.6, 0.58), (0.03, 0.16, 0.30), (0.05, 0.25, 0.12),
+)  # fmt: skip
 PAINT_WEIGHTS = np.array([4, 4, 3, 3, 3, 3, 2, 1.5, 1.5, 1, 0.7, 0.5, 0.3])
 KEY_MARGIN_S = 0.5
 RIG_BOX = (-1.2, 3.2)  # where cameras may sit along the vehicle, with clearance, metres
@@ -39,7 +32,7 @@ CLEARANCE_M = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mover:
+class PosedObject:
     """One posed object: its record (pose columns unused), keys f64[T, 4] = x, y, z of the ground point and yaw."""
 
     row: list[float]
@@ -92,40 +85,30 @@ def _rotation_y(a: float) -> Array:
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
-class TrafficPlanner:
+class TrafficPlanner(Draws):
     """Proposes objects and keeps those that collide neither with each other nor with the shifted cameras."""
 
     def __init__(self, config: CityConfig, plan: StreetPlan, ego_times: Array, ego_poses: Array) -> None:
-        self.rng = seeds.numpy_rng(config.seed, 0, "city traffic")
+        super().__init__(config.seed, "city traffic")
         self.config, self.plan = config, plan
         self.times = key_times(config)
-        self.movers: list[Mover] = []
+        self.objects: list[PosedObject] = []
         frames = np.arange(config.n_frames) / config.rate_hz
         at_frames = np.rint((frames - ego_times[0]) * config.rate_hz * 4).astype(int)
-        self._ego_xy, self._ego_yaw = (
-            ego_poses[at_frames, :2, 3],
-            np.arctan2(ego_poses[at_frames, 1, 0], ego_poses[at_frames, 0, 0]),
-        )
+        self._ego_xy = ego_poses[at_frames, :2, 3]
+        self._ego_yaw = np.arctan2(ego_poses[at_frames, 1, 0], ego_poses[at_frames, 0, 0])
         self._frame_key = int(np.rint(-self.times[0] * config.rate_hz)) + np.arange(config.n_frames)
         self._rects: list[Array] = []
         self._paths = np.zeros((0, len(self.times), 2))  # of all kept objects
         self._radii = np.zeros(0)
-
-    def uniform(self, low: float, high: float) -> float:
-        """A uniform number."""
-        return low + (high - low) * float(self.rng.random())
-
-    def chance(self, probability: float) -> bool:
-        """True with this probability."""
-        return float(self.rng.random()) < probability
 
     def add(self, row: list[float], keys: Array, gait: float = 0.0, moving: bool = True) -> bool:
         """Keep the object unless it collides; returns whether it was kept."""
         half_l, half_w = row[5] / 2, row[6] / 2
         if self._meets_cameras(keys, half_l, half_w) or self._meets_others(keys, half_l, half_w):
             return False
-        row = row[:-1] + [float(len(self.movers) + 1)]
-        self.movers.append(Mover(row, keys, gait, moving))
+        row = row[:-1] + [float(len(self.objects) + 1)]
+        self.objects.append(PosedObject(row, keys, gait, moving))
         self._rects.append(np.array([half_l, half_w]))
         self._paths = np.concatenate([self._paths, keys[None, :, :2]])
         self._radii = np.append(self._radii, math.hypot(half_l, half_w))
@@ -147,8 +130,8 @@ class TrafficPlanner:
         gap = keys[None, :, :2] - self._paths
         all_near = gap[..., 0] ** 2 + gap[..., 1] ** 2 < (radius + self._radii[:, None]) ** 2
         for index in np.flatnonzero(all_near.any(1)):
-            mover, rect, near = self.movers[index], self._rects[index], all_near[index]
-            a, b = keys[near], mover.keys[near]
+            other, rect, near = self.objects[index], self._rects[index], all_near[index]
+            a, b = keys[near], other.keys[near]
             # separating axes of both rectangles
             separated = np.zeros(len(a), bool)
             for yaw in (a[:, 3], b[:, 3]):
@@ -170,7 +153,7 @@ class TrafficPlanner:
     def vehicle(self, allow_big: bool = True) -> list[float]:
         """Record of a random vehicle."""
         paint = PAINTS[int(self.rng.choice(len(PAINTS), p=PAINT_WEIGHTS / PAINT_WEIGHTS.sum()))]
-        seed = int(self.rng.integers(1, 1 << 24))
+        seed = self.seed()
         draw = float(self.rng.random())
         origin = (0.0, 0.0, 0.0)
         if draw < 0.10:
@@ -179,28 +162,17 @@ class TrafficPlanner:
             return record(rec.VAN, origin, 0, size, seed, white)
         if allow_big and draw < 0.17:
             size = (self.uniform(6.5, 9.0), 2.45, self.uniform(3.0, 3.7))
-            box = (
-                PAINTS[1]
-                if self.chance(0.6)
-                else (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
-            )
+            white = self.chance(0.6)
+            box = PAINTS[1] if white else (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
             return record(rec.TRUCK, origin, 0, size, seed, paint, box)
         if allow_big and draw < 0.21:
-            body = ((0.45, 0.03, 0.03), (0.55, 0.42, 0.03), (0.6, 0.6, 0.58), (0.03, 0.16, 0.30), (0.05, 0.25, 0.12))[
-                int(self.rng.integers(5))
-            ]
+            body = BUS_COLORS[int(self.rng.integers(5))]
             return record(rec.BUS, origin, 0, (self.uniform(10.5, 12), 2.5, 3.1), seed, body, (0.6, 0.6, 0.58))
         style = int(self.rng.choice(4, p=[0.3, 0.32, 0.24, 0.14]))
         length = (self.uniform(4.4, 4.9), self.uniform(3.7, 4.3), self.uniform(4.3, 4.8), self.uniform(4.5, 4.9))[style]
-        height = (
-            self.uniform(1.40, 1.48),
-            self.uniform(1.45, 1.55),
-            self.uniform(1.62, 1.78),
-            self.uniform(1.45, 1.53),
-        )[style]
-        return record(
-            rec.CAR, origin, 0, (length, self.uniform(1.74, 1.88), height), seed, paint, parameters=(float(style),)
-        )
+        height = tuple(self.uniform(*span) for span in ((1.40, 1.48), (1.45, 1.55), (1.62, 1.78), (1.45, 1.53)))[style]
+        size = (length, self.uniform(1.74, 1.88), height)
+        return record(rec.CAR, origin, 0, size, seed, paint, parameters=(float(style),))
 
     def cloth(self) -> Color:
         """A colour of clothing: mostly muted."""
@@ -213,7 +185,7 @@ class TrafficPlanner:
         clothes = [self.cloth(), self.cloth()]
         height = self.uniform(1.55, 1.9)
         swing = min(0.5, 0.33 * speed)
-        return record(rec.PEDESTRIAN, (0, 0, 0), 0, (0.85, 0.65, height), int(self.rng.integers(1, 1 << 24)), clothes[0],
+        return record(rec.PEDESTRIAN, (0, 0, 0), 0, (0.85, 0.65, height), self.seed(), clothes[0],
                       tuple(0.4 * c for c in clothes[1]), (swing, float(self.chance(0.3))))  # type: ignore[arg-type]  # fmt: skip
 
     def along_street(self, s: Array, u: Array | float, direction: int, z: float = 0.0) -> Array:
@@ -222,7 +194,7 @@ class TrafficPlanner:
         return np.stack([x, y, np.full(len(s), z), heading + (0.0 if direction > 0 else math.pi)], 1)
 
 
-def plan_traffic(config: CityConfig, plan: StreetPlan, ego_times: Array, ego_poses: Array) -> list[Mover]:
+def plan_traffic(config: CityConfig, plan: StreetPlan, ego_times: Array, ego_poses: Array) -> list[PosedObject]:
     """All posed objects of a world; their public id is their position + 1."""
     t = TrafficPlanner(config, plan, ego_times, ego_poses)
     if config.traffic <= 0:
@@ -234,7 +206,7 @@ def plan_traffic(config: CityConfig, plan: StreetPlan, ego_times: Array, ego_pos
     _cyclists(t)
     _parked(t)
     _pedestrians(t)
-    return t.movers
+    return t.objects
 
 
 def _lead(t: TrafficPlanner) -> None:
@@ -322,7 +294,7 @@ def _crossing_traffic(t: TrafficPlanner) -> None:
     if crossing is None:
         return
     for arm in (-1, 1):
-        if (arm > 0 and crossing.end <= 0) or (arm < 0 and crossing.start >= 0):
+        if not crossing.has_arm(arm):
             continue
         a = abs(plan.kerb(arm)) + crossing.corner * 0.6 + 7.5
         for _ in range(2):
@@ -345,9 +317,7 @@ def _cyclists(t: TrafficPlanner) -> None:
     ego_s = t.plan.ego_s(t.times)
     for _ in range(int(2 + t.config.traffic)):
         clothes = t.cloth()
-        row = record(
-            rec.CYCLIST, (0, 0, 0), 0, (1.8, 0.62, 1.78), int(t.rng.integers(1, 1 << 24)), clothes, (0.03, 0.03, 0.05)
-        )
+        row = record(rec.CYCLIST, (0, 0, 0), 0, (1.8, 0.62, 1.78), t.seed(), clothes, (0.03, 0.03, 0.05))
         speed = t.uniform(3.5, 6.0)
         side = -1 if t.chance(0.6) else 1
         if side < 0 or not t.plan.backward_lanes:
@@ -374,10 +344,8 @@ def _parked(t: TrafficPlanner) -> None:
             half = row[5] / 2
             crossing = plan.crossing
             clear = crossing is None or abs(s + half - crossing.s) > crossing.half_width + crossing.corner + 6
-            walk = any(
-                on_cross < 0.5 and start - 5 < s + half < start + length + 5
-                for start, length, on_cross in plan.crosswalks
-            )
+            walks = [(start, length) for start, length, on_cross in plan.crosswalks if on_cross < 0.5]
+            walk = any(start - 5 < s + half < start + length + 5 for start, length in walks)
             if clear and not walk and t.chance(0.72 * min(1.0, t.config.traffic)):
                 u = side * (abs(plan.kerb(side)) - 0.18 - row[6] / 2 - t.uniform(0, 0.15))
                 direction = -1 if side > 0 and plan.backward_lanes else 1

@@ -24,7 +24,7 @@ from mudg.data.city.furnish import furnish
 from mudg.data.city.layout import StreetPlan, plan_streets
 from mudg.data.city.light import light_numbers
 from mudg.data.city.native import CityHandle
-from mudg.data.city.traffic import Mover, ego_keys, key_times, plan_traffic
+from mudg.data.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
 DATASET = "mudg procedural city"
 GENERATOR_VERSION = 1
@@ -83,14 +83,13 @@ class CityWorld:
         self.plan: StreetPlan = plan_streets(config)
         self.light_name, light = light_numbers(config)
         self._ego_times, self._ego_poses = ego_keys(config, self.plan)
-        self.movers: tuple[Mover, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
+        self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
         self._key_times = key_times(config)
-        rows = furnish(config, self.plan) + [m.row for m in self.movers]
-        self._keys = (
-            np.stack([m.keys for m in self.movers], 1) if self.movers else np.zeros((len(self._key_times), 0, 4))
-        )
-        self._gaits = np.array([m.gait_rad_per_s for m in self.movers], np.float64)
-        self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.movers))
+        rows = furnish(config, self.plan) + [m.row for m in self.objects]
+        no_keys = np.zeros((len(self._key_times), 0, 4))
+        self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
+        self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
+        self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
         self._handle = CityHandle(
             rec.to_array(rows), self.plan, _road_numbers(config, self.plan), light, _seed31(config, "city surfaces")
         )
@@ -107,17 +106,12 @@ class CityWorld:
         """
         recipe = source.recipe
         if recipe is None or "city" not in recipe:
-            raise InputError(
-                "the scene was not generated, so there is no exact truth", where="source.recipe", got=source.dataset
-            )
+            raise InputError("the scene was not generated, so there is no exact truth", where="source.recipe",
+                got=source.dataset)  # fmt: skip
         if recipe.get("generator_version") != GENERATOR_VERSION:
-            raise InputError(
-                "the scene was made by another version of the generator",
-                where="source.recipe.generator_version",
-                expected=str(GENERATOR_VERSION),
-                got=str(recipe.get("generator_version")),
-                remedy="generate it again",
-            )
+            raise InputError("the scene was made by another version of the generator",
+                where="source.recipe.generator_version", expected=str(GENERATOR_VERSION),
+                got=str(recipe.get("generator_version")), remedy="generate it again")  # fmt: skip
         return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
 
     def source(self) -> Source:
@@ -133,10 +127,10 @@ class CityWorld:
         lanes = f"{len(plan.forward_lanes)}+{len(plan.backward_lanes)} lanes"
         quarter = "urban" if plan.urban else "suburban"
         crossing = "a crossing" if plan.crossing is not None else "no crossing"
-        moving = sum(m.moving for m in self.movers)
+        moving = sum(m.moving for m in self.objects)
         return (
             f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving and "
-            f"{len(self.movers) - moving} standing objects, {self.shape_count} shapes"
+            f"{len(self.objects) - moving} standing objects, {self.shape_count} shapes"
         )
 
     @property
@@ -166,12 +160,11 @@ class CityWorld:
         """Boxes of all vehicles and people, parked ones with a constant pose. The number in the id is the instance id.
         Truth between keys is exactly ``Track.pose_at``."""
         tracks = []
-        for index, mover in enumerate(self.movers):
-            label = rec.LABELS[int(mover.row[0])]
-            poses = np.stack(
-                [geometry.yaw_matrix(float(k[3]), (k[0], k[1], k[2] + mover.size[2] / 2)) for k in mover.keys]
-            )
-            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(mover.size), self._key_times, poses))
+        for index, posed in enumerate(self.objects):
+            label = rec.LABELS[int(posed.row[0])]
+            half = posed.size[2] / 2
+            poses = np.stack([geometry.yaw_matrix(float(yaw), (x, y, z + half)) for x, y, z, yaw in posed.keys])
+            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(posed.size), self._key_times, poses))
         return tuple(tracks)
 
     def instance_of(self, track_id: str) -> int:
@@ -191,11 +184,8 @@ class CityWorld:
     def _world_from_ego(self, time_s: float) -> NDArray[np.float64]:
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
-            raise UsageError(
-                "time lies outside the log",
-                expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s",
-                got=f"{time_s} s",
-            )
+            raise UsageError("time lies outside the log",
+                expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s", got=f"{time_s} s")  # fmt: skip
         return pose
 
     def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -203,11 +193,8 @@ class CityWorld:
         times, keys = self._key_times, self._keys
         first, last = self.span_s
         if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
-            raise UsageError(
-                "time lies outside the log",
-                expected=f"{first:.3f}..{last:.3f} s",
-                got=f"{times_s.min()}..{times_s.max()} s",
-            )
+            raise UsageError("time lies outside the log", expected=f"{first:.3f}..{last:.3f} s",
+                got=f"{times_s.min()}..{times_s.max()} s")  # fmt: skip
         at = np.clip((times_s - first) * self.config.rate_hz, 0, len(times) - 1)
         nearest = np.rint(at)
         at = np.where(np.abs(at - nearest) < 1e-6 * self.config.rate_hz, nearest, at)
@@ -326,17 +313,9 @@ def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
     cross = [0.0] * 10
     if crossing is not None:
         cross = [
-            1.0,
-            crossing.s,
-            crossing.x,
-            crossing.y,
-            crossing.yaw,
-            crossing.half_width,
-            crossing.corner,
-            crossing.start,
-            crossing.end,
-            crossing.sidewalk,
-        ]
+            1.0, crossing.s, crossing.x, crossing.y, crossing.yaw, crossing.half_width, crossing.corner, crossing.start,
+            crossing.end, crossing.sidewalk,
+        ]  # fmt: skip
     grey = rng.uniform(0.045, 0.11)
     warm = rng.uniform(-0.06, 0.06)
     asphalt = grey * np.array([1 + warm, 1.0, 1 - warm])

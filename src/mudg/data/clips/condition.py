@@ -13,7 +13,7 @@
 Steps 2 to 6 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
 only, zero where nothing is known, the reference image in frame 0 being put in by the model.
 
-The generated cities as training data are in `city_clips`.
+Training clips are made of these in `from_city.py` and `from_log.py`.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
 from mudg.base import palette
 from mudg.base.errors import InputError
-from mudg.base.types import Condition, FusedCloud, Track, View
+from mudg.base.types import Condition, FusedCloud, Photo, Track, View
+from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 
 
@@ -49,7 +49,7 @@ class ConditionRules:
     point_px: float = 1.0
     """Side of the square a point covers, in pixels."""
     same_time_s: float = 0.06
-    """Recorded images nearer in time than this may also colour moving things."""
+    """Recorded images nearer in time than this may also colour dynamic objects."""
     images_per_view: int = 4
     """How many recorded images are tried per view, nearest in time (then in place) first."""
     hidden_share: float = 0.08
@@ -71,16 +71,7 @@ class ConditionRules:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
-    """A recorded image: `rgb` u8[H,W,3] of `view`, any size; `semantics` u8[H,W] train ids (255 = unknown) or None."""
-
-    view: View
-    rgb: NDArray[np.uint8]
-    semantics: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sparse:
+class ProjectedPoints:
     """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects),
     semantics u8[H,W] (255 = unknown)."""
 
@@ -91,12 +82,12 @@ class Sparse:
     semantics: Tensor
 
 
-Beyond = Callable[[View], Sparse]
+Beyond = Callable[[View], ProjectedPoints]
 """What is known of a view from elsewhere than its points; `valid` where anything is."""
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class DrawnCloud:
     """A fused cloud ready to be drawn, and what is known `beyond` it."""
 
     cloud: FusedCloud
@@ -104,18 +95,18 @@ class Points:
     rules: ConditionRules
     beyond: Beyond | None
 
-    def at(self, view: View) -> Sparse:
+    def project(self, view: View) -> ProjectedPoints:
         """The points seen at a view, and what is known beyond them."""
         sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
         return sparse if self.beyond is None else fill_beyond(sparse, self.beyond(view), self.rules.measured_reach_px)
 
 
-def fill_beyond(measured: Sparse, other: Sparse, reach_px: int) -> Sparse:
+def fill_beyond(measured: ProjectedPoints, other: ProjectedPoints, reach_px: int) -> ProjectedPoints:
     """`measured`, and `other` where it is valid and nothing was measured within `reach_px` (steps to the four sides)."""
     near = torch.from_numpy(ndimage.binary_dilation(measured.valid.numpy(), iterations=max(reach_px, 1)))
     taken = other.valid & ~near
     pick = lambda mine, theirs: torch.where(taken, theirs, mine)  # noqa: E731
-    return Sparse(
+    return ProjectedPoints(
         pick(measured.rgb, other.rgb), pick(measured.depth, other.depth), measured.valid | taken, pick(measured.moving, other.moving),
         pick(measured.semantics, other.semantics),
     )  # fmt: skip
@@ -155,13 +146,6 @@ def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
     return rows, columns
 
 
-def resize_image(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Area-averaged resize of u8[H,W,3] (the same array if the size is right already)."""
-    if rgb.shape[:2] == (height, width):
-        return rgb
-    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BOX))
-
-
 def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
     """Where the pixels of `view`, at `depth` f32[K,H,W] metres, lie in another view.
 
@@ -197,7 +181,7 @@ def inside(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
 
 
 def warp(
-    view: View, depth: Tensor, source: Source, surface: Tensor, hidden_share: float
+    view: View, depth: Tensor, source: WarpSource, surface: Tensor, hidden_share: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours and classes that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
 
@@ -211,7 +195,7 @@ def warp(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class WarpSource:
     """A recorded image made ready for warping: rgb f32[3,h,w] in [0,1], depth f32[h,w] m (filled), moving bool[h,w],
     semantics u8[h,w] (255 = unknown)."""
 
@@ -226,16 +210,16 @@ def build_condition(
     cloud: FusedCloud,
     tracks: Sequence[Track],
     views: Sequence[View],
-    recorded: Sequence[Recorded],
+    recorded: Sequence[Photo],
     rules: ConditionRules,
-    sources: dict[int, Source] | None = None,
+    sources: dict[int, WarpSource] | None = None,
     beyond: Beyond | None = None,
 ) -> Condition:
     """The model's condition for `views` (any path, any size; resized to the rules' size).
 
     cloud      fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time
     recorded   images of any cameras; the ones nearest in time to a view are warped into it; may be empty
-    sources    cache of prepared images (index into `recorded` -> Source); pass the same dict again for further views
+    sources    cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views
     beyond     what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
                within `rules.measured_reach_px` as if it were points (not with `published`)
     Returns colour and depth filled everywhere (zeros with `published`), `valid` where a point was seen and kept,
@@ -250,9 +234,9 @@ def build_conditions(
     cloud: FusedCloud,
     tracks: Sequence[Track],
     views: Sequence[View],
-    recorded: Sequence[Recorded],
+    recorded: Sequence[Photo],
     rules: ConditionRules,
-    sources: dict[int, Source] | None = None,
+    sources: dict[int, WarpSource] | None = None,
     beyond: Beyond | None = None,
 ) -> tuple[Condition, Condition]:
     """As `build_condition`, and the same condition on the fine grid (the same object if there is no finer one)."""
@@ -266,9 +250,9 @@ def build_conditions(
     sources = {} if sources is None else sources
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
-    points = Points(cloud, tracks, rules, beyond)
-    looks = [_look(points, view, recorded, rules, sources) for view in fine_views]
-    color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*looks))
+    points = DrawnCloud(cloud, tracks, rules, beyond)
+    parts = [_condition_of_view(points, view, recorded, rules, sources) for view in fine_views]
+    color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*parts))
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
                      warped, backdrop, ids, far_ids)  # fmt: skip
     if size == (rules.width, rules.height):
@@ -277,7 +261,7 @@ def build_conditions(
     def reduced(x: Tensor) -> Tensor:
         return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
 
-    own = [points.at(view) for view in small]
+    own = [points.project(view) for view in small]
     own_depth = torch.stack([_filled(sparse, rules)[1] for sparse in own])[:, None]
     own_valid = torch.stack([sparse.valid for sparse in own])[:, None]
     small_size = (rules.height, rules.width)
@@ -287,26 +271,26 @@ def build_conditions(
     return condition, fine
 
 
-def _look(
-    points: Points,
+def _condition_of_view(
+    points: DrawnCloud,
     view: View,
-    recorded: Sequence[Recorded],
+    recorded: Sequence[Photo],
     rules: ConditionRules,
-    sources: dict[int, Source],
+    sources: dict[int, WarpSource],
 ) -> tuple[Tensor, ...]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
     the backdrop u8[1,H,W] of one view, at its size."""
 
-    def source(number: int) -> Source:
+    def source(number: int) -> WarpSource:
         if number not in sources:
             sources[number] = _prepare_source(points, recorded[number], view, rules)
         return sources[number]
 
-    sparse = points.at(view)
-    colour, depth, moving, ids = _filled(sparse, rules)
+    sparse = points.project(view)
+    color, depth, moving, ids = _filled(sparse, rules)
     found = torch.zeros_like(sparse.valid)
     if not (rules.warp and recorded):
-        return colour, depth[None], sparse.valid[None], found[None], colour, ids[None], ids[None]
+        return color, depth[None], sparse.valid[None], found[None], color, ids[None], ids[None]
     order = _order_of_images(view, recorded, rules)
     nearest = source(order[0])
     x, y, _ = carry(view, torch.full((1, *depth.shape), rules.backdrop_m), nearest.view)
@@ -317,13 +301,13 @@ def _look(
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
         rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
         new = new & ~found if fresh else new & ~found & ~moving
-        colour = torch.where(new, rgb, colour)
+        color = torch.where(new, rgb, color)
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
         found = found | new
-    return colour, depth[None], sparse.valid[None], found[None], backdrop, ids[None], far_ids
+    return color, depth[None], sparse.valid[None], found[None], backdrop, ids[None], far_ids
 
 
-def _filled(sparse: Sparse, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest valid pixel, for every pixel."""
     if not bool(sparse.valid.any()):
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
@@ -350,7 +334,7 @@ def _published_condition(
     return Condition(tuple(views), color, depth, valid, reference)
 
 
-def _reference(view: View, recorded: Sequence[Recorded], rules: ConditionRules) -> Tensor:
+def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> Tensor:
     own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
     if not own:
         return torch.zeros(3, rules.height, rules.width)
@@ -358,14 +342,14 @@ def _reference(view: View, recorded: Sequence[Recorded], rules: ConditionRules) 
     if rules.published and rules.fine_width:
         size = (rules.height, rules.width)
         return functional.interpolate(_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
-    return _tensor(resize_image(nearest.rgb, rules.width, rules.height))
+    return _tensor(resize_area(nearest.rgb, rules.width, rules.height))
 
 
 def _tensor(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
 
 
-def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionRules) -> list[int]:
+def _order_of_images(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
     """The images to try for a view: nearest in time first (steps of 20 ms), the same camera before others, then by distance."""
 
     def rank(number: int) -> tuple[float, bool, float]:
@@ -380,19 +364,19 @@ def _order_of_images(view: View, recorded: Sequence[Recorded], rules: ConditionR
     return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
 
 
-def _prepare_source(points: Points, recorded: Recorded, target: View, rules: ConditionRules) -> Source:
+def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: ConditionRules) -> WarpSource:
     """A recorded image brought to about as many pixels as the target view, with its depth."""
     camera = recorded.view.camera
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
-    _, depth, moving, _ = _filled(points.at(view), rules)
-    return Source(
-        view, _tensor(resize_image(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
+    _, depth, moving, _ = _filled(points.project(view), rules)
+    return WarpSource(
+        view, _tensor(resize_area(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
     )
 
 
-def _ids_at(recorded: Recorded, width: int, height: int) -> Tensor:
+def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
     """The image's classes u8[height,width], each from the pixel in its middle; 255 without labels."""
     if recorded.semantics is None:
         return torch.full((height, width), palette.UNLABELLED, dtype=torch.uint8)
@@ -400,8 +384,8 @@ def _ids_at(recorded: Recorded, width: int, height: int) -> Tensor:
     return functional.interpolate(own[None, None], size=(height, width), mode="nearest-exact")[0, 0]
 
 
-def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules: ConditionRules) -> Sparse:
-    """Project a fused cloud into a view of the condition's resolution (see `Sparse`)."""
+def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules: ConditionRules) -> ProjectedPoints:
+    """Project a fused cloud into a view of the condition's resolution (see `ProjectedPoints`)."""
     poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
     config = ProjectConfig(
         static_splat_px=rules.point_px,
@@ -419,4 +403,6 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
     unknown = np.uint8(palette.UNLABELLED)
     ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
     table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
-    return Sparse(seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()])
+    return ProjectedPoints(
+        seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()]
+    )

@@ -11,9 +11,8 @@ of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of th
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +21,11 @@ import torch
 from mudg import native
 from mudg.base import geometry, seeds
 from mudg.base.log import progress
-from mudg.base.types import Clip, Condition, FusedCloud, View
-from mudg.core.fusion import FusionRules, Shot, SweepShots, fuse_sweeps
+from mudg.base.types import Clip, Condition, FusedCloud, Photo, View
+from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
-from mudg.data.clips.condition import ConditionRules, Recorded, Source, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
 from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 
 HELD_OUT = 1_000_000
@@ -34,7 +33,7 @@ HELD_OUT = 1_000_000
 rig, all cameras, and shifts of exactly 2, 3 and 4 m, whatever the seed."""
 
 DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
-"""Cities to look at while choosing; also what `learn` watches."""
+"""Cities for choosing between variants; also what `learn` watches."""
 REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 """Cities whose scores are reported and on which nothing is chosen."""
 
@@ -74,7 +73,7 @@ class CityLog:
 
     world: CityWorld
     cloud: FusedCloud
-    recorded: tuple[Recorded, ...]
+    recorded: tuple[Photo, ...]
 
 
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
@@ -116,7 +115,7 @@ def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
 
 def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     """Generate, record and fuse one city; `frames` long."""
-    config = dataclasses.replace(city_config(rules, city), n_frames=frames)
+    config = replace(city_config(rules, city), n_frames=frames)
     rng = seeds.numpy_rng(rules.seed, city, "log")
     world = CityWorld(config)
     truths: dict[str, list[CityTruth]] = {
@@ -134,21 +133,21 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
         sweep = world.lidar_sweep(index)
         error = geometry.yaw_matrix(float(rng.normal(0, jitter_rad)), rng.normal(0, jitter_m, 3))
         shots = [
-            Shot(world.frame_views(n)[index], truths[n][index].rgb_u8, truths[n][index].semantics)
+            Photo(world.frame_views(n)[index], truths[n][index].rgb_u8, truths[n][index].semantics)
             for n in config.cameras
         ]
         sweeps.append(SweepShots(sweep.time_s, sweep.world_from_lidar @ error, sweep.points, shots))
     cloud, _ = fuse_sweeps(sweeps, world.tracks(), FusionRules(min_object_points=40))
     recorded = tuple(
-        Recorded(view, truth.rgb_u8, truth.semantics)
+        Photo(view, truth.rgb_u8, truth.semantics)
         for name in config.cameras
         for view, truth in zip(world.frame_views(name), truths[name])
     )
     return CityLog(world, cloud, recorded)
 
 
-def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> tuple[list[Clip], tuple[float, ...]]:
-    """All clips of one city and their shifts in metres; `log` is the city's own from `make_log`, made here if not given."""
+def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> list[Clip]:
+    """All clips of one city; `log` is the city's own from `make_log`, made here if not given."""
     log = log or make_log(rules, city, rules.frames)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
     size = (rules.width, rules.height)
@@ -157,20 +156,19 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> t
     conditions = ConditionRules(*size, *fine, published=rules.published)
     tracks = log.world.tracks()
     clips = []
-    shifts = shifts_of(rules, city)
-    sources: dict[int, Source] = {}
+    sources: dict[int, WarpSource] = {}
     known = _without_every_fourth(log.recorded, rng) if city < HELD_OUT and rng.random() < 0.5 else log.recorded
-    for shift_m in shifts:
+    for shift_m in shifts_of(rules, city):
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
         given, cache = (_thinned(log.recorded, rng), {}) if shift_m == 0.0 else (known, sources)
         given = log.recorded if rules.published else given  # for the reference only
         condition = build_condition(log.cloud, tracks, views, given, conditions, cache)
         truths = [log.world.render(view.resized(*size)) for view in views]
-        clips.append(clip_from_truth(condition, truths))
-    return clips, shifts
+        clips.append(replace(clip_from_truth(condition, truths), shift_m=shift_m))
+    return clips
 
 
-def _without_every_fourth(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
+def _without_every_fourth(recorded: Sequence[Photo], rng: np.random.Generator) -> tuple[Photo, ...]:
     """As in a log whose every fourth moment is held out."""
     times = sorted({r.view.time_s for r in recorded})
     held_out = set(times[int(rng.integers(4)) :: 4])
@@ -186,7 +184,7 @@ def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
     return View(view.camera, moved, view.time_s)
 
 
-def _thinned(recorded: Sequence[Recorded], rng: np.random.Generator) -> tuple[Recorded, ...]:
+def _thinned(recorded: Sequence[Photo], rng: np.random.Generator) -> tuple[Photo, ...]:
     """Every second to fourth moment's images only."""
     gap = int(rng.integers(2, 5))
     times = sorted({r.view.time_s for r in recorded})
@@ -214,11 +212,11 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     torch.set_num_threads(1)
     native.set_threads(1)
     log = make_log(rules, city, rules.frames)
-    clips, shifts = make_clips(rules, city, log)
-    points = None
+    clips = make_clips(rules, city, log)
     if city >= HELD_OUT or rules.point_colors:
         plain = ConditionRules(rules.width, rules.height, warp=False)
         tracks = log.world.tracks()
         points = [build_condition(log.cloud, tracks, c.condition.views, (), plain).color for c in clips]
-    write_shard(folder, city, pack_clips(clips, shifts, points))
+        clips = [replace(clip, point_color=color) for clip, color in zip(clips, points)]
+    write_shard(folder, city, pack_clips(clips))
     return len(clips)

@@ -1,6 +1,6 @@
 """Training clips from recorded logs: a scene, its fused cloud, and whatever labels it has.
 
-A clip is a window of consecutive frames of one camera, looked at from where they were recorded:
+A clip is a window of consecutive frames of one camera, seen from where they were recorded:
 
 * **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured (and the depth labels of
   the scene, where there are such); classes where labels exist and are trusted;
@@ -27,17 +27,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import geometry, palette, seeds, store
+from mudg.base.config import differences
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Clip, Condition, Frame, FusedCloud, PointCloud, Scene, Sweep, View
+from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointCloud, Scene, Sweep, View
+from mudg.core.pictures import resize_area
 from mudg.core.project import project_points
 from mudg.data.clips.condition import (
     ConditionRules,
-    Recorded,
-    Source,
+    WarpSource,
     build_condition,
     nearest_valid,
     remove_shine_through,
-    resize_image,
 )
 from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
@@ -59,7 +59,7 @@ class LogClipRules:
     frame_step: int = 1
     """Take every n-th frame only."""
     cameras: tuple[str, ...] = ()
-    """Cameras to look through (empty = all of the scene)."""
+    """Cameras to take clips from (empty = all of the scene)."""
     held_out_every: int = 5
     """Every n-th window is for scoring (0 = none)."""
     farthest: int = 4
@@ -130,10 +130,10 @@ def log_windows(scene: Scene, rules: LogClipRules) -> list[LogWindow]:
             found.append(LogWindow(camera, tuple(f.id for f in chosen), kept))
     if not found:
         raise InputError("a log is too short for a training clip", where=scene.root, expected=f"{reach} frames of a camera",
-                         remedy="give a shorter --window, or ingest with --test-every 0")  # fmt: skip
+                         remedy="give a shorter --data.window, or ingest with --test-every 0")  # fmt: skip
     time_of = {frame.id: frame.view.time_s for frame in scene.frames}
-    shown = {time_of[name] for window in found if window.held_out for name in window.frames}
-    return [w for w in found if w.held_out or not shown & {time_of[name] for name in w.frames}]
+    scored = {time_of[name] for window in found if window.held_out for name in window.frames}
+    return [w for w in found if w.held_out or not scored & {time_of[name] for name in w.frames}]
 
 
 class OpenLog:
@@ -146,22 +146,22 @@ class OpenLog:
         times = np.array([f.view.time_s for f in self._frames])
         apart = np.diff(times) > ConditionRules(1, 1).same_time_s
         self.moment: list[int] = np.concatenate([[0], np.cumsum(apart)]).tolist()
-        self._read: dict[int, Recorded] = {}
+        self._read: dict[int, Photo] = {}
 
     def frame(self, frame_id: str) -> Frame:
         """The frame with this id."""
         return self._frames[self.place[frame_id]]
 
-    def images(self, first: int, last: int) -> dict[int, Recorded]:
+    def images(self, first: int, last: int) -> dict[int, Photo]:
         """The recorded images of the moments `first` to `last`, by place in time; others are forgotten."""
         wanted = [n for n, moment in enumerate(self.moment) if first <= moment <= last]
         self._read = {n: self._read[n] if n in self._read else self._recorded(n) for n in wanted}
         return self._read
 
-    def _recorded(self, number: int) -> Recorded:
+    def _recorded(self, number: int) -> Photo:
         frame = self._frames[number]
         classes = read_trusted_classes(self.scene, frame, self.rules.label_confidence)
-        return Recorded(frame.view, read_image(self.scene, frame), classes)
+        return Photo(frame.view, read_image(self.scene, frame), classes)
 
 
 def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
@@ -169,14 +169,26 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
     rules = log.rules
     rng = seeds.numpy_rng(rules.seed, number, "log clip")
     gap = min(2, rules.farthest) if window.held_out else int(rng.integers(1, rules.farthest + 1))
-    cloud = log.cloud if window.held_out else thinned(log.cloud, rng.uniform(rules.least_points, 1.0), rng)
-    conditions = ConditionRules(rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
+    cloud = log.cloud if window.held_out else thinned_cloud(log.cloud, rng.uniform(rules.least_points, 1.0), rng)
     places = [log.place[name] for name in window.frames]
-    if rules.published:
-        return _published_clip(log, window, cloud, places)
+    build = _published_condition if rules.published else _condition
+    condition, images = build(log, cloud, places, gap)
+    truths = [
+        _truth(log.scene, log.frame(name), images[place], view)
+        for name, place, view in zip(window.frames, places, condition.views)
+    ]
+    rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
+    depth = torch.where(known, depth, _nearest_depth(condition.depth))  # a plausible filling: the noisy input shows it
+    return Clip(condition, rgb, depth, known, ids)
+
+
+def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int) -> tuple[Condition, dict[int, Photo]]:
+    """The condition of some frames from images at least `gap` moments away, and all images read, by place in time."""
+    rules = log.rules
+    conditions = ConditionRules(rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
     margin = gap + conditions.images_per_view  # at a log's end all images come from one side
     images = log.images(log.moment[places[0]] - margin, log.moment[places[-1]] + margin)
-    sources: dict[int, Source] = {}
+    sources: dict[int, WarpSource] = {}
     parts = []
     for place in places:
         far = [n for n in images if abs(log.moment[n] - log.moment[place]) >= gap]
@@ -184,34 +196,23 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
         view = images[place].view
         parts.append(build_condition(cloud, log.scene.tracks, [view], [images[n] for n in far], conditions, given))
         sources |= {far[index]: source for index, source in given.items()}
-    condition = _in_one(parts)
-    truths = [
-        _truth(log.scene, log.frame(name), images[place], view)
-        for name, place, view in zip(window.frames, places, condition.views)
-    ]
-    rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
-    depth = torch.where(known, depth, condition.depth)  # a plausible filling: the noisy input shows it
-    return Clip(condition, rgb, depth, known, ids)
+    return _stacked(parts), images
 
 
-def _published_clip(log: OpenLog, window: LogWindow, cloud: FusedCloud, places: Sequence[int]) -> Clip:
-    """A clip with the condition that the published model is given; no image but the reference has a part in it."""
+def _published_condition(
+    log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int
+) -> tuple[Condition, dict[int, Photo]]:
+    """What the published model is given; no image but the reference, the first frame's own, has a part in it."""
+    del gap
     rules = log.rules
     images = log.images(log.moment[places[0]], log.moment[places[-1]])
     views = [images[place].view for place in places]
     camera = views[0].camera
     conditions = ConditionRules(rules.width, rules.height, camera.width, camera.height, published=True)
-    condition = build_condition(cloud, log.scene.tracks, views, [images[places[0]]], conditions)
-    truths = [
-        _truth(log.scene, log.frame(name), images[place], view)
-        for name, place, view in zip(window.frames, places, condition.views)
-    ]
-    rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
-    depth = torch.where(known, depth, _nearest_depth(condition.depth, conditions.far_m))
-    return Clip(condition, rgb, depth, known, ids)
+    return build_condition(cloud, log.scene.tracks, views, [images[places[0]]], conditions), images
 
 
-def _nearest_depth(depth: Tensor, far_m: float) -> Tensor:
+def _nearest_depth(depth: Tensor, far_m: float = ConditionRules(1, 1).far_m) -> Tensor:
     """Depth f32[T,1,H,W] with its zeros replaced by the nearest pixel's that has some; `far_m` in a frame without any."""
     filled = []
     for image in depth[:, 0].numpy():
@@ -220,7 +221,7 @@ def _nearest_depth(depth: Tensor, far_m: float) -> Tensor:
     return torch.stack(filled)[:, None]
 
 
-def thinned(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:
+def thinned_cloud(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:
     """A random `share` of the points of every cloud."""
 
     def part(points: PointCloud) -> PointCloud:
@@ -231,7 +232,7 @@ def thinned(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedC
     return FusedCloud(part(cloud.static), {name: part(points) for name, points in cloud.objects.items()})
 
 
-def _in_one(parts: Sequence[Condition]) -> Condition:
+def _stacked(parts: Sequence[Condition]) -> Condition:
     """Conditions of one view each as one of all views; the reference is that of the first."""
 
     def stack(name: str) -> Tensor | None:
@@ -244,10 +245,10 @@ def _in_one(parts: Sequence[Condition]) -> Condition:
     return Condition(views, color, depth, valid, parts[0].reference, **optional)
 
 
-def _truth(scene: Scene, frame: Frame, recorded: Recorded, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _truth(scene: Scene, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """rgb f32[3,H,W], depth f32[1,H,W] metres, where it is known bool[1,H,W], classes i64[H,W], all at the size of `view`."""
     width, height = view.camera.width, view.camera.height
-    rgb = torch.from_numpy(resize_image(recorded.rgb, width, height).copy()).permute(2, 0, 1).float() / 255
+    rgb = torch.from_numpy(resize_area(recorded.rgb, width, height).copy()).permute(2, 0, 1).float() / 255
     rows = ((np.arange(height) + 0.5) * recorded.rgb.shape[0] / height).astype(int)[:, None]
     columns = ((np.arange(width) + 0.5) * recorded.rgb.shape[1] / width).astype(int)[None]
     ids = np.full((height, width), palette.UNLABELLED, np.uint8)
@@ -285,18 +286,10 @@ def _measured(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np
 # files ----------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class LogClips:
-    """Clips of logs on disk: training shards are numbered from 0, those for scoring from `first_held_out`; one clip each."""
-
-    train: int
-    held_out: int
-
-
-def plan(
+def plan_shards(
     sources: Sequence[LogSource], rules: LogClipRules, first_held_out: int
-) -> tuple[list[tuple[int, LogSource, LogWindow]], LogClips]:
-    """What shards there will be: (number, log, window) each, and how many of both kinds.
+) -> list[tuple[int, LogSource, LogWindow]]:
+    """What shards there will be, one clip each: (number, log, window); numbers from 0 to train on, from `first_held_out` to score.
 
     Raises:
         InputError: a log is too short, or holding out leaves nothing to train on.
@@ -305,16 +298,15 @@ def plan(
     counts = {False: 0, True: 0}
     for source in sources:
         for window in log_windows(read_scene(source.scene), rules):
-            number = counts[window.held_out] + (first_held_out if window.held_out else 0)
+            rows.append((counts[window.held_out] + (first_held_out if window.held_out else 0), source, window))
             counts[window.held_out] += 1
-            rows.append((number, source, window))
     if not counts[False] or (rules.held_out_every and not counts[True]):
         raise InputError(
             "the logs are too short to hold out windows", where=", ".join(str(s.scene) for s in sources),
             got=f"{counts[False]} windows to train on, {counts[True]} to score",
-            remedy="give a smaller --stride or --window, or --held-out-every 0 (scores are then of clips trained on)",
+            remedy="smaller --data.stride or --data.window, or --data.held-out-every 0 (scores are then of clips trained on)",
         )  # fmt: skip
-    return rows, LogClips(counts[False], counts[True])
+    return rows
 
 
 def write_log(source: LogSource, rules: LogClipRules, windows: Sequence[tuple[int, LogWindow]], folder: Path) -> int:
@@ -324,11 +316,11 @@ def write_log(source: LogSource, rules: LogClipRules, windows: Sequence[tuple[in
         log = OpenLog(source, rules)
         for number, window in missing:
             clip = make_clip(log, window, number)
-            write_shard(folder, number, pack_clips([clip], [0.0], gaps=True))
+            write_shard(folder, number, pack_clips([clip], gaps=True))
     return len(missing)
 
 
-def claim(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]) -> None:
+def claim_folder(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]) -> None:
     """Write down what the shards of a folder are made of; UsageError if they are made of something else."""
     inputs = [[store.digest(s.scene), store.digest(s.fused)] for s in sources]
     stated = {name: value for name, value in asdict(rules).items() if name != "published" or value}
@@ -338,8 +330,8 @@ def claim(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]) -> No
         found = store.read_json(path)
         if found != wanted:
             raise UsageError("the folder holds training clips of other logs or settings", where=str(folder),
-                             got="; ".join(store.differences(found, wanted)[:4]), remedy="give another --clips")  # fmt: skip
+                             got="; ".join(differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
         return
     if folder.is_dir() and any(folder.glob("*.safetensors")):
-        raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --clips")
+        raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --data.clips")
     store.write_json(path, wanted)

@@ -13,11 +13,9 @@ A shard is a safetensors file with, for K clips of T frames,
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,43 +25,10 @@ from torch import Tensor
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.types import Clip
+from mudg.base.types import Camera, Clip, Condition, View
 
 FAR_M = 1000.0
 FLAG_VALID, FLAG_WARPED, FLAG_DEPTH_UNKNOWN = 1, 2, 4
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Clips stacked for training.
-
-    rgb, color, backdrop f32[B,T,3,H,W] in [0,1]; depth, sparse_depth f32[B,T,1,H,W] metres; valid, warped bool[B,T,1,H,W];
-    semantics i64[B,T,H,W]; reference f32[B,3,H,W]; ids, backdrop_ids u8[B,T,1,H,W] (255 = unknown); world_from_cam
-    f64[B,T,4,4]; intrinsics f64[B,T,4]; shift_m: lateral shift of each clip; point_color f32[B,T,3,H,W] or None;
-    depth_known bool[B,T,1,H,W]: where `depth` is true (all of it in generated cities).
-    """
-
-    rgb: Tensor
-    depth: Tensor
-    semantics: Tensor
-    color: Tensor
-    sparse_depth: Tensor
-    valid: Tensor
-    warped: Tensor
-    backdrop: Tensor
-    reference: Tensor
-    ids: Tensor
-    backdrop_ids: Tensor
-    world_from_cam: Tensor
-    intrinsics: Tensor
-    shift_m: tuple[float, ...]
-    depth_known: Tensor
-    point_color: Tensor | None = None
-
-    def to(self, device: torch.device) -> Batch:
-        """The same batch on a device."""
-        moved = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return Batch(**{k: v.to(device) if isinstance(v, Tensor) else v for k, v in moved.items()})
 
 
 def shard_path(folder: Path, city: int) -> Path:
@@ -71,10 +36,8 @@ def shard_path(folder: Path, city: int) -> Path:
     return folder / f"city_{city:07d}.safetensors"
 
 
-def pack_clips(
-    clips: Sequence[Clip], shifts_m: Sequence[float], point_color: Sequence[Tensor] | None = None, *, gaps: bool = False
-) -> dict[str, NDArray[np.generic]]:
-    """Arrays of a shard from clips of one size; `point_color` f32[T,3,H,W] per clip is kept if given.
+def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArray[np.generic]]:
+    """Arrays of a shard from clips of one size.
 
     Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is, and
     marked as unknown. A condition's depth of 0 (nothing seen; points alone) stays 0.
@@ -104,8 +67,8 @@ def pack_clips(
         cameras = [view.camera for view in clip.condition.views]
         return np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], np.float64)
 
-    extra = {} if point_color is None else {"point_color": np.stack([u8(c) for c in point_color])}
-    return extra | {
+    points = [u8(c.point_color) for c in clips if c.point_color is not None]
+    return ({"point_color": np.stack(points)} if points else {}) | {
         "rgb": np.stack([u8(c.rgb) for c in clips]),
         "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
         "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
@@ -118,7 +81,7 @@ def pack_clips(
         "backdrop_ids": np.stack([ids(c, True) for c in clips]),
         "world_from_cam": np.stack([np.stack([v.world_from_cam for v in c.condition.views]) for c in clips]),
         "intrinsics": np.stack([lens(c) for c in clips]),
-        "shift_m": np.asarray(shifts_m, np.float32),
+        "shift_m": np.asarray([c.shift_m for c in clips], np.float32),
     }
 
 
@@ -150,89 +113,64 @@ _PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "ba
               "intrinsics")  # fmt: skip
 
 
-def read_batch(folder: Path, picks: Sequence[tuple[int, int, Sequence[int]]]) -> Batch:
-    """Read clips as a batch; `picks` holds (city, clip, frame indices), all with the same number of frames."""
-    columns: dict[str, list[NDArray[np.generic]]] = {}
-    shifts = []
-    for city, clip, frames in picks:
-        with _open(shard_path(folder, city)) as shard:
-            for name in _PER_FRAME:
-                columns.setdefault(name, []).append(shard.get_slice(name)[clip][np.asarray(frames)])
-            if "point_color" in shard.keys():
-                columns.setdefault("point_color", []).append(shard.get_slice("point_color")[clip][np.asarray(frames)])
-            columns.setdefault("reference", []).append(shard.get_slice("reference")[clip])
-            shifts.append(float(shard.get_tensor("shift_m")[clip]))
-    stacked = {name: torch.from_numpy(np.stack(parts)) for name, parts in columns.items()}
-    flags = stacked["flags"].unsqueeze(2)
-    return Batch(
-        rgb=stacked["rgb"].float() / 255,
-        depth=stacked["depth"].float().unsqueeze(2),
-        semantics=stacked["semantics"].long(),
-        color=stacked["color"].float() / 255,
-        sparse_depth=stacked["sparse_depth"].float().unsqueeze(2),
-        valid=(flags & FLAG_VALID) > 0,
-        warped=(flags & FLAG_WARPED) > 0,
-        backdrop=stacked["backdrop"].float() / 255,
-        reference=stacked["reference"].float() / 255,
-        ids=stacked["ids"].unsqueeze(2),
-        backdrop_ids=stacked["backdrop_ids"].unsqueeze(2),
-        world_from_cam=stacked["world_from_cam"],
-        intrinsics=stacked["intrinsics"],
-        shift_m=tuple(shifts),
-        depth_known=(flags & FLAG_DEPTH_UNKNOWN) == 0,
-        point_color=stacked["point_color"].float() / 255 if len(columns.get("point_color", ())) == len(picks) else None,
+def read_clip(folder: Path, city: int, clip: int, frames: Sequence[int]) -> Clip:
+    """Some frames of one clip of a shard, as a `Clip`. Shards hold no times: frame numbers stand for seconds."""
+    with _open(shard_path(folder, city)) as shard:
+        names = [*_PER_FRAME, *(("point_color",) if "point_color" in shard.keys() else ())]
+        found = {name: torch.from_numpy(shard.get_slice(name)[clip][np.asarray(frames)]) for name in names}
+        reference = torch.from_numpy(shard.get_slice("reference")[clip])
+        shift_m = float(shard.get_tensor("shift_m")[clip])
+    image = lambda x: x.float() / 255  # noqa: E731
+    flags, (height, width) = found["flags"].unsqueeze(1), found["rgb"].shape[-2:]
+    views = tuple(
+        View(Camera("clip", width, height, *lens.tolist()), pose.numpy(), float(frame))
+        for frame, lens, pose in zip(frames, found["intrinsics"], found["world_from_cam"])
     )
+    condition = Condition(
+        views, image(found["color"]), found["sparse_depth"].float().unsqueeze(1), (flags & FLAG_VALID) > 0, image(reference),
+        warped=(flags & FLAG_WARPED) > 0, backdrop=image(found["backdrop"]), semantics=found["ids"].unsqueeze(1),
+        backdrop_semantics=found["backdrop_ids"].unsqueeze(1),
+    )  # fmt: skip
+    return Clip(
+        condition, image(found["rgb"]), found["depth"].float().unsqueeze(1), (flags & FLAG_DEPTH_UNKNOWN) == 0,
+        found["semantics"].long(), shift_m, image(found["point_color"]) if "point_color" in found else None,
+    )  # fmt: skip
 
 
-def joined(batches: Sequence[Batch]) -> Batch:
-    """Several batches of the same size and number of frames as one."""
-    columns: dict[str, Any] = {}
-    for field in dataclasses.fields(Batch):
-        parts = [getattr(b, field.name) for b in batches]
-        if field.name == "shift_m":
-            columns[field.name] = tuple(s for part in parts for s in part)
-        else:
-            columns[field.name] = None if any(p is None for p in parts) else torch.cat(parts)
-    return Batch(**columns)
-
-
-def vary(batch: Batch, rng: np.random.Generator) -> Batch:
-    """Random mirror image, one random colour curve per clip for truth and condition alike, and worse or no given classes.
+def vary(clip: Clip, rng: np.random.Generator) -> Clip:
+    """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
     +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `_worse_ids`. A mirrored clip keeps its
     poses and intrinsics: they then describe the mirror image of the place.
+
+    Args:
+        clip: as read from a shard, with warped colours, backdrop and classes.
     """
-    columns: dict[str, list[Tensor]] = {
-        name: [] for name in ("rgb", "color", "backdrop", "reference", "ids", "backdrop_ids")
+    given = clip.condition
+    gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
+    gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
+    middle = float(clip.rgb.mean())
+    error = rng.uniform(0.97, 1.03)
+
+    def curve(x: Tensor, extra: float) -> Tensor:
+        x = x * torch.as_tensor(gain * extra, dtype=x.dtype).view(3, 1, 1)
+        x = x.clamp(1e-4, 1) ** gamma
+        grey = x.mean(-3, keepdim=True)
+        x = grey + saturation * (x - grey)
+        return (middle + contrast * (x - middle)).clamp(0, 1)
+
+    rgb = curve(clip.rgb, 1.0)
+    varied: dict[str, Tensor] = {
+        name: curve(getattr(given, name), error) for name in ("color", "backdrop", "reference")
     }
-    for index in range(len(batch.rgb)):
-        gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
-        gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
-        middle = float(batch.rgb[index].mean())
-        error = rng.uniform(0.97, 1.03)
-
-        def curve(x: Tensor, extra: float, gain=gain, gamma=gamma, contrast=contrast, saturation=saturation,
-                  middle=middle) -> Tensor:  # fmt: skip
-            x = x * torch.as_tensor(gain * extra, dtype=x.dtype).view(3, 1, 1)
-            x = x.clamp(1e-4, 1) ** gamma
-            grey = x.mean(-3, keepdim=True)
-            x = grey + saturation * (x - grey)
-            return (middle + contrast * (x - middle)).clamp(0, 1)
-
-        columns["rgb"].append(curve(batch.rgb[index], 1.0))
-        for name in ("color", "backdrop", "reference"):
-            columns[name].append(curve(getattr(batch, name)[index], error))
-        ids, far_ids = _worse_ids(batch.ids[index], batch.backdrop_ids[index], rng)
-        columns["ids"].append(ids)
-        columns["backdrop_ids"].append(far_ids)
-    turned = {name: torch.stack(parts) for name, parts in columns.items()}
-    for name in ("depth", "semantics", "sparse_depth", "valid", "warped", "depth_known"):
-        turned[name] = getattr(batch, name)
+    varied["semantics"], varied["backdrop_semantics"] = _worse_ids(given.semantics, given.backdrop_semantics, rng)
     if rng.random() >= 0.5:
-        return dataclasses.replace(batch, **turned)  # type: ignore[arg-type]
-    mirrored: dict[str, Any] = {name: x.flip(-1) for name, x in turned.items()}
-    return dataclasses.replace(batch, **mirrored, shift_m=tuple(-s for s in batch.shift_m))
+        return replace(clip, rgb=rgb, condition=replace(given, **varied))
+    varied |= {name: getattr(given, name) for name in ("depth", "valid", "warped")}
+    turned = replace(given, **{name: x.flip(-1) for name, x in varied.items()})
+    flipped = {name: getattr(clip, name).flip(-1) for name in ("depth", "depth_valid", "semantics")}
+    return replace(clip, condition=turned, rgb=rgb.flip(-1), **flipped, shift_m=-clip.shift_m)
 
 
 NO_IDS, WORSE_IDS = 0.35, 0.25

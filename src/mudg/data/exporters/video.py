@@ -1,9 +1,11 @@
-"""MP4 video (H.264, 4:2:0) through PyAV; panels side by side; depth and semantics in colours."""
+"""MP4 video (H.264, 4:2:0) through PyAV, and the panels of an observation side by side."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,14 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from mudg.base import palette, store
+from mudg.base import store
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.types import Observation
+from mudg.core.pictures import class_colors, depth_colors, to_bytes
 
-# Control points of a perceptually ordered map (near = warm and light, far = dark blue), interpolated linearly in RGB.
-_DEPTH_STOPS = np.array(
-    [[252, 253, 191], [254, 176, 120], [241, 96, 93], [183, 55, 121], [114, 31, 129], [45, 17, 96], [10, 8, 40]], np.float64
-)
 _H264_ENCODERS = ("libx264", "h264_videotoolbox", "libopenh264")
 _CODECS = ("libx264", "h264", "mpeg4")
 
@@ -44,6 +43,34 @@ def mp4_bytes(
     buffer = io.BytesIO()
     _encode(buffer, frames, fps, crf, preset)
     return buffer.getvalue()
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How a video is coded: pictures per second, the best and the worst quality (x264's CRF, lower is better), x264's preset."""
+
+    fps: float
+    first_crf: int
+    last_crf: int
+    preset: str
+
+
+def mp4_within(frames: Callable[[], Iterable[NDArray[np.uint8]]], encoding: Encoding, budget_bytes: int) -> bytes:
+    """A video of at most ``budget_bytes``, if the worst quality allows; ``frames`` is called once per attempt."""
+    crf = encoding.first_crf
+    while True:
+        content = mp4_bytes(frames(), encoding.fps, crf, encoding.preset)
+        if len(content) <= budget_bytes or crf >= encoding.last_crf:
+            return content
+        # Six steps of the quality halve the size, about.
+        crf = min(encoding.last_crf, crf + max(1, math.ceil(6 * math.log2(len(content) / budget_bytes))))
+
+
+def jpeg_bytes(picture: NDArray[np.uint8], quality: int) -> bytes:
+    """A picture u8[H, W, 3] as a JPEG file."""
+    target = io.BytesIO()
+    Image.fromarray(picture).save(target, "JPEG", quality=quality)
+    return target.getvalue()
 
 
 def read_mp4(path: Path) -> NDArray[np.uint8]:
@@ -109,30 +136,13 @@ def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 # ---- pictures ------------------------------------------------------------------------------------------------------
 
 
-def depth_colors(depth_m: NDArray[np.floating], near_m: float = 2.0, far_m: float = 100.0) -> NDArray[np.uint8]:
-    """Depth f[H, W] in metres to colours u8[H, W, 3], logarithmic from near (light) to far (dark); no depth is black."""
-    known = np.isfinite(depth_m) & (depth_m > 0)
-    safe = np.where(known, depth_m, far_m).clip(near_m, far_m)
-    along = np.log(safe / near_m) / np.log(far_m / near_m) * (len(_DEPTH_STOPS) - 1)
-    index = np.minimum(along.astype(int), len(_DEPTH_STOPS) - 2)
-    part = (along - index)[..., None]
-    colors = _DEPTH_STOPS[index] * (1 - part) + _DEPTH_STOPS[index + 1] * part
-    colors[~known] = 0
-    return colors.round().astype(np.uint8)
-
-
-def semantic_colors(train_ids: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """Train ids [H, W] to the colours people know from Cityscapes; unlabelled is black."""
-    return palette.encode(train_ids, palette.DISPLAY_COLORS)
-
-
 def panels_of(observation: Observation) -> list[NDArray[np.uint8]]:
     """Colour, depth and semantics of an observation as pictures of one size (those that exist)."""
-    panels = [(observation.rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()]
+    panels = [to_bytes(observation.rgb)]
     if observation.depth is not None:
         panels.append(depth_colors(observation.depth[0].cpu().numpy()))
     if observation.semantics is not None:
-        panels.append(semantic_colors(observation.semantics.cpu().numpy()))
+        panels.append(class_colors(observation.semantics.cpu().numpy()))
     return panels
 
 

@@ -25,40 +25,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import InputError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
+from mudg.data.importers.columns import Columns, arrow_files, finite_columns, require_columns
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import (
+    LogFiles,
+    chosen_cameras,
+    folder_contents,
+    refuse_missing_cameras,
+    refuse_untwist,
+    the_only,
+)
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
-Columns = Mapping[str, NDArray[Any]]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
 RING_CAMERAS: Final = (
-    "ring_front_center",
-    "ring_front_left",
-    "ring_front_right",
-    "ring_side_left",
-    "ring_side_right",
-    "ring_rear_left",
-    "ring_rear_right",
-)
+    "ring_front_center", "ring_front_left", "ring_front_right", "ring_side_left", "ring_side_right",
+    "ring_rear_left", "ring_rear_right",
+)  # fmt: skip
 STEREO_CAMERAS: Final = ("stereo_front_left", "stereo_front_right")
 CAMERAS: Final[Mapping[str, str]] = {
-    "ring_front_center": "front",
-    "ring_front_left": "front_left",
-    "ring_front_right": "front_right",
-    "ring_side_left": "side_left",
-    "ring_side_right": "side_right",
-    "ring_rear_left": "rear_left",
-    "ring_rear_right": "rear_right",
-    "stereo_front_left": "stereo_left",
-    "stereo_front_right": "stereo_right",
-}
+    "ring_front_center": "front", "ring_front_left": "front_left", "ring_front_right": "front_right",
+    "ring_side_left": "side_left", "ring_side_right": "side_right", "ring_rear_left": "rear_left",
+    "ring_rear_right": "rear_right", "stereo_front_left": "stereo_left", "stereo_front_right": "stereo_right",
+}  # fmt: skip
 SENSOR: Final = "lidar"
 _UPPER: Final = "up_lidar"
 NANOSECONDS: Final = 10**9
@@ -67,39 +63,17 @@ _MAX_OFFSET_NS: Final = 500_000_000
 _POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 LABELS: Final[Mapping[str, str]] = {
-    "REGULAR_VEHICLE": "car",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "BICYCLE": "bicycle",
-    "BICYCLIST": "rider",
-    "MOTORCYCLE": "motorcycle",
-    "MOTORCYCLIST": "rider",
-    "WHEELED_RIDER": "rider",
-    "WHEELED_DEVICE": "wheeled_device",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "VEHICULAR_TRAILER": "trailer",
-    "RAILED_VEHICLE": "tram",
-    "STROLLER": "stroller",
-    "WHEELCHAIR": "wheelchair",
-    "DOG": "animal",
-    "ANIMAL": "animal",
-    "BOLLARD": "bollard",
-    "CONSTRUCTION_CONE": "traffic_cone",
-    "CONSTRUCTION_BARREL": "construction_barrel",
-    "STOP_SIGN": "traffic_sign",
-    "SIGN": "traffic_sign",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign",
-    "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
-    "MESSAGE_BOARD_TRAILER": "message_board_trailer",
-    "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
-}
-"""The data set's categories in the product's words."""
+    "REGULAR_VEHICLE": "car", "PEDESTRIAN": "pedestrian", "OFFICIAL_SIGNALER": "pedestrian", "BICYCLE": "bicycle",
+    "BICYCLIST": "rider", "MOTORCYCLE": "motorcycle", "MOTORCYCLIST": "rider", "WHEELED_RIDER": "rider",
+    "WHEELED_DEVICE": "wheeled_device", "BUS": "bus", "SCHOOL_BUS": "bus", "ARTICULATED_BUS": "bus",
+    "LARGE_VEHICLE": "truck", "BOX_TRUCK": "truck", "TRUCK": "truck", "TRUCK_CAB": "truck",
+    "VEHICULAR_TRAILER": "trailer", "RAILED_VEHICLE": "tram", "STROLLER": "stroller", "WHEELCHAIR": "wheelchair",
+    "DOG": "animal", "ANIMAL": "animal", "BOLLARD": "bollard", "CONSTRUCTION_CONE": "traffic_cone",
+    "CONSTRUCTION_BARREL": "construction_barrel", "STOP_SIGN": "traffic_sign", "SIGN": "traffic_sign",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign", "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
+    "MESSAGE_BOARD_TRAILER": "message_board_trailer", "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
+}  # fmt: skip
+"""The data set's categories -> labels."""
 
 
 def looks_like_argoverse2(source: Path) -> bool:
@@ -122,7 +96,7 @@ def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "Argoverse 2", str(source))
+    refuse_untwist(options, "Argoverse 2", str(source))
     return drive_log.write_log(read_log(_choose_log(source, options), options), out, options)
 
 
@@ -138,23 +112,11 @@ def _logs(source: Path) -> list[Path]:
 def _choose_log(source: Path, options: ImportOptions) -> Path:
     logs = _logs(source)
     if not logs:
-        raise InputError(
-            "no Argoverse 2 log found",
-            where=str(source),
+        raise InputError("no Argoverse 2 log found", where=str(source), got=folder_contents(source),
             expected="city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders",
-            got=", ".join(sorted(path.name for path in source.iterdir())[:10]) or "an empty folder",
-            remedy="give the folder of one log of the sensor data set",
-        )
+            remedy="give the folder of one log of the sensor data set")  # fmt: skip
     matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
-    if len(matching) != 1:
-        names = ", ".join(path.name for path in logs[:8]) + (f", ... ({len(logs)} in all)" if len(logs) > 8 else "")
-        raise UsageError(
-            "the folder holds several logs" if matching else "there is no such log",
-            where=str(source),
-            expected=f"--sequence with one of {names}",
-            got=options.sequence or "none chosen",
-        )
-    return matching[0]
+    return the_only(matching, [path.name for path in logs], options, source, "log")
 
 
 def files_of_argoverse2(source: Path, options: ImportOptions) -> LogFiles:
@@ -169,21 +131,10 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     image_folder, sweep_folder = folder / "sensors" / "cameras", folder / "sensors" / "lidar"
     there = {raw: name for raw, name in CAMERAS.items() if (image_folder / raw).is_dir()}
     if not there:
-        raise InputError(
-            "the log has no images",
-            where=str(image_folder),
+        raise InputError("the log has no images", where=str(image_folder),
             expected="folders ring_front_center, ring_front_left, ... with images named by nanoseconds",
-            remedy="download the sensor data set's camera archives, too; a scene is made of images",
-        )
-    absent = [name for name in RING_CAMERAS if name not in there]
-    if absent and not options.cameras and not options.skip_missing:
-        raise InputError(
-            "cameras are missing in the log",
-            where=str(image_folder),
-            got=f"no folder {', '.join(absent)}",
-            expected="seven ring cameras",
-            remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing",
-        )
+            remedy="download the sensor data set's camera archives, too; a scene is made of images")  # fmt: skip
+    refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
     chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, RING_CAMERAS)}
     files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
     scans = _files_by_time(sweep_folder, (".feather",)) if sweep_folder.is_dir() else {}
@@ -191,20 +142,22 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     if not stamps:
         raise InputError("the log has no images", where=str(image_folder))
     zero_ns = min(stamps)
-    mounts = read_mounts(folder / "calibration" / "egovehicle_SE3_sensor.feather")
-    ego = read_ego(folder / "city_SE3_egovehicle.feather", zero_ns)
+    ego_file, mount_file = (
+        folder / "city_SE3_egovehicle.feather",
+        folder / "calibration" / "egovehicle_SE3_sensor.feather",
+    )
+    mounts, ego = read_mounts(mount_file), read_ego(ego_file, zero_ns)
 
     def map_from_ego(stamp: int) -> Matrix:
-        return common.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, ego_where)
+        return common.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, str(ego_file))
 
-    ego_where = str(folder / "city_SE3_egovehicle.feather")
     images = [
         ImageRecord(name, (stamp - zero_ns) / NANOSECONDS, map_from_ego(stamp) @ mount, path)
         for name, found in files.items()
-        for mount in [_mount(mounts, chosen[name], where)]
+        for mount in [_of_sensor(mounts, chosen[name], mount_file)]
         for stamp, path in found.items()
     ]
-    upper = _mount(mounts, _UPPER, where) if scans else np.eye(4)
+    upper = _of_sensor(mounts, _UPPER, mount_file) if scans else np.eye(4)
     sweeps = [
         SweepRecord(
             SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper)
@@ -224,7 +177,7 @@ def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     found = sorted(
         (int(path.stem), path) for path in folder.iterdir() if path.stem.isdigit() and path.suffix.lower() in suffixes
     )
-    drive_log.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
+    common.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
     return dict(found)
 
 
@@ -238,54 +191,17 @@ def read_feather(path: Path, columns: Sequence[str]) -> Columns:
         ResourceError: pyarrow is not installed.
         InputError: missing, cut off, without one of the columns, or with empty values.
     """
-    try:
-        import pyarrow
+    with arrow_files(path):
         import pyarrow.feather
-    except ImportError as error:
-        raise ResourceError(
-            "reading Argoverse 2 needs pyarrow, which is not installed",
-            where=str(path),
-            remedy="pip install 'mudg[data]'",
-        ) from error
-    if not path.is_file():
-        raise InputError("file not found", where=str(path), remedy="is the log complete?")
-    try:
+
+        if not path.is_file():
+            raise InputError("file not found", where=str(path), remedy="is the log complete?")
         table = pyarrow.feather.read_table(str(path), memory_map=False)
-        missing = [name for name in columns if name not in table.schema.names]
-        if missing:
-            raise InputError(
-                "table lacks columns",
-                where=str(path),
-                expected=", ".join(columns),
-                got=", ".join(table.schema.names),
-                remedy="is this a file of another data set or version?",
-            )
+        require_columns(columns, table.schema.names, path)
         empty = [name for name in columns if table.column(name).null_count]
         if empty:
             raise InputError("table has rows without a value", where=f"{path}: {', '.join(empty)}")
         return {name: table.column(name).to_numpy() for name in columns}
-    except (pyarrow.ArrowException, OSError, MemoryError) as error:
-        raise InputError(
-            "file is no Feather table, or is cut off", where=str(path), got=str(error), remedy="copy the file again"
-        ) from error
-
-
-def _numbers(columns: Columns, names: Sequence[str], where: str) -> Matrix:
-    """Columns as finite f64[n, k]."""
-    try:
-        table = np.stack([columns[name].astype(np.float64) for name in names], 1)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            "column does not hold numbers", where=f"{where}: {', '.join(names)}", got=str(error)
-        ) from error
-    bad = ~np.isfinite(table).all(1)
-    if bad.any():
-        raise InputError(
-            "table holds values that are not finite",
-            where=f"{where}: {', '.join(names)}",
-            got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}",
-        )
-    return table
 
 
 def _stamps(columns: Columns, where: str) -> NDArray[np.int64]:
@@ -293,12 +209,12 @@ def _stamps(columns: Columns, where: str) -> NDArray[np.int64]:
     if stamps.dtype.kind not in "iu":
         raise InputError("time stamps are not whole numbers", where=f"{where}: timestamp_ns", got=str(stamps.dtype))
     stamps = stamps.astype(np.int64)
-    drive_log.check_epoch(stamps, NANOSECONDS, f"{where}: timestamp_ns")
+    common.check_epoch(stamps, NANOSECONDS, f"{where}: timestamp_ns")
     return stamps
 
 
 def _poses(columns: Columns, where: str) -> list[Matrix]:
-    rows = _numbers(columns, _POSE, where)
+    rows = finite_columns(columns, _POSE, where)
     return [common.pose_from_quaternion(row[:4], row[4:], f"{where}: row {index}") for index, row in enumerate(rows)]
 
 
@@ -308,7 +224,7 @@ def read_ego(path: Path, zero_ns: int) -> EgoPath:
     stamps = _stamps(columns, str(path))
     if len(stamps) == 0:
         raise InputError("table of vehicle poses is empty", where=str(path))
-    return drive_log.ego_path([(int(t) - zero_ns) / NANOSECONDS for t in stamps], _poses(columns, str(path)))
+    return common.ego_path([(int(t) - zero_ns) / NANOSECONDS for t in stamps], _poses(columns, str(path)))
 
 
 def read_mounts(path: Path) -> dict[str, Matrix]:
@@ -317,15 +233,10 @@ def read_mounts(path: Path) -> dict[str, Matrix]:
     return dict(zip(map(str, columns["sensor_name"]), _poses(columns, str(path)), strict=True))
 
 
-def _mount(mounts: Mapping[str, Matrix], sensor: str, where: str) -> Matrix:
-    if sensor not in mounts:
-        raise InputError(
-            "calibration lacks a sensor",
-            where=f"{where}/calibration/egovehicle_SE3_sensor.feather",
-            expected=sensor,
-            got=", ".join(mounts),
-        )
-    return mounts[sensor]
+def _of_sensor(calibration: Mapping[str, Any], sensor: str, where: object) -> Any:
+    if sensor not in calibration:
+        raise InputError("calibration lacks a sensor", where=str(where), expected=sensor, got=", ".join(calibration))
+    return calibration[sensor]
 
 
 def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
@@ -336,12 +247,10 @@ def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
     where = str(path)
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
     columns = read_feather(path, ("sensor_name", *names))
-    rows = dict(zip(map(str, columns["sensor_name"]), _numbers(columns, names, where).tolist(), strict=True))
+    rows = dict(zip(map(str, columns["sensor_name"]), finite_columns(columns, names, where).tolist(), strict=True))
     cameras = {}
     for name, raw in chosen.items():
-        if raw not in rows:
-            raise InputError("calibration lacks a camera", where=where, expected=raw, got=", ".join(rows))
-        fx, fy, cx, cy, k1, k2, k3, width, height = rows[raw]
+        fx, fy, cx, cy, k1, k2, k3, width, height = _of_sensor(rows, raw, where)
         lens = (k1, k2, 0.0, 0.0, k3)
         cameras[name] = Camera(name, int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, distortion=lens)
     return cameras
@@ -355,13 +264,13 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     names = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE)
     columns = read_feather(path, names)
     stamps, poses = _stamps(columns, where), _poses(columns, where)
-    sizes = _numbers(columns, ("length_m", "width_m", "height_m"), where)
+    sizes = finite_columns(columns, ("length_m", "width_m", "height_m"), where)
     map_from_ego = {
         int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where) for t in set(stamps)
     }
     tracks = BoxTracks(where, LABELS)
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
-        label = tracks.word(str(columns["category"][row]))
+        label = tracks.label_of(str(columns["category"][row]))
         length, width, height = sizes[row].tolist()
         time_s = (int(stamp) - zero_ns) / NANOSECONDS
         track = str(columns["track_uuid"][row])
@@ -378,25 +287,18 @@ def read_sweep(path: Path, ego_from_lidar: Matrix) -> SweepPoints:
     """
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
-    xyz_ego = _numbers(columns, ("x", "y", "z"), where)
-    intensity = _numbers(columns, ("intensity",), where)[:, 0]
+    xyz_ego = finite_columns(columns, ("x", "y", "z"), where)
+    intensity = finite_columns(columns, ("intensity",), where)[:, 0]
     offset_ns = columns["offset_ns"]
     if offset_ns.dtype.kind not in "iu" or (
         len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
     ):
-        raise InputError(
-            "point times are no nanoseconds of one turn",
-            where=f"{where}: offset_ns",
+        raise InputError("point times are no nanoseconds of one turn", where=f"{where}: offset_ns",
             expected="whole nanoseconds since the sweep's time, under half a second",
-            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}",
-        )
+            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")  # fmt: skip
     if len(intensity) and (intensity.min() < 0 or intensity.max() > 255):
-        raise InputError(
-            "intensity is out of range",
-            where=where,
-            expected="0 to 255",
-            got=f"{intensity.min():g} to {intensity.max():g}",
-        )
+        raise InputError("intensity is out of range", where=where, expected="0 to 255",
+            got=f"{intensity.min():g} to {intensity.max():g}")  # fmt: skip
     xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
     dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
     return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s)

@@ -33,7 +33,7 @@ class BoxTimes:
     """Mean point time of every box of every moving track, collected while sweeps pass by in any order.
 
     Args:
-        tracks: as annotated; keys at sweep times. ``see`` may be called from several threads, once per sweep.
+        tracks: as annotated; keys at sweep times. ``observe`` may be called from several threads, once per sweep.
     """
 
     def __init__(self, tracks: Sequence[Track]) -> None:
@@ -41,7 +41,7 @@ class BoxTimes:
         self._moving = [i for i, track in enumerate(self._tracks) if _extent_m(track) > MOVES_M]
         self._late_s: dict[tuple[int, int], float] = {}
 
-    def see(self, time_s: float, map_from_lidar: Matrix, points: SweepPoints) -> None:
+    def observe(self, time_s: float, map_from_lidar: Matrix, points: SweepPoints) -> None:
         """Note the mean ``dt_s`` of the points inside each box that is annotated at this sweep's time."""
         if not np.any(points.dt_s):
             return

@@ -1,9 +1,9 @@
-"""Boxes of many frames -> tracks: words for classes, sizes that make sense, keys in time order, splits where a box is not seen."""
+"""Boxes of many frames -> tracks: labels, plausible sizes, keys in time order, splits where a box is not seen."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -22,6 +22,9 @@ LONGER_THAN_WIDE: Final = frozenset(("car", "van", "bus", "vehicle"))
 """Labels whose boxes are longer than wide in every data set (a truck's cab may be a box of its own)."""
 _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
+_SAME_TIME_S: Final = 1e-4
+Speeds = Callable[[NDArray[np.float64], Matrix, Sequence[NDArray[np.intp]]], Matrix]
+"""Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities f64[n, 3] m/s."""
 
 
 def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, float, float]:
@@ -31,12 +34,9 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
     except (TypeError, ValueError) as error:
         raise InputError("box size is not made of numbers", where=where, got=str(error)) from error
     if not all(np.isfinite(side) and 0 < side <= MAX_SIDE_M for side in size):
-        raise InputError(
-            "box size makes no sense",
-            where=where,
+        raise InputError("box size makes no sense", where=where,
             expected=f"length, width and height in metres, above 0 and at most {MAX_SIDE_M:g}",
-            got=f"length {length}, width {width}, height {height}",
-        )
+            got=f"length {length}, width {width}, height {height}")  # fmt: skip
     return size
 
 
@@ -52,23 +52,23 @@ class BoxTracks:
 
     Args:
         where: the file or folder the boxes come from, for messages.
-        words: the data set's class -> the product's word (``car``, ``pedestrian``, ...). Other classes keep the last part (after
+        labels: the data set's class -> the label here (``car``, ``pedestrian``, ...). Other classes keep the last part (after
             a dot) of their name in lower case, and are named once in the notes.
         max_gap_s: an object that is not seen for longer than this is split.
     """
 
-    def __init__(self, where: str, words: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
-        self._where, self._words, self._max_gap_s = where, words, max_gap_s
+    def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
+        self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
         self._members: dict[str, _Member] = {}
         self._unknown: dict[str, int] = {}
 
     def __len__(self) -> int:
         return len(self._members)
 
-    def word(self, category: str) -> str:
-        """The product's word for a class of the data set; what is not known is counted."""
-        if category in self._words:
-            return self._words[category]
+    def label_of(self, category: str) -> str:
+        """The label of a class of the data set; classes that are not known are counted."""
+        if category in self._labels:
+            return self._labels[category]
         self._unknown[category] = self._unknown.get(category, 0) + 1
         return category.rsplit(".", 1)[-1].strip().lower().replace(" ", "_") or "unknown"
 
@@ -87,7 +87,7 @@ class BoxTracks:
 
         Args:
             track: the object's id, the same in all frames.
-            label: the product's word for it (``word``). The track takes its commonest one.
+            label: its label (``label_of``). The track takes its commonest one.
             time_s: when, seconds of the scene's clock.
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
@@ -105,11 +105,18 @@ class BoxTracks:
         member.standing = standing
         member.rows.extend((time_s, late_s, *size, *world_from_box[:3].ravel().tolist()))
 
-    def tracks(self) -> tuple[list[Track], list[str]]:
+    def tracks(
+        self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
+    ) -> tuple[list[Track], list[str]]:
         """All tracks in the order of their first boxes, and notes for people.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to its last
         moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
+
+        Args:
+            speeds: how velocities are found; None = from the neighbouring boxes of a piece.
+            images_s: time of a box -> times of the first and last image that show the object; a track reaches from the first
+                image of its first box to the last one of its last. None = from box to box.
 
         Raises:
             InputError: an object has two boxes at one moment; length and width are swapped.
@@ -122,14 +129,10 @@ class BoxTracks:
             times = rows[:, 0]
             if (np.diff(times) <= 0).any():
                 at = float(times[int(np.flatnonzero(np.diff(times) <= 0)[0])])
-                raise InputError(
-                    "an object has two boxes at one moment",
-                    where=f"{self._where}: object {name}",
-                    got=f"time {at:.3f} s of the log",
-                    remedy="are two logs mixed?",
-                )
+                raise InputError("an object has two boxes at one moment", where=f"{self._where}: object {name}",
+                    got=f"time {at:.3f} s of the log", remedy="are two logs mixed?")  # fmt: skip
             size = np.median(rows[:, 2:5], axis=0)
-            label = max(member.labels, key=lambda word: member.labels[word])
+            label = max(member.labels, key=lambda name: member.labels[name])
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
             poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
             if member.standing:
@@ -138,12 +141,14 @@ class BoxTracks:
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
             split += len(pieces) > 1
-            for piece in pieces:
-                poses[piece, :3, 3] -= _velocity(times[piece] + rows[piece, 1], poses[piece, :3, 3]) * rows[piece, 1:2]
-            tracks += [
-                Track(f"{name}.{part}" if part else name, label, size, times[piece], poses[piece])
-                for part, piece in enumerate(pieces)
-            ]
+            velocity = (speeds or neighbour_speeds)(times + rows[:, 1], poses[:, :3, 3], pieces)
+            poses[:, :3, 3] -= velocity * rows[:, 1:2]
+            for part, piece in enumerate(pieces):
+                keys = times[piece], poses[piece]
+                if images_s is not None:
+                    ends_s = images_s[float(times[piece[0]])][0], images_s[float(times[piece[-1]])][1]
+                    keys = _reaching(*keys, velocity[piece], ends_s)
+                tracks.append(Track(f"{name}.{part}" if part else name, label, size, *keys))
         check_sides(tracks, self._where)
         tracks.sort(key=lambda track: float(track.times_s[0]))
         return tracks, self._notes(split)
@@ -153,11 +158,11 @@ class BoxTracks:
         if split:
             notes.append(f"{split} tracks are not seen for more than {self._max_gap_s:g} s and were split there")
         if self._unknown:
-            notes.append(unknown_words(self._unknown))
+            notes.append(unknown_classes(self._unknown))
         return notes
 
 
-def unknown_words(counts: Mapping[str, int]) -> str:
+def unknown_classes(counts: Mapping[str, int]) -> str:
     """A note about classes of boxes that the format does not document, by their number of boxes."""
     some = ", ".join(f"{label!r} ({count} boxes)" for label, count in sorted(counts.items())[:8])
     return f"classes that are not known here keep their names: {some}"
@@ -169,14 +174,14 @@ def check_sides(tracks: Sequence[Track], where: str) -> None:
     wide = [track for track in vehicles if track.size_m[1] > track.size_m[0]]
     if vehicles and 2 * len(wide) > len(vehicles):
         length, width, _ = wide[0].size_m
-        raise InputError(
-            "length and width of boxes are swapped",
-            where=where,
-            expected="vehicles longer than wide",
+        raise InputError("length and width of boxes are swapped", where=where, expected="vehicles longer than wide",
             got=f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
-            f"{length:.2f} m long, {width:.2f} m wide",
-            remedy="check the order in which the sizes were written",
-        )
+            f"{length:.2f} m long, {width:.2f} m wide", remedy="check the order in which the sizes were written")  # fmt: skip
+
+
+def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
+    """Velocities of an object's boxes, f64[n, 3], by their neighbours within each of the ``pieces`` of its track."""
+    return np.concatenate([_velocity(measured_s[piece], places[piece]) for piece in pieces])
 
 
 def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:
@@ -189,6 +194,20 @@ def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:
     short = span < _MIN_STEP_S  # two measurements at nearly one moment, at an end: go by the neighbour
     velocity[short] = velocity[np.where(before == np.arange(len(places)), after, before)][short]
     return velocity
+
+
+def _reaching(
+    times_s: NDArray[np.float64], poses: Matrix, velocity: Matrix, ends_s: tuple[float, float]
+) -> tuple[NDArray[np.float64], Matrix]:
+    """Keys with one more at each of ``ends_s`` that lies outside of them."""
+    start_s, end_s = ends_s[0] - times_s[0], ends_s[1] - times_s[-1]
+    if start_s < -_SAME_TIME_S:
+        times_s, poses = np.concatenate([ends_s[:1], times_s]), np.concatenate([poses[:1], poses])
+        poses[0, :3, 3] += velocity[0] * start_s
+    if end_s > _SAME_TIME_S:
+        times_s, poses = np.concatenate([times_s, ends_s[1:]]), np.concatenate([poses, poses[-1:]])
+        poses[-1, :3, 3] += velocity[-1] * end_s
+    return times_s, poses
 
 
 def _mean_pose(poses: Matrix) -> Matrix:

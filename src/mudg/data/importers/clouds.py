@@ -49,29 +49,22 @@ def read_cloud(path: Path) -> Cloud:
     """
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(
-            "point cloud format is not known",
-            where=str(path),
-            expected=", ".join(READERS),
-            got=path.suffix or "no suffix",
-        )
+        raise InputError("point cloud format is not known", where=str(path), expected=", ".join(READERS),
+            got=path.suffix or "no suffix")  # fmt: skip
     columns = reader(store.read_bytes(path), str(path))
     absent = [name for name in "xyz" if name not in columns]
     if absent:
-        raise InputError(
-            "cloud has no coordinates", where=str(path), expected="fields x, y, z",
-            got=", ".join(columns) or "no fields",
-        )  # fmt: skip
+        raise InputError("cloud has no coordinates", where=str(path), expected="fields x, y, z",
+            got=", ".join(columns) or "no fields")  # fmt: skip
     xyz = np.stack([columns[name].astype(np.float64) for name in "xyz"], 1)
     nowhere = np.isnan(xyz).all(1)
     if nowhere.any():
         xyz = xyz[~nowhere]
     if not np.isfinite(xyz).all():
         bad = int((~np.isfinite(xyz).all(1)).sum())
-        raise InputError(
-            "cloud holds coordinates that are not finite", where=str(path), got=f"{bad} of {len(xyz)} points",
-            remedy="leave missing returns out, or write all three coordinates as NaN",
-        )  # fmt: skip
+        raise InputError("cloud holds coordinates that are not finite", where=str(path),
+            got=f"{bad} of {len(xyz)} points",
+            remedy="leave missing returns out, or write all three coordinates as NaN")  # fmt: skip
     rest = {name: values[~nowhere] for name, values in columns.items() if name not in "xyz"}
     return Cloud(xyz, rest, int(nowhere.sum()))
 
@@ -87,38 +80,39 @@ _PCD_KEYS: Final = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIG
 
 @dataclass(frozen=True, slots=True)
 class _PcdField:
-    """One field; padding is called ``_`` and may have a count of 0."""
+    """One field of one number a point: its type, and where it stands in a row (byte and number)."""
 
     name: str
     kind: str
-    count: int
+    byte: int
+    column: int
 
 
 def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     """Point Cloud Data file of version 0.6 or 0.7: fields of one number a point, by name."""
     header, start = _pcd_header(content, where)
-    fields = _pcd_fields(header, where)
+    fields, size, columns = _pcd_fields(header, where)
     points = _count(header["POINTS"][0], f"{where}: POINTS")
     width, height = (_count(header[key][0], f"{where}: {key}") for key in ("WIDTH", "HEIGHT"))
     if width * height != points:
-        raise InputError(
-            "cloud contradicts itself",
-            where=where,
-            expected=f"WIDTH x HEIGHT = {width * height} points",
-            got=f"POINTS {points}",
-        )
+        raise InputError("cloud contradicts itself", where=where, expected=f"WIDTH x HEIGHT = {width * height} points",
+            got=f"POINTS {points}")  # fmt: skip
     body = content[start:]
     kind = header["DATA"][0].lower()
     if kind == "ascii":
-        return _pcd_ascii(body, fields, points, where)
-    size = sum(np.dtype(f.kind).itemsize * f.count for f in fields)
+        table = _number_table(body, columns, points, where)
+        return {field.name: table[:, field.column] for field in fields}
     if kind == "binary":
-        return _pcd_binary(body, fields, points, size, where)
-    if kind == "binary_compressed":
-        return _pcd_compressed(body, fields, points, size, where)
-    raise InputError(
-        "cloud's DATA is of no known kind", where=where, expected="ascii, binary or binary_compressed", got=kind[:40]
-    )
+        _enough(body, points * size, where)
+        names, kinds, offsets = ([getattr(f, part) for f in fields] for part in ("name", "kind", "byte"))
+        layout = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": size})
+        rows = np.frombuffer(body, layout, points)
+        return {name: rows[name].copy() for name in names}
+    if kind == "binary_compressed":  # field after field, all points of one together
+        flat = _pcd_unpacked(body, points, size, where)
+        return {field.name: np.frombuffer(flat, field.kind, points, field.byte * points).copy() for field in fields}
+    raise InputError("cloud's DATA is of no known kind", where=where, expected="ascii, binary or binary_compressed",
+        got=kind[:40])  # fmt: skip
 
 
 def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
@@ -127,10 +121,8 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
     while "DATA" not in header:
         end = content.find(b"\n", start, _MAX_HEADER_BYTES)
         if end < 0:
-            raise InputError(
-                "not a PCD file", where=where, expected=f"a header with {', '.join(_PCD_KEYS)}",
-                got=f"{len(content)} bytes without the line DATA", remedy="is the file cut off?",
-            )  # fmt: skip
+            raise InputError("not a PCD file", where=where, expected=f"a header with {', '.join(_PCD_KEYS)}",
+                got=f"{len(content)} bytes without the line DATA", remedy="is the file cut off?")  # fmt: skip
         words = content[start:end].decode("ascii", "replace").split()
         start = end + 1
         if words and not words[0].startswith("#"):
@@ -139,44 +131,29 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
     header.setdefault("HEIGHT", ["1"])
     absent = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "POINTS", "DATA") if not header.get(key)]
     if absent:
-        raise InputError(
-            "PCD header is incomplete", where=where, expected=", ".join(absent), got=", ".join(header)[:200]
-        )
+        raise InputError("PCD header is incomplete", where=where, expected=", ".join(absent),
+            got=", ".join(header)[:200])  # fmt: skip
     return header, start
 
 
-def _pcd_fields(header: dict[str, list[str]], where: str) -> list[_PcdField]:
+def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[list[_PcdField], int, int]:
+    """Fields of one number a point, each name once (padding, called ``_``, and descriptors are passed over); bytes and numbers a row."""
     names, sizes, types, counts = (header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT"))
     if not len(names) == len(sizes) == len(types) == len(counts):
-        raise InputError(
-            "PCD header contradicts itself", where=where, expected="as many SIZE, TYPE and COUNT as FIELDS",
-            got=f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}",
-        )  # fmt: skip
-    fields = []
+        raise InputError("PCD header contradicts itself", where=where,
+            expected="as many SIZE, TYPE and COUNT as FIELDS",
+            got=f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}")  # fmt: skip
+    fields: dict[str, _PcdField] = {}
+    byte = column = 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         key = (kind.upper(), _count(size, f"{where}: SIZE"))
         if key not in _PCD_TYPES:
             raise InputError("PCD field has an unknown type", where=f"{where}: {name}", got=f"{kind}{size}")
-        fields.append(_PcdField(name, _PCD_TYPES[key], _count(count, f"{where}: COUNT", 65536)))
-    return fields
-
-
-def _wanted(fields: list[_PcdField]) -> list[tuple[int, _PcdField]]:
-    """Fields of one number, each name once; padding and descriptors are passed over."""
-    taken: set[str] = set()
-    chosen = []
-    for index, field in enumerate(fields):
-        if field.count == 1 and field.name != "_" and field.name not in taken:
-            taken.add(field.name)
-            chosen.append((index, field))
-    return chosen
-
-
-def _pcd_ascii(body: bytes, fields: list[_PcdField], points: int, where: str) -> dict[str, NDArray]:
-    columns = sum(field.count for field in fields)
-    table = _number_table(body, columns, points, where)
-    first = np.cumsum([0, *(field.count for field in fields)])
-    return {field.name: table[:, first[index]] for index, field in _wanted(fields)}
+        numbers = _count(count, f"{where}: COUNT", 65536)
+        if numbers == 1 and name != "_":
+            fields.setdefault(name, _PcdField(name, _PCD_TYPES[key], byte, column))
+        byte, column = byte + key[1] * numbers, column + numbers
+    return list(fields.values()), byte, column
 
 
 def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[np.float64]:
@@ -187,46 +164,19 @@ def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[n
     except ValueError as error:
         raise InputError("cloud holds a value that is no number", where=where, got=str(error)[:120]) from error
     if len(table) != rows * columns:
-        raise InputError(
-            "cloud is cut off or has rows of another length", where=where, got=f"{len(table)} numbers",
-            expected=f"{rows} rows of {columns}",
-        )  # fmt: skip
+        raise InputError("cloud is cut off or has rows of another length", where=where, got=f"{len(table)} numbers",
+            expected=f"{rows} rows of {columns}")  # fmt: skip
     return table.reshape(rows, columns)
 
 
-def _pcd_binary(body: bytes, fields: list[_PcdField], points: int, size: int, where: str) -> dict[str, NDArray]:
-    _enough(body, points * size, where)
-    offsets = np.cumsum([0, *(np.dtype(f.kind).itemsize * f.count for f in fields)])
-    chosen = _wanted(fields)
-    layout = np.dtype(
-        {
-            "names": [field.name for _, field in chosen], "formats": [field.kind for _, field in chosen],
-            "offsets": [int(offsets[index]) for index, _ in chosen], "itemsize": size,
-        }
-    )  # fmt: skip
-    rows = np.frombuffer(body, layout, points)
-    return {field.name: rows[field.name].copy() for _, field in chosen}
-
-
-def _pcd_compressed(body: bytes, fields: list[_PcdField], points: int, size: int, where: str) -> dict[str, NDArray]:
+def _pcd_unpacked(body: bytes, points: int, size: int, where: str) -> bytes:
     _enough(body, 8, where)
     packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
     _enough(body, 8 + packed, where)
     if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
-        raise InputError(
-            "compressed cloud contradicts itself", where=where, expected=f"{points} points of {size} bytes",
-            got=f"{packed} bytes said to unpack to {unpacked}",
-        )  # fmt: skip
-    flat = lzf_decompress(body[8 : 8 + packed], unpacked, where)
-    columns: dict[str, NDArray] = {}
-    chosen = {index for index, _ in _wanted(fields)}
-    at = 0
-    for index, field in enumerate(fields):  # field after field, all points of one together
-        length = np.dtype(field.kind).itemsize * field.count * points
-        if index in chosen:
-            columns[field.name] = np.frombuffer(flat, field.kind, points, at).copy()
-        at += length
-    return columns
+        raise InputError("compressed cloud contradicts itself", where=where,
+            expected=f"{points} points of {size} bytes", got=f"{packed} bytes said to unpack to {unpacked}")  # fmt: skip
+    return lzf_decompress(body[8 : 8 + packed], unpacked, where)
 
 
 def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
@@ -274,10 +224,8 @@ def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
 
 def _enough(body: bytes, needed: int, where: str) -> None:
     if len(body) < needed:
-        raise InputError(
-            "cloud is cut off", where=where, expected=f"at least {needed} bytes after the header", got=str(len(body)),
-            remedy="copy the file again",
-        )  # fmt: skip
+        raise InputError("cloud is cut off", where=where, expected=f"at least {needed} bytes after the header",
+            got=str(len(body)), remedy="copy the file again")  # fmt: skip
 
 
 def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
@@ -300,9 +248,8 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
     end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
     start = content.find(b"\n", end) + 1
     if not content.startswith(b"ply") or end < 0 or start == 0:
-        raise InputError(
-            "not a PLY file", where=where, expected="a header from 'ply' to 'end_header'", got=f"{len(content)} bytes"
-        )
+        raise InputError("not a PLY file", where=where, expected="a header from 'ply' to 'end_header'",
+            got=f"{len(content)} bytes")  # fmt: skip
     order, points, properties, element = "?", -1, [], ""
     for line in content[:end].decode("ascii", "replace").splitlines():
         words = line.split()
@@ -319,9 +266,8 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
                 raise InputError("vertex property is of no known type", where=where, got=line.strip()[:80])
             properties.append((words[2], _PLY_TYPES[words[1]]))
     if order not in _PLY_ORDER or points < 0 or not properties or len({n for n, _ in properties}) != len(properties):
-        raise InputError(
-            "PLY header is incomplete", where=where, expected="format, element vertex, properties", got=order
-        )
+        raise InputError("PLY header is incomplete", where=where, expected="format, element vertex, properties",
+            got=order)  # fmt: skip
     body = content[start:]
     if order == "ascii":
         lines = body.split(b"\n", points)  # faces may follow
@@ -340,62 +286,62 @@ def read_float_rows(path: Path, columns: int, what: str = "scan") -> NDArray[np.
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns].
 
     Args:
-        what: word for one file's content, for messages.
+        what: what one file holds, for messages.
 
     Raises:
         InputError: missing, cut off, or values that are not finite.
     """
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
-        raise InputError(
-            f"{what} is cut off", where=str(path), got=f"{len(content)} bytes",
-            expected=f"a multiple of {4 * columns} bytes ({columns} float32 a row)", remedy="copy the file again",
-        )  # fmt: skip
+        raise InputError(f"{what} is cut off", where=str(path), got=f"{len(content)} bytes",
+            expected=f"a multiple of {4 * columns} bytes ({columns} float32 a row)", remedy="copy the file again")  # fmt: skip
     rows = np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
     bad = ~np.isfinite(rows).all(1)
     if bad.any():
-        raise InputError(
-            f"{what} holds values that are not finite", where=str(path), got=f"{int(bad.sum())} of {len(rows)} rows",
-            remedy="copy the file again",
-        )  # fmt: skip
+        raise InputError(f"{what} holds values that are not finite", where=str(path),
+            got=f"{int(bad.sum())} of {len(rows)} rows", remedy="copy the file again")  # fmt: skip
     return rows
 
 
 def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
     """KITTI's form: little-endian float32 rows x, y, z, intensity, nothing else."""
     if len(content) % 16:
-        raise InputError(
-            "cloud is cut off, or is not of this form", where=where, got=f"{len(content)} bytes",
-            expected="a multiple of 16 bytes: float32 x, y, z, intensity a point",
-        )  # fmt: skip
+        raise InputError("cloud is cut off, or is not of this form", where=where, got=f"{len(content)} bytes",
+            expected="a multiple of 16 bytes: float32 x, y, z, intensity a point")  # fmt: skip
     rows = np.frombuffer(content, "<f4").reshape(-1, 4)
     return {name: rows[:, index].copy() for index, name in enumerate(("x", "y", "z", "intensity"))}
 
 
-def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
-    """numpy archive: ``xyz`` [N, 3] and any number of arrays [N]."""
-    columns: dict[str, NDArray] = {}
+def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
+    """All arrays of a numpy archive by name.
+
+    Raises:
+        InputError: damaged, cut off, or not plain numbers of the declared size.
+    """
+    arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for entry in archive.infolist():
                 with archive.open(entry) as handle:
-                    columns[entry.filename.removesuffix(".npy")] = read_npy(
-                        handle, entry.file_size, f"{where}: {entry.filename}"
-                    )
+                    member = f"{where}: {entry.filename}"
+                    arrays[entry.filename.removesuffix(".npy")] = read_npy(handle, entry.file_size, member)
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as error:
-        raise InputError("not a readable NPZ file", where=where, got=str(error)[:120]) from error
+        raise InputError("not a readable NPZ file, or cut off", where=where, got=str(error)[:120],
+            remedy="copy the file again") from error  # fmt: skip
+    return arrays
+
+
+def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
+    """numpy archive: ``xyz`` [N, 3] and any number of arrays [N]."""
+    columns = npz_arrays(content, where)
     xyz = columns.pop("xyz", None)
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
-        raise InputError(
-            "NPZ cloud has no coordinates", where=where, expected="an array xyz [N, 3] of numbers",
-            got=", ".join(columns) or ("nothing" if xyz is None else f"{xyz.dtype} {xyz.shape}"),
-        )  # fmt: skip
+        raise InputError("NPZ cloud has no coordinates", where=where, expected="an array xyz [N, 3] of numbers",
+            got=", ".join(columns) or ("nothing" if xyz is None else f"{xyz.dtype} {xyz.shape}"))  # fmt: skip
     for name, values in columns.items():
         if values.shape != (len(xyz),) or values.dtype.kind not in "fiub":
-            raise InputError(
-                "NPZ array does not fit the points", where=f"{where}: {name}", expected=f"numbers [{len(xyz)}]",
-                got=f"{values.dtype} {values.shape}",
-            )  # fmt: skip
+            raise InputError("NPZ array does not fit the points", where=f"{where}: {name}",
+                expected=f"numbers [{len(xyz)}]", got=f"{values.dtype} {values.shape}")  # fmt: skip
     return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **columns}
 
 
@@ -419,10 +365,8 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
         or length > min(size, MAX_POINTS * 24)
         or handle.tell() + length != size
     ):
-        raise InputError(
-            "array is not plain numbers of the declared size", where=where, got=f"{dtype} {shape} in {size} bytes",
-            remedy="save it with numpy.savez from an array of numbers",
-        )  # fmt: skip
+        raise InputError("array is not plain numbers of the declared size", where=where,
+            got=f"{dtype} {shape} in {size} bytes", remedy="save it with numpy.savez from an array of numbers")  # fmt: skip
     content = handle.read(length)
     handle.read(1)  # at its end an archive's member compares its checksum
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")

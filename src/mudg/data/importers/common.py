@@ -1,25 +1,21 @@
-"""What importers share: work over frames in parallel, and the traps that every format has (units of time, poses).
+"""What importers share: work over items in parallel, units of time, poses that must be rigid, and the vehicle's path.
 
-A typical importer::
+A typical importer reads what is small, checks it, and hands the rest to the writer item by item::
 
     times_s = seconds(raw_times, "us", where)                     # refuses milliseconds called microseconds
-    fits = {name: fit_images(camera, lens, options) for ...}      # images.py: rectified and resized in one place
-    with SceneWriter(out, scene_id, source) as writer:
-        for fit in fits.values():
-            writer.add_camera(fit.camera)
-        for_each(records, convert, workers=options.workers, title="importing", name=str)
-        ...
-        return writer.finish()
+    fits = {name: fit_images(camera, options, lens) for ...}      # images.py: rectified and resized in one place
+    content = SceneContent(name, source, fits, items, convert, item_name, ego)
+    return write_scene(content, out, options)                     # drive_log.py
 
-``SceneWriter.add_*`` may be called from several threads and orders frames and sweeps by time, so the scene is the same for
-any number of workers.
+The scene is the same for any number of workers: frames and sweeps are ordered by time when all are there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import Final, Literal, TypeVar
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +23,15 @@ from numpy.typing import ArrayLike, NDArray
 from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, MudgError
-from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, pose_at, transform_points
+from mudg.base.geometry import (
+    from_rotation_translation,
+    invert,
+    matrix_from_quaternion,
+    pose_at,
+    transform_points,
+    yaw_matrix,
+    yaw_of,
+)
 from mudg.base.types import EgoPath
 
 Item = TypeVar("Item")
@@ -41,6 +45,14 @@ POSE_TOLERANCE: Final = 1e-3
 QUATERNION_TOLERANCE: Final = 1e-2
 MAX_EXTRAPOLATION_S: Final = 0.15
 _DESKEW_STEPS: Final = 32
+MAX_SPEED_M_S: Final = 100.0
+_SPEED_OVER_S: Final = 0.05
+_LEAST_UPRIGHT: Final = 0.5
+_DRIVES_M_S: Final = 1.0
+_LEAST_ALONG: Final = 0.8
+_EPOCH_S: Final = (1e8, 4.1e9)
+"""Seconds since 1970 that a recording may carry: 1973 to 2099."""
+_MAX_LOG_S: Final = 4 * 3600.0
 
 
 # --- work over frames -------------------------------------------------------------------------------------------------
@@ -68,7 +80,7 @@ def for_each(
         title: of the progress bar.
         total: number of items; None = ``len(items)``, or unknown for a generator.
         workers: threads; 1 = no threads, 0 = as many as there are processors to use.
-        name: words for an item, put before the place of an error.
+        name: what an item is called, put before the place of an error.
 
     Returns:
         Number of items.
@@ -89,39 +101,25 @@ def for_each(
                 bar.advance()
             return done
         with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
-            pending: dict[Future[None], int] = {}
-            failed: dict[int, BaseException] = {}
-            source = iter(items)
-            index = 0
+            pending: deque[Future[None]] = deque()
+
+            def finish_first() -> None:
+                pending.popleft().result()
+                bar.advance()
+
             try:
-                while not failed:
-                    while len(pending) < 2 * workers:
-                        try:
-                            item = next(source)
-                        except StopIteration:
-                            break
-                        pending[pool.submit(_named, work, item, name)] = index
-                        index += 1
-                    if not pending:
+                for item in items:
+                    pending.append(pool.submit(_named, work, item, name))
+                    done += 1
+                    if any(future.done() and future.exception() for future in pending):
                         break
-                    finished, _ = wait(pending, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        at = pending.pop(future)
-                        error = future.exception()
-                        if error is not None:
-                            failed[at] = error
-                        else:
-                            done += 1
-                            bar.advance()
+                    if len(pending) == 2 * workers:
+                        finish_first()
+                while pending:
+                    finish_first()
             finally:
                 for future in pending:
                     future.cancel()
-            wait(pending)
-            for future, at in pending.items():
-                if not future.cancelled() and future.exception() is not None:
-                    failed[at] = future.exception()  # type: ignore[assignment]
-            if failed:
-                raise failed[min(failed)]
     return done
 
 
@@ -129,11 +127,11 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
     try:
         work(item)
     except MudgError as error:
-        words = name(item)
-        if words in error.where:
+        called = name(item)
+        if called in error.where:
             raise
         raise type(error)(
-            error.what, where=f"{words}: {error.where}" if error.where else words,
+            error.what, where=f"{called}: {error.where}" if error.where else called,
             expected=error.expected, got=error.got, remedy=error.remedy,
         ) from error  # fmt: skip
 
@@ -159,21 +157,35 @@ def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, wh
     steps = np.diff(since_start)
     if (steps <= 0).any():
         at = int(np.flatnonzero(steps <= 0)[0])
-        raise InputError(
-            "timestamps do not increase", where=f"{where}: record {at + 1}",
+        raise InputError("timestamps do not increase", where=f"{where}: record {at + 1}",
             expected=f"later than {numbers[at]} {unit}", got=str(numbers[at + 1]),
-            remedy="sort the records by time, and remove doubled ones",
-        )  # fmt: skip
+            remedy="sort the records by time, and remove doubled ones")  # fmt: skip
     low, high = PLAUSIBLE_PERIOD_S
     if len(steps) and not low <= (period := float(np.median(steps))) <= high:
         raw = period * UNITS_PER_SECOND[unit]
         fitting = [u for u, scale in UNITS_PER_SECOND.items() if low <= raw / scale <= high]
-        raise InputError(
-            "timestamps are in another unit than expected", where=where,
+        raise InputError("timestamps are in another unit than expected", where=where,
             expected=f"{unit}; records {low:g} to {high:g} s apart", got=f"records {period:.3g} s apart",
-            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording",
-        )  # fmt: skip
+            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording")  # fmt: skip
     return since_start
+
+
+def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> None:
+    """Refuse integer time stamps that are not since 1970 in the unit ``per_second`` (10**6 = microseconds)."""
+    unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
+    outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
+    if outside.any():
+        raise InputError("time stamp is in another unit", where=where, expected=f"{unit} since 1970",
+            got=f"{int(stamps[outside][0])}", remedy=f"convert the stamps to {unit}")  # fmt: skip
+    if len(stamps) and int(stamps.max()) - int(stamps.min()) > _MAX_LOG_S * per_second:
+        raise InputError("time stamps of one log span more than hours", where=where,
+            got=f"{int(stamps.min())} to {int(stamps.max())}", expected=f"{unit}, all of one recording",
+            remedy="are records of another log, or of another unit, mixed in?")  # fmt: skip
+
+
+def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
+    """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to the earlier."""
+    return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
 
 
 # --- poses ------------------------------------------------------------------------------------------------------------
@@ -193,10 +205,8 @@ def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
     if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
         got = numbers[3].tolist()
         transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
-        raise InputError(
-            "pose does not end in the row 0 0 0 1", where=where, got=str(got),
-            remedy="it looks transposed: write it row by row" if transposed else "write it row by row",
-        )  # fmt: skip
+        raise InputError("pose does not end in the row 0 0 0 1", where=where, got=str(got),
+            remedy="it looks transposed: write it row by row" if transposed else "write it row by row")  # fmt: skip
     return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
 
 
@@ -205,20 +215,16 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
     u, stretch, vt = np.linalg.svd(matrix)
     handed = float(np.linalg.det(u @ vt))
     if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
-        raise InputError(
-            "pose is scaled", where=where, expected="a rotation (scale 1)", got=f"scale {stretch[1]:.6g}",
-            remedy="divide the rotation part by its scale; are the translations in metres?",
-        )  # fmt: skip
+        raise InputError("pose is scaled", where=where, expected="a rotation (scale 1)", got=f"scale {stretch[1]:.6g}",
+            remedy="divide the rotation part by its scale; are the translations in metres?")  # fmt: skip
     if np.abs(stretch - 1).max() > POSE_TOLERANCE:
-        raise InputError(
-            "pose is not a rigid motion", where=where, expected="an orthonormal rotation part",
-            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}", remedy="is it row-major, without shear or scale?",
-        )  # fmt: skip
+        raise InputError("pose is not a rigid motion", where=where, expected="an orthonormal rotation part",
+            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}",
+            remedy="is it row-major, without shear or scale?")  # fmt: skip
     if handed < 0:
-        raise InputError(
-            "pose is left-handed", where=where, expected="determinant +1", got="a reflection (determinant -1)",
-            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras",
-        )  # fmt: skip
+        raise InputError("pose is left-handed", where=where, expected="determinant +1",
+            got="a reflection (determinant -1)",
+            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras")  # fmt: skip
     return u @ vt
 
 
@@ -230,22 +236,18 @@ def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matri
     """
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
-        raise InputError(
-            "pose is not a quaternion and a translation", where=where, expected="4 and 3 finite numbers",
-            got=f"{q.tolist()} and {t.tolist()}",
-        )  # fmt: skip
+        raise InputError("pose is not a quaternion and a translation", where=where, expected="4 and 3 finite numbers",
+            got=f"{q.tolist()} and {t.tolist()}")  # fmt: skip
     length = float(np.linalg.norm(q))
     if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise InputError(
-            "quaternion does not have length 1",
-            where=where,
-            expected="w, x, y, z of a rotation",
-            got=f"length {length:.6g}",
-        )
+        raise InputError("quaternion does not have length 1", where=where, expected="w, x, y, z of a rotation",
+            got=f"length {length:.6g}")  # fmt: skip
     return from_rotation_translation(matrix_from_quaternion(q), t)
 
 
-def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path") -> Matrix:
+def pose_near(
+    ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path"
+) -> Matrix:
     """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
 
     Raises:
@@ -257,13 +259,8 @@ def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATI
     first = time_s < ego.times_s[0]
     beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
     if beyond > max_beyond_s:
-        raise InputError(
-            "vehicle poses do not cover the images and scans",
-            where=where,
-            got=f"{beyond:.2f} s outside",
-            expected="poses from the first to the last frame",
-            remedy="is the pose file cut off, or of another log?",
-        )
+        raise InputError("vehicle poses do not cover the images and scans", where=where, got=f"{beyond:.2f} s outside",
+            expected="poses from the first to the last frame", remedy="is the pose file cut off, or of another log?")  # fmt: skip
     if len(ego.times_s) == 1:
         return ego.world_from_ego[0]
     near, far = (0, 1) if first else (-1, -2)
@@ -274,6 +271,51 @@ def pose_near(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATI
     back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
     end = ego.world_from_ego[near]
     return end if back is None else end @ invert(back) @ end
+
+
+def world_from_first(map_from_ego: Matrix) -> Matrix:
+    """The world whose origin is the first vehicle pose, its x axis along the first heading, its z axis the map's."""
+    return yaw_matrix(-yaw_of(map_from_ego)) @ from_rotation_translation(np.eye(3), -map_from_ego[:3, 3])
+
+
+def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:
+    """Vehicle path in time order; of poses at one time (within a microsecond) the first is kept."""
+    times = np.asarray(stamps_s, np.float64)
+    order = np.argsort(times, kind="stable")
+    kept = order[np.r_[True, np.diff(times[order]) > 1e-6]]
+    return EgoPath(times[kept], np.stack([poses[i] for i in kept]))
+
+
+def check_motion(ego: EgoPath, where: str) -> None:
+    """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are wrong then."""
+    upright = float(np.median(ego.world_from_ego[:, 2, 2]))
+    if upright < _LEAST_UPRIGHT:
+        raise InputError("the vehicle does not stand upright", where=where, expected="vehicle and map with z up",
+            got=f"its z axis rises by {upright:.2f} per metre",
+            remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
+    if len(ego.times_s) < 2:
+        return
+    # over a twentieth of a second at least: pose noise over less is no speed
+    later = np.minimum(np.searchsorted(ego.times_s, ego.times_s + _SPEED_OVER_S), len(ego.times_s) - 1)
+    pairs = np.flatnonzero(ego.times_s[later] - ego.times_s >= _SPEED_OVER_S)
+    first, last = (pairs, later[pairs]) if len(pairs) else (np.array([0]), np.array([len(ego.times_s) - 1]))
+    steps = ego.world_from_ego[last, :3, 3] - ego.world_from_ego[first, :3, 3]
+    speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
+    at = int(speed.argmax())
+    if speed[at] > MAX_SPEED_M_S:
+        raise InputError("the vehicle moves impossibly fast", where=where,
+            got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
+            expected=f"under {MAX_SPEED_M_S:.0f} m/s",
+            remedy="check the units of times and translations, and that all poses are of one log")  # fmt: skip
+    drives = speed > _DRIVES_M_S
+    if drives.any():
+        forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
+        along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
+        if along < _LEAST_ALONG:
+            raise InputError("the vehicle does not drive where it looks", where=where,
+                expected="vehicle axes x forward, y left, z up",
+                got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
+                remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
 
 
 def deskew(
@@ -297,33 +339,25 @@ def deskew(
     lidar_from_world = invert(world_from_lidar(time_s))
     corrections = [lidar_from_world @ world_from_lidar(time_s + float(moment)) for moment in moments]
     place = (dt_s.astype(np.float64) - low) / (moments[-1] - low) * _DESKEW_STEPS
-    step = np.clip(place.astype(int), 0, _DESKEW_STEPS - 1)
-    out = np.empty_like(xyz)
-    for index in range(_DESKEW_STEPS):
+    return blend_motion(xyz.astype(np.float64), corrections, place).astype(xyz.dtype)
+
+
+def blend_motion(
+    points: NDArray[np.floating], corrections: Sequence[Matrix], place: NDArray[np.floating]
+) -> NDArray[Any]:
+    """Move each of the points [N, 3] by what lies between two of many corrections, blended linearly.
+
+    Args:
+        points: metres; computed in their type.
+        corrections: f64[4, 4] each, at least two.
+        place: [N] number of the correction, with its fraction: 2.5 is halfway between the third and the fourth.
+    """
+    step = np.clip(place.astype(int), 0, len(corrections) - 2)
+    out = np.empty_like(points)
+    for index in range(len(corrections) - 1):
         chosen = step == index
         if chosen.any():
             share = (place[chosen] - index)[:, None]
-            points = xyz[chosen].astype(np.float64)
-            before, after = (transform_points(corrections[n], points) for n in (index, index + 1))
+            before, after = (transform_points(corrections[n], points[chosen]) for n in (index, index + 1))
             out[chosen] = before + share * (after - before)
     return out
-
-
-# --- moments ----------------------------------------------------------------------------------------------------------
-
-
-def moments(times_s: Mapping[str, Sequence[float]]) -> list[list[str]]:
-    """Group frames for ``holdout_split``: the first camera's images are the moments, others join the nearest one.
-
-    Args:
-        times_s: camera -> times of its frames in order; frame n of a camera has the id ``<camera>/00000n``.
-
-    Returns:
-        Frame ids of each moment, in time order.
-    """
-    clock = np.array(next((times for times in times_s.values() if len(times)), []))
-    groups: list[list[str]] = [[] for _ in clock]
-    for camera, times in times_s.items():
-        for index, time_s in enumerate(times):
-            groups[int(np.abs(clock - time_s).argmin())].append(f"{camera}/{index:06d}")
-    return groups

@@ -18,9 +18,6 @@ century, a clock that runs ten times too fast. Times after 2099 are read as such
 from __future__ import annotations
 
 import datetime
-import io
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -31,14 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError
 from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.clouds import read_npy
+from mudg.data.importers.clouds import npz_arrays
+from mudg.data.importers.columns import record_fields
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, path_inside, refuse_untwist, the_only
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -48,28 +46,13 @@ MICROSECONDS: Final = 10**6
 _YEAR_2100_US: Final = 4_102_444_800 * MICROSECONDS
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _BOXES_3D: Final = "1"
-_UNREADABLE: Final = (
-    zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError,
-)  # fmt: skip
-"""What a damaged archive raises."""
-
 LABELS: Final[Mapping[str, str]] = {
-    "Car": "car",
-    "Truck": "truck",
-    "Bus/RV/Caravan": "bus",
-    "Bus": "bus",
-    "Motorcycle": "motorcycle",
-    "Motorcyclist": "rider",
-    "Bicycle": "bicycle",
-    "Bicyclist": "rider",
-    "Person": "pedestrian",
-    "Pedestrian": "pedestrian",
-    "Train": "train",
-    "Trailer": "trailer",
-    "Towed Object": "towed_object",
+    "Car": "car", "Truck": "truck", "Bus/RV/Caravan": "bus", "Bus": "bus", "Motorcycle": "motorcycle",
+    "Motorcyclist": "rider", "Bicycle": "bicycle", "Bicyclist": "rider", "Person": "pedestrian",
+    "Pedestrian": "pedestrian", "Train": "train", "Trailer": "trailer", "Towed Object": "towed_object",
     "Wheeled Slow": "wheeled_slow",
-}
-"""Names of common ontologies in the product's words."""
+}  # fmt: skip
+"""Class names of common ontologies -> the labels of this package."""
 
 
 def looks_like_dgp(source: Path) -> bool:
@@ -91,7 +74,7 @@ def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "DGP", str(source))
+    refuse_untwist(options, "DGP", str(source))
     return drive_log.write_log(read_log(_choose_scene(source, options), options), out, options)
 
 
@@ -106,22 +89,11 @@ def _scenes(source: Path) -> list[Path]:
 def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
-        raise InputError(
-            "no DGP scene found",
-            where=str(source),
-            expected="scene_<hash>.json beside a calibration folder, here or in sub-folders",
-            got=", ".join(sorted(path.name for path in source.iterdir())[:10]) or "an empty folder",
-        )
+        raise InputError("no DGP scene found", where=str(source), got=folder_contents(source),
+            expected="scene_<hash>.json beside a calibration folder, here or in sub-folders")  # fmt: skip
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
-    if len(matching) != 1:
-        names = ", ".join(f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes[:8])
-        raise UsageError(
-            "the folder holds several scenes" if matching else "there is no such scene",
-            where=str(source),
-            expected=f"--sequence with the folder or file name of one of {names} ({len(scenes)} in all)",
-            got=options.sequence or "none chosen",
-        )
-    return matching[0]
+    names = [f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes]
+    return the_only(matching, names, options, source, "scene")
 
 
 def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
@@ -150,7 +122,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     folder, where = scene_file.parent, str(scene_file)
     log.info(f"dgp: {scene_file}")
     scene = store.read_json(scene_file)
-    try:
+    with record_fields("scene record is incomplete", where, "the fields of a DGP scene"):
         data = _read_data(scene, where)
         calibrations = {key: _read_calibration(folder, key) for key in sorted({d.calibration for d in data})}
         names = {d.sensor: d.sensor.lower() for d in data if d.kind == "image"}
@@ -166,7 +138,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
         images, sweeps = [], []
         cameras: dict[str, Camera] = {}
         for datum in used:
-            path = drive_log.path_inside(folder, datum.record.get("filename"), datum.where)
+            path = path_inside(folder, datum.record.get("filename"), datum.where)
             if datum.kind == "image":
                 name = names[datum.sensor]
                 _add_camera(cameras, calibrations[datum.calibration], name, datum)
@@ -176,14 +148,10 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
                 sweeps.append(SweepRecord(datum.sensor.lower(), seconds(datum), datum.map_from_sensor, path, read))
         anchors = clouds or [d for d in used if d.sensor == next(iter(chosen.values()))]
         mounts = [calibrations[d.calibration].mount(d.sensor, d.where) for d in anchors]
-        ego = drive_log.ego_path(
+        ego = common.ego_path(
             [seconds(d) for d in anchors], [d.map_from_sensor @ invert(m) for d, m in zip(anchors, mounts, strict=True)]
         )
         tracks, track_notes = _read_tracks(folder, scene, clouds, [seconds(d) for d in clouds])
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            "scene record is incomplete", where=where, got=repr(error), expected="the fields of a DGP scene"
-        ) from error
     ordered = {name: cameras[name] for name in chosen}
     source = Source("dgp", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
@@ -228,9 +196,9 @@ def _clock(data: Sequence[_Datum], where: str) -> tuple[int, list[str]]:
     """Ticks of ``stamp_us`` per second, and notes."""
     stamps = np.array([datum.stamp_us for datum in data], np.int64)
     if (stamps > _YEAR_2100_US).all():
-        drive_log.check_epoch(stamps // 10, MICROSECONDS, where)
+        common.check_epoch(stamps // 10, MICROSECONDS, where)
         return 10 * MICROSECONDS, ["dates after 2099: times are read as tenths of a microsecond"]
-    drive_log.check_epoch(stamps, MICROSECONDS, where)
+    common.check_epoch(stamps, MICROSECONDS, where)
     return MICROSECONDS, []
 
 
@@ -243,7 +211,7 @@ def _pose(value: Mapping[str, Any], where: str) -> Matrix:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Calibration:
+class _DgpCalibration:
     """One calibration file: intrinsics records and vehicle-from-sensor f64[4, 4] by sensor."""
 
     intrinsics: Mapping[str, Mapping[str, Any]]
@@ -252,28 +220,23 @@ class _Calibration:
 
     def mount(self, sensor: str, where: str) -> Matrix:
         if sensor not in self.mounts:
-            raise InputError(
-                "calibration lacks a sensor",
-                where=self.where,
-                expected=f"{sensor} ({where})",
-                got=", ".join(self.mounts),
-            )
+            raise InputError("calibration lacks a sensor", where=self.where, expected=f"{sensor} ({where})",
+                got=", ".join(self.mounts))  # fmt: skip
         return self.mounts[sensor]
 
 
-def _read_calibration(folder: Path, key: str) -> _Calibration:
-    path = drive_log.path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
+def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
+    path = path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
     record = store.read_json(path)
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
-        raise InputError(
-            "calibration lists differ in length", where=str(path), expected="names, extrinsics, intrinsics"
-        )
+        raise InputError("calibration lists differ in length", where=str(path),
+            expected="names, extrinsics, intrinsics")  # fmt: skip
     mounts = {n: _pose(value, f"{path}: {n}") for n, value in zip(names, record["extrinsics"], strict=True)}
-    return _Calibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
+    return _DgpCalibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
 
 
-def _add_camera(cameras: dict[str, Camera], calibration: _Calibration, name: str, datum: _Datum) -> None:
+def _add_camera(cameras: dict[str, Camera], calibration: _DgpCalibration, name: str, datum: _Datum) -> None:
     """The datum's camera; all images of a scene must share it. Half a pixel is added: pixel centres are whole numbers here."""
     calibration.mount(datum.sensor, datum.where)
     k = {key: float(calibration.intrinsics[datum.sensor].get(key, 0.0)) for key in ("fx", "fy", "cx", "cy", "skew")}
@@ -283,12 +246,8 @@ def _add_camera(cameras: dict[str, Camera], calibration: _Calibration, name: str
     width, height = int(datum.record["width"]), int(datum.record["height"])
     camera = Camera(name, width, height, k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5)
     if cameras.setdefault(name, camera) != camera:
-        raise InputError(
-            "images of one camera differ in size or calibration",
-            where=datum.where,
-            expected=str(cameras[name]),
-            got=str(camera),
-        )
+        raise InputError("images of one camera differ in size or calibration", where=datum.where,
+            expected=str(cameras[name]), got=str(camera))  # fmt: skip
 
 
 # --- boxes and clouds -------------------------------------------------------------------------------------------------
@@ -306,17 +265,15 @@ def _read_tracks(
     for datum, time_s, name in zip(clouds, times_s, files, strict=True):
         if not name:
             continue
-        path = drive_log.path_inside(folder, name, datum.where)
+        path = path_inside(folder, name, datum.where)
         for index, item in enumerate(store.read_json(path)["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
-                raise InputError(
-                    "box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
-                    expected=", ".join(str(number) for number in names),
-                )  # fmt: skip
+                raise InputError("box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
+                    expected=", ".join(str(number) for number in names))  # fmt: skip
             box = item["box"]
             size = box["length"], box["width"], box["height"]
-            label = tracks.word(names[item["class_id"]])
+            label = tracks.label_of(names[item["class_id"]])
             pose = datum.map_from_sensor @ _pose(box["pose"], where)
             tracks.add(str(item["instance_id"]), label, time_s, size, pose, where=where)
     return tracks.tracks()
@@ -324,7 +281,7 @@ def _read_tracks(
 
 def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
     key = scene["ontologies"].get(_BOXES_3D)
-    path = drive_log.path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
+    path = path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
     return {int(item["id"]): str(item["name"]) for item in store.read_json(path)["items"]}
 
 
@@ -335,38 +292,16 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
         InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite.
     """
     where = str(path)
-    try:
-        with zipfile.ZipFile(io.BytesIO(store.read_bytes(path))) as archive:
-            entry = archive.getinfo("data.npy")
-            with archive.open(entry) as handle:
-                data = read_npy(handle, entry.file_size, f"{where}: data.npy")
-    except _UNREADABLE as error:
-        raise InputError(
-            "cloud is no npz file with an array 'data', or is cut off",
-            where=where,
-            got=str(error),
-            remedy="copy the file again",
-        ) from error
+    data = npz_arrays(store.read_bytes(path), where).get("data", np.zeros(0))
     columns = [str(name).upper() for name in point_format] or ["X", "Y", "Z", "INTENSITY"]
-    if (
-        data.ndim != 2
-        or data.shape[1] != len(columns)
-        or data.dtype.kind not in "fiu"
-        or not {"X", "Y", "Z"} <= {*columns}
-    ):
-        raise InputError(
-            "cloud does not have its columns",
-            where=where,
-            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
-            got=f"{data.dtype} {data.shape}",
-        )
+    fits = data.ndim == 2 and data.shape[1] == len(columns) and data.dtype.kind in "fiu"
+    if not fits or not {"X", "Y", "Z"} <= {*columns}:
+        raise InputError("cloud does not have its columns", where=f"{where}: data", got=f"{data.dtype} {data.shape}",
+            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}")  # fmt: skip
     data = data.astype(np.float32)
     if not np.isfinite(data).all():
-        raise InputError(
-            "cloud holds values that are not finite",
-            where=where,
-            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points",
-        )
+        raise InputError("cloud holds values that are not finite", where=where,
+            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")  # fmt: skip
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
     return SweepPoints(xyz, np.clip(intensity, 0, 1), np.zeros(len(data), np.float32))

@@ -14,7 +14,7 @@ A scene's cameras are pinhole cameras: projection, fusion and rasteriser know no
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +26,7 @@ from PIL import Image
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera
+from mudg.core.pictures import resize_nearest, shrink_exact
 from mudg.data.importers.options import ImportOptions, Resolution
 from mudg.data.scene import decode_image
 
@@ -55,10 +56,7 @@ def brown_conrady(
         r2 = x * x + y * y
         radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
+            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
             1,
         )
 
@@ -88,26 +86,26 @@ class ImageFit:
     Args:
         camera: the scene's camera: pinhole, rectified, of the scene's size.
         recorded: the camera as recorded: its size is that of the files.
-        words: what is done, for ``Source.notes``; empty if images are kept as they are.
+        note: what is done, for ``Source.notes``; empty if images are kept as they are.
         table: where each pixel of the rectified image (recorded size) comes from; None if images are rectified already.
     """
 
     camera: Camera
     recorded: Camera
-    words: str
+    note: str
     table: _Table | None
 
     @property
     def keeps_bytes(self) -> bool:
         """Whether images are taken as they are."""
-        return not self.words
+        return not self.note
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
         """One recorded image as ``SceneWriter.add_frame`` wants it.
 
         Args:
             image: u8[H, W, 3], or path or bytes of a PNG or JPEG.
-            where: words for the image, for errors.
+            where: names the image, for errors.
 
         Returns:
             ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95 for a
@@ -138,23 +136,17 @@ class ImageFit:
         if self.table is not None:
             rgb = self.table.bilinear(rgb)
         size = (self.camera.height, self.camera.width)
-        return rgb if rgb.shape[:2] == size else shrink(rgb, *size)
+        return rgb if rgb.shape[:2] == size else shrink_exact(rgb, *size)
 
     def ids(self, ids: NDArray[Any]) -> NDArray[Any]:
         """Labels [H, W] of the recorded size -> [h, w] of the scene's: each pixel takes the nearest recorded one, none are mixed."""
         height, width = self.recorded.height, self.recorded.width
         if ids.shape != (height, width):
-            raise InputError(
-                "label does not have its camera's size", where=f"camera {self.camera.name}",
-                expected=f"[{height}, {width}]", got=str(list(ids.shape)),
-            )  # fmt: skip
+            raise InputError("label does not have its camera's size", where=f"camera {self.camera.name}",
+                expected=f"[{height}, {width}]", got=str(list(ids.shape)))  # fmt: skip
         if self.table is not None:
             ids = self.table.nearest(ids)
-        if (self.camera.height, self.camera.width) == (height, width):
-            return ids
-        rows = (np.arange(self.camera.height) + 0.5) * height / self.camera.height
-        columns = (np.arange(self.camera.width) + 0.5) * width / self.camera.width
-        return ids[rows.astype(int)[:, None], columns.astype(int)]
+        return resize_nearest(ids, self.camera.height, self.camera.width)
 
 
 def fit_images(
@@ -171,19 +163,30 @@ def fit_images(
     Raises:
         InputError: the lens cannot be rectified like this. UsageError: ``resolution`` is larger than the images.
     """
-    words = []
+    changes = []
     table = None
     out = camera
     if lens is not None:
         out = target or covering_camera(camera, lens)
         table = _Table.of(out, camera, lens)
-        words.append(f"rectified, focal length times {out.fx / camera.fx:.3f}")
+        changes.append(f"rectified, focal length times {out.fx / camera.fx:.3f}")
     size = resized(out.width, out.height, options.resolution, f"camera {camera.name}")
     if size != (out.width, out.height):
-        words.append(f"resized from {out.width}x{out.height} to {size[0]}x{size[1]}")
+        changes.append(f"resized from {out.width}x{out.height} to {size[0]}x{size[1]}")
         out = out.resized(*size)
-    note = f"camera {camera.name}: images {'; '.join(words)}" if words else ""
+    note = f"camera {camera.name}: images {'; '.join(changes)}" if changes else ""
     return ImageFit(out, camera, note, table)
+
+
+def image_notes(fits: Mapping[str, ImageFit]) -> list[str]:
+    """What is done to the images of the cameras, for ``Source.notes``; nothing where they are kept as they are."""
+    return [fit.note for fit in fits.values() if fit.note]
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, which is decoded to prove that it is one."""
+    height, width = decode_image(store.read_bytes(path), str(path)).shape[:2]
+    return width, height
 
 
 def resized(width: int, height: int, resolution: Resolution | None, where: str = "") -> tuple[int, int]:
@@ -194,10 +197,8 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
         scale = min(1.0, resolution / max(width, height))
         return max(1, round(width * scale)), max(1, round(height * scale))
     if resolution[0] > width or resolution[1] > height:
-        raise UsageError(
-            "images are never enlarged", where=where or "--resolution", expected=f"at most {width}x{height}",
-            got=f"{resolution[0]}x{resolution[1]}",
-        )  # fmt: skip
+        raise UsageError("images are never enlarged", where=where or "--resolution",
+            expected=f"at most {width}x{height}", got=f"{resolution[0]}x{resolution[1]}")  # fmt: skip
     return resolution
 
 
@@ -219,11 +220,9 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
         return camera
     problem = _border_problem(at(high), camera, lens)
     if problem is not None:
-        raise InputError(
-            "lens cannot be rectified to a pinhole camera of its own size", where=f"camera {camera.name}", got=problem,
-            expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
-            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera",
-        )  # fmt: skip
+        raise InputError("lens cannot be rectified to a pinhole camera of its own size", where=f"camera {camera.name}",
+            got=problem, expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
+            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera")  # fmt: skip
     while high - low > 1e-4:
         middle = (low + high) / 2
         low, high = (middle, high) if _border_problem(at(middle), camera, lens) else (low, middle)
@@ -273,10 +272,8 @@ class _Table:
             place = lens(xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5
             outside = (place < -0.51) | (place > np.array([camera.width, camera.height]) - 0.49)
             if not np.isfinite(place).all() or outside.any():
-                raise InputError(
-                    "rectified camera looks beyond the recorded image", where=f"camera {camera.name}",
-                    got=f"row {rows.start} on", remedy="choose a narrower pinhole camera",
-                )  # fmt: skip
+                raise InputError("rectified camera looks beyond the recorded image", where=f"camera {camera.name}",
+                    got=f"row {rows.start} on", remedy="choose a narrower pinhole camera")  # fmt: skip
             place = place.clip(0, np.array([camera.width, camera.height]) - 1.0)
             whole = np.minimum(place.astype(np.int64), [max(camera.width - 2, 0), max(camera.height - 2, 0)])
             part = np.minimum(np.round((place - whole) * 256), 255).astype(np.uint8)
@@ -303,33 +300,3 @@ class _Table:
         """Each target pixel as its nearest source pixel."""
         place = self.corner + (self.right >= 128) + (self.down >= 128).astype(np.int32) * self.size[1]
         return np.ascontiguousarray(ids).reshape(-1).take(place)
-
-
-# --- shrinking --------------------------------------------------------------------------------------------------------------
-
-
-def shrink(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """u8[H, W, 3] -> u8[height, width, 3]: each new pixel is the mean over its exact area of the old image.
-
-    Raises:
-        InputError: larger than the image.
-    """
-    tall, wide = rgb.shape[:2]
-    if height > tall or width > wide:
-        raise InputError("images are never enlarged", expected=f"at most {wide}x{tall}", got=f"{width}x{height}")
-    down = _area_weights(tall, height) @ rgb.reshape(tall, wide * 3).astype(np.float32)
-    across = _area_weights(wide, width) @ down.reshape(height, wide, 3).transpose(1, 0, 2).reshape(wide, height * 3)
-    return np.rint(across.reshape(width, height, 3).transpose(1, 0, 2)).clip(0, 255).astype(np.uint8)
-
-
-def _area_weights(old: int, new: int) -> Any:
-    """Sparse f32[new, old]: the share of each old pixel in each new one; rows add to 1."""
-    from scipy.sparse import csr_matrix
-
-    edges = np.arange(new + 1) * (old / new)
-    first = np.floor(edges[:-1] + 1e-9).astype(int)
-    last = np.minimum(np.ceil(edges[1:] - 1e-9).astype(int), old)
-    rows = np.repeat(np.arange(new), last - first)
-    columns = np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
-    share = np.minimum(columns + 1, edges[rows + 1]) - np.maximum(columns, edges[rows])
-    return csr_matrix(((share * new / old).astype(np.float32), (rows, columns)), (new, old))

@@ -51,9 +51,8 @@ def parse_frame_range(text: str) -> tuple[int, int] | None:
         return None
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text.strip())
     if match is None or int(match[1]) >= int(match[2]):
-        raise UsageError(
-            "frame range makes no sense", where="--frames", expected="FIRST:END with FIRST < END, e.g. 0:16", got=text
-        )
+        raise UsageError("frame range makes no sense", where="--frames",
+            expected="FIRST:END with FIRST < END, e.g. 0:16", got=text)  # fmt: skip
     return int(match[1]), int(match[2])
 
 
@@ -68,10 +67,8 @@ def parse_resolution(text: str) -> Resolution | None:
     match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
     sides = [int(side) for side in match.groups() if side] if match is not None else []
     if not sides or min(sides) < 16:
-        raise UsageError(
-            "image size makes no sense", where="--resolution",
-            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels", got=text,
-        )  # fmt: skip
+        raise UsageError("image size makes no sense", where="--resolution",
+            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels", got=text)  # fmt: skip
     return sides[0] if len(sides) == 1 else (sides[0], sides[1])
 
 

@@ -28,6 +28,10 @@ MAX_OPCODES: Final = 20_000_000
 _MAX_DIMENSIONS: Final = 4
 _DTYPE: Final = re.compile(r"b1|[iu][1248]|f[248]|O8?|[US]\d{1,4}")
 _MARK: Final = object()
+_MALFORMED: Final = (
+    ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, struct.error,
+)  # fmt: skip
+"""What a malformed pickle makes the disassembler or an opcode raise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +42,7 @@ class Name:
 
 
 @dataclass(slots=True)
-class Record:
+class PickledObject:
     """An object of an allowed class as plain values: its class' name, arguments, state, and items if it is a list."""
 
     name: str
@@ -78,7 +82,7 @@ class Array:
 def _filled(shape: Any, dtype: Any, order: str, content: Any) -> NDArray[Any]:
     if not isinstance(dtype, Dtype):
         raise ValueError("array without a type")
-    sizes = [_whole(side) for side in shape]
+    sizes = [_integer(side) for side in shape]
     if len(sizes) > _MAX_DIMENSIONS or min(sizes, default=0) < 0:
         raise ValueError(f"array of shape {tuple(sizes)}")
     count = math.prod(sizes)
@@ -95,7 +99,7 @@ def _filled(shape: Any, dtype: Any, order: str, content: Any) -> NDArray[Any]:
     return flat.reshape(sizes, order="F" if order == "F" else "C")
 
 
-def _whole(value: Any) -> int:
+def _integer(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError(f"{value!r} is no whole number")
     return value
@@ -129,21 +133,20 @@ NUMPY_MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) -> Any:
-    """Plain values from a pickle: numbers, texts, bytes, lists, tuples, dicts, ``Array``, ``Record``.
+    """Plain values from a pickle: numbers, texts, bytes, lists, tuples, dicts, ``Array``, ``PickledObject``.
 
     Args:
         content: the pickle, protocol 0 to 5.
         where: for messages.
         makers: name in the file (``module.name``) -> function from plain values to a plain value; None = a class or name
-            that may only be mentioned: objects of it become a ``Record``.
+            that may only be mentioned: objects of it become a ``PickledObject``.
 
     Raises:
         InputError: cut off, malformed, too large, or it names something that is not in ``makers``.
     """
     if len(content) > MAX_BYTES:
-        raise InputError(
-            "pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes", got=f"{len(content)} bytes"
-        )
+        raise InputError("pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes",
+            got=f"{len(content)} bytes")  # fmt: skip
     machine = _Machine(where, makers)
     try:
         for count, (opcode, argument, _place) in enumerate(pickletools.genops(content)):
@@ -152,28 +155,15 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
             if opcode.name == "STOP":
                 return machine.result()
             machine.step(opcode.name, argument)
-    except (
-        ValueError,
-        IndexError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-        struct.error,
-    ) as error:
-        raise InputError(
-            "pickle is malformed or cut off",
-            where=where,
-            got=f"{type(error).__name__}: {error}"[:200],
-            remedy="copy the file again",
-        ) from error
+    except _MALFORMED as error:
+        raise InputError("pickle is malformed or cut off", where=where, got=f"{type(error).__name__}: {error}"[:200],
+            remedy="copy the file again") from error  # fmt: skip
     raise InputError("pickle is cut off", where=where, expected="an end mark", remedy="copy the file again")
 
 
 def as_list(value: Any, where: str) -> list[Any]:
     """The items of a pickled list, tuple, array, or object of an allowed list class."""
-    if isinstance(value, Record):
+    if isinstance(value, PickledObject):
         return value.items
     if isinstance(value, Array) and value.value is not None:
         return value.value.tolist()
@@ -226,12 +216,8 @@ class _Machine:
         elif opcode == "DUP":
             stack.append(stack[-1])
         else:
-            raise InputError(
-                "pickle uses an operation that plain data does not need",
-                where=self._where,
-                got=opcode,
-                remedy="the file is not what the data set ships; do not open it with Python's pickle",
-            )
+            raise InputError("pickle uses an operation that plain data does not need", where=self._where, got=opcode,
+                remedy="the file is not what the data set ships; do not open it with Python's pickle")  # fmt: skip
 
     def _since_mark(self) -> list[Any]:
         for index in range(len(self._stack) - 1, -1, -1):
@@ -248,13 +234,9 @@ class _Machine:
             name, module = self._stack.pop(), self._stack.pop()
         text = f"{module}.{name}"
         if text not in self._makers:
-            raise InputError(
-                f"pickle asks for {text!r}, which is not plain data",
-                where=self._where,
-                expected="numbers, texts, lists and arrays",
-                got=text[:120],
-                remedy="nothing was run. If the file comes from the data set itself, convert it to a plain format",
-            )
+            raise InputError(f"pickle asks for {text!r}, which is not plain data", where=self._where,
+                expected="numbers, texts, lists and arrays", got=text[:120],
+                remedy="nothing was run. If the file comes from the data set itself, convert it to a plain format")  # fmt: skip
         self._stack.append(Name(text))
 
     def _remember(self, opcode: str, argument: Any) -> None:
@@ -282,7 +264,7 @@ class _Machine:
             stack.append(self._since_mark())
         elif opcode in ("APPEND", "APPENDS"):
             items = [stack.pop()] if opcode == "APPEND" else self._since_mark()
-            target = stack[-1].items if isinstance(stack[-1], Record) else stack[-1]
+            target = stack[-1].items if isinstance(stack[-1], PickledObject) else stack[-1]
             if not isinstance(target, list):
                 raise TypeError("items for something that is no list")
             target.extend(items)
@@ -302,7 +284,7 @@ class _Machine:
         if opcode == "BUILD":
             state = stack.pop()
             target = stack[-1]
-            if isinstance(target, Record):
+            if isinstance(target, PickledObject):
                 target.state = state
             elif isinstance(target, Dtype | Array):
                 target.build(state)
@@ -314,14 +296,16 @@ class _Machine:
         arguments, kind = stack.pop(), stack.pop()
         if not isinstance(arguments, tuple):
             raise TypeError("arguments are no tuple")
-        if isinstance(kind, Record):  # a call of an object: kept as it stands, whoever knows its class may read it
-            stack.append(Record(kind.name, (kind, *arguments)))
+        if isinstance(
+            kind, PickledObject
+        ):  # a call of an object: kept as it stands, whoever knows its class may read it
+            stack.append(PickledObject(kind.name, (kind, *arguments)))
         elif not isinstance(kind, Name):
             raise TypeError(f"a call of a {type(kind).__name__}")
         else:
             maker = self._makers[kind.text]
             if maker is None or opcode != "REDUCE":
-                stack.append(Record(kind.text, arguments))
+                stack.append(PickledObject(kind.text, arguments))
             else:
                 stack.append(maker(*arguments))
 

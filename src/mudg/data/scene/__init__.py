@@ -8,23 +8,18 @@
     manifest.json                    sha256 of every file; checked at each read where it is there
 
 The writer builds the tree beside its destination and moves it into place at ``finish``: a scene is there completely or
-not at all. The same tree as one stored zip is the portable form; every reader here takes both.
+not at all. The same tree as one stored zip is the portable form: ``write_zip`` makes it, and every reader here takes both.
 """
 
 from __future__ import annotations
 
 from mudg.data.scene.check import Finding, check_scene
-from mudg.data.scene.read import (
-    decode_image,
-    read_image,
-    read_label,
-    read_points,
-    read_scene,
-    read_trusted_classes,
-)
-from mudg.data.scene.write import SceneWriter, write_zip
+from mudg.data.scene.labels import read_label, read_trusted_classes
+from mudg.data.scene.read import decode_image, read_image, read_points, read_scene
+from mudg.data.scene.write import SCENE_FILES, SceneWriter, write_zip
 
 __all__ = [
+    "SCENE_FILES",
     "Finding",
     "SceneWriter",
     "check_scene",

@@ -17,7 +17,7 @@ MAX_GAP_S = 0.06
 
 
 def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
-    """The nearest sweep of each LiDAR, if within ``max_gap_s`` of the image; the nearest of all first."""
+    """The nearest sweep of each LiDAR within ``max_gap_s`` seconds of the image, in the order of their distance in time."""
     nearest: dict[str, Sweep] = {}
     for sweep in scene.sweeps:
         best = nearest.get(sweep.sensor)
@@ -28,7 +28,7 @@ def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
 
 
 def camera_alignment(scene: Scene) -> dict[str, EdgeAlignment]:
-    """Camera name -> how its images fit the sweeps of their moments, from up to six images. A scene without sweeps: empty."""
+    """Camera name -> how its images fit the sweeps of the same time, from up to six images; empty without sweeps."""
     if not scene.sweeps:
         return {}
     with log.task("comparing LiDAR and image edges", len(scene.cameras)) as bar:
@@ -47,7 +47,7 @@ def _shots(scene: Scene, name: str) -> Iterator[tuple[View, Any, Any, Any]]:
             yield frame.view, read_image(scene, frame), sweep.world_from_lidar, read_points(scene, sweep).xyz
 
 
-def words(name: str, found: EdgeAlignment) -> str:
+def describe(name: str, found: EdgeAlignment) -> str:
     """One sentence about a camera."""
     if found.verdict == "unknown":
         if found.jumps < MIN_JUMPS:
@@ -68,7 +68,7 @@ def words(name: str, found: EdgeAlignment) -> str:
     )
 
 
-def record(found: EdgeAlignment) -> dict[str, Any]:
+def to_json(found: EdgeAlignment) -> dict[str, Any]:
     """Plain values for JSON."""
     return {
         "verdict": found.verdict, "score": round(found.score, 3), "best_turn_deg": list(found.best_turn_deg),

@@ -1,37 +1,36 @@
-"""The deep check behind ``mudg doctor SCENE``: reads every file of a scene and says in words what is wrong or odd."""
+"""The deep check behind ``mudg doctor SCENE``: reads every file of a scene and lists what is wrong or odd."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mudg.base import geometry, log
 from mudg.base.errors import MudgError
 from mudg.base.types import Frame, Scene, Sweep, SweepPoints, Track
-from mudg.data.scene import read as scene_read
+from mudg.data.scene.labels import read_label
+from mudg.data.scene.read import load_scene, read_image, read_points
 
 Level = Literal["error", "warning", "note"]
+_LEVELS: Final = ("error", "warning", "note")
 
-MAX_SPEED_M_S = 70.0
-MAX_TIME_S = 24 * 3600.0
-MAX_TRACK_GAP_S = 1.0
-SAME_MOMENT_S = 0.06
-MAX_GAP_STEPS = 1.8
-MIN_STEP_M = 0.05
-MIN_COURSE_M = 3.0
-VEHICLES = frozenset(
+MAX_SPEED_M_S: Final = 70.0
+MAX_TIME_S: Final = 24 * 3600.0
+MAX_TRACK_GAP_S: Final = 1.0
+SAME_MOMENT_S: Final = 0.06
+MAX_GAP_STEPS: Final = 1.8
+MIN_STEP_M: Final = 0.05
+MIN_COURSE_M: Final = 3.0
+VEHICLES: Final = frozenset(
     ("car", "van", "truck", "bus", "vehicle", "trailer", "towed_object", "construction_vehicle", "tram", "train", "motorcycle",
      "bicycle")
 )  # fmt: skip
 """Labels of what drives. These are longer than wide; barriers, signs and people need not be."""
-
-
-Say = Callable[[Level, str, str], None]
-Complain = Callable[[MudgError], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +39,18 @@ class Finding:
 
     level: Level
     where: str
-    words: str
+    message: str
+
+
+Findings = Iterator[Finding]
+
+
+def _warning(where: str, message: str) -> Finding:
+    return Finding("warning", where, message)
+
+
+def _note(where: str, message: str) -> Finding:
+    return Finding("note", where, message)
 
 
 def check_scene(path: Path | str) -> list[Finding]:
@@ -50,113 +60,104 @@ def check_scene(path: Path | str) -> list[Finding]:
     nothing was found.
     """
     findings: list[Finding] = []
-
-    def complain(problem: MudgError) -> None:
-        findings.append(finding_of(problem, str(path)))
-
-    def say(level: Level, where: str, words: str) -> None:
-        findings.append(Finding(level, where, words))
-
     try:
-        scene = scene_read.load_scene(path, complain)
+        scene = load_scene(path, lambda problem: findings.append(finding_of(problem, str(path))))
     except MudgError as problem:
-        complain(problem)
-        return findings
-    check_records(scene, say)
+        return [*findings, finding_of(problem, str(path))]
+    findings.extend(check_records(scene))
     with log.task("checking files", len(scene.frames) + len(scene.sweeps)) as bar:
         for frame in scene.frames:
-            _check_frame(scene, frame, complain, say)
+            findings.extend(collected(_check_image_file(scene, frame), str(path)))
+            for name in frame.labels:
+                findings.extend(collected(_check_label(scene, frame, name), str(path)))
             bar.advance()
         for sweep in scene.sweeps:
-            _check_sweep(scene, sweep, complain, say)
+            findings.extend(collected(_check_sweep(scene, sweep), str(path)))
             bar.advance()
     return worst_first(findings)
 
 
+def collected(findings: Findings, where: str) -> list[Finding]:
+    """The findings of a check; an error that it raises becomes the last one. ``where`` as in ``finding_of``."""
+    found: list[Finding] = []
+    try:
+        found.extend(findings)
+    except MudgError as problem:
+        found.append(finding_of(problem, where))
+    return found
+
+
 def worst_first(findings: list[Finding]) -> list[Finding]:
     """Errors, then warnings, then notes; each in the order found."""
-    rank = {"error": 0, "warning": 1, "note": 2}
-    return sorted(findings, key=lambda finding: rank[finding.level])
+    return sorted(findings, key=lambda finding: _LEVELS.index(finding.level))
 
 
 def finding_of(problem: MudgError, where: str) -> Finding:
     """A raised problem as a finding; ``where`` stands in for a missing place."""
-    words = "; ".join(
-        part
-        for part in (
-            problem.what,
-            _and("expected", problem.expected),
-            _and("got", problem.got),
-            _and("what to do", problem.remedy),
-        )
-        if part
-    )
-    return Finding("error", problem.where or where, words)
+    details = {"expected": problem.expected, "got": problem.got, "what to do": problem.remedy}
+    message = "; ".join((problem.what, *(f"{name}: {text}" for name, text in details.items() if text)))
+    return Finding("error", problem.where or where, message)
 
 
-def check_records(scene: Scene, say: Say) -> None:
+def check_records(scene: Scene) -> Findings:
     """What can be said without opening images and clouds: motion, boxes, how things relate."""
-    _check_motion(scene, say)
-    _check_gaps(scene, say)
-    _check_tracks(scene, say)
-    _check_relations(scene, say)
+    yield from _check_cameras(scene)
+    yield from _check_ego(scene)
+    yield from _check_gaps(scene)
+    yield from _check_tracks(scene)
+    yield from _check_relations(scene)
 
 
-def _and(name: str, value: str) -> str:
-    return f"{name}: {value}" if value else ""
+def _speeds(places_m: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Speed in m/s of each step between places f64[T, 3]."""
+    return np.linalg.norm(np.diff(places_m, axis=0), axis=1) / np.diff(times_s).clip(1e-9)
 
 
-def _check_motion(scene: Scene, say: Say) -> None:
+def _check_cameras(scene: Scene) -> Findings:
     """Speeds, units of time, and which way is up."""
     for name in scene.cameras:
-        frames = scene.frames_of(name)
+        frames, where = scene.frames_of(name), f"camera {name}"
         times = np.array([frame.view.time_s for frame in frames])
         if len(times) and np.abs(times).max() > MAX_TIME_S:
-            say(
-                "warning",
-                f"camera {name}",
-                f"times reach {np.abs(times).max():.6g}; are they seconds since the start of the log?",
-            )
+            latest = f"times reach {np.abs(times).max():.6g}"
+            yield _warning(where, f"{latest}; are they seconds since the start of the log?")
         if len(frames) > 1:
             centers = np.stack([frame.view.center_world for frame in frames])
-            speed = np.linalg.norm(np.diff(centers, axis=0), axis=1) / np.diff(times).clip(1e-9)
+            speed = _speeds(centers, times)
             if speed.max() > MAX_SPEED_M_S:
-                at = frames[int(speed.argmax())].id
-                say(
-                    "warning",
-                    f"frame {at}",
-                    f"the camera moves at {speed.max():.0f} m/s to the next frame; check units of time and place",
-                )
+                fastest = f"the camera moves at {speed.max():.0f} m/s to the next frame"
+                yield _warning(f"frame {frames[int(speed.argmax())].id}", f"{fastest}; check units of time and place")
             if np.allclose(centers, centers[0], atol=1e-6):
-                say("note", f"camera {name}", "all poses are the same: nothing can be learnt about depth from motion")
+                yield _note(where, "all poses are the same: nothing can be learnt about depth from motion")
         downs = [float(frame.view.world_from_cam[2, 1]) for frame in frames]
         if downs and np.median(downs) > -0.5:
-            say(
-                "warning",
-                f"camera {name}",
+            yield _warning(
+                where,
                 "its image's down direction does not point to the ground; is the world z up and the camera "
                 "x right, y down, z forward?",
             )
+
+
+def _check_ego(scene: Scene) -> Findings:
     ego = scene.ego
     if len(ego.times_s) > 1:
-        speed = np.linalg.norm(np.diff(ego.world_from_ego[:, :3, 3], axis=0), axis=1) / np.diff(ego.times_s)
+        speed = _speeds(ego.world_from_ego[:, :3, 3], ego.times_s)
         if speed.max() > MAX_SPEED_M_S:
-            say("warning", "ego path", f"the vehicle moves at {speed.max():.0f} m/s; check units of time and place")
+            yield _warning("ego path", f"the vehicle moves at {speed.max():.0f} m/s; check units of time and place")
     if scene.frames:
         first = scene.frames[0].view.center_world
         distance = float(np.linalg.norm(first - ego.world_from_ego[0, :3, 3]))
         if distance > 20:
-            say("warning", f"frame {scene.frames[0].id}", f"the camera is {distance:.0f} m away from the vehicle")
+            yield _warning(f"frame {scene.frames[0].id}", f"the camera is {distance:.0f} m away from the vehicle")
         if np.linalg.norm(first) > 10_000:
-            say(
-                "warning",
+            yield _warning(
                 "world",
                 f"the log starts {np.linalg.norm(first):.0f} m from the origin; float32 points lose precision there: "
                 "put the origin near the first pose",
             )
 
 
-def _check_gaps(scene: Scene, say: Say) -> None:
+def _check_gaps(scene: Scene) -> Findings:
     """Images or sweeps that seem to be missing: a step in time much longer than usual."""
     streams = {f"camera {name}": [f.view.time_s for f in scene.frames_of(name)] for name in scene.cameras}
     for sweep in scene.sweeps:
@@ -169,16 +170,44 @@ def _check_gaps(scene: Scene, say: Say) -> None:
         gaps = np.flatnonzero(steps > MAX_GAP_STEPS * usual)
         if len(gaps):
             missing = int(np.round(steps[gaps] / max(usual, 1e-9) - 1).sum())
-            say(
-                "warning",
+            yield _warning(
                 where,
                 f"about {missing} records are missing: {len(gaps)} gaps, the first of {steps[gaps[0]]:.2f} s after "
                 f"{times[int(gaps[0])]:.2f} s (usual: {usual:.3f} s)",
             )
 
 
-def _check_course(track: Track, where: str, say: Say) -> None:
-    """Whether a moving box looks where it goes: a quarter turn means swapped sides or another zero of the yaw."""
+def _check_tracks(scene: Scene) -> Findings:
+    if not scene.tracks:
+        yield _note("tracks", "no tracked boxes: everything counts as static")
+    for track in scene.tracks:
+        where = f"track {track.id} ({track.label})"
+        length, width, _ = track.size_m
+        if track.label in VEHICLES and width > 1.5 * length and length > 0.5:
+            sides = f"it is {width:.1f} m wide and {length:.1f} m long"
+            yield _warning(where, f"{sides}; are width and length swapped?")
+        if max(track.size_m) > 60:
+            yield _warning(where, f"its box measures {max(track.size_m):.0f} m")
+        steps = np.diff(track.times_s)
+        if len(steps):
+            if steps.max() > MAX_TRACK_GAP_S:
+                yield _warning(
+                    where,
+                    f"it is not seen for {steps.max():.1f} s from {track.times_s[int(steps.argmax())]:.1f} s on; its "
+                    "path across the gap is a guess: split the track",
+                )
+            speed = np.linalg.norm(np.diff(track.world_from_object[:, :3, 3], axis=0), axis=1) / steps
+            if speed.max() > MAX_SPEED_M_S:
+                yield _warning(where, f"it moves at {speed.max():.0f} m/s; check ids and poses")
+            yield from _check_course(track, where)
+        tilt = np.rad2deg(np.arccos(np.clip(track.world_from_object[:, 2, 2], -1, 1))).max()
+        if tilt > 30:
+            axes = "object axes are x forward, y left, z up"
+            yield _warning(where, f"its z axis is tilted by {tilt:.0f} degrees; {axes}")
+
+
+def _check_course(track: Track, where: str) -> Findings:
+    """Whether a dynamic box faces its direction of travel: a quarter turn means swapped sides or another zero of the yaw."""
     steps = np.diff(track.world_from_object[:, :2, 3], axis=0)
     length = np.linalg.norm(steps, axis=1)
     moving = length > MIN_STEP_M
@@ -188,129 +217,79 @@ def _check_course(track: Track, where: str, say: Say) -> None:
     turn = np.rad2deg(np.arccos(np.clip((forward * steps[moving]).sum(1) / length[moving], -1, 1)))
     typical = float(np.median(turn))
     if 60 < typical < 120:
-        sides = "its width is larger than its length: they are swapped" if track.size_m[1] > track.size_m[0] else (
-            "are width and length swapped, or is yaw counted from another axis?"
-        )  # fmt: skip
-        say("warning", where, f"it moves sideways, {typical:.0f} degrees from where it looks; {sides}")
+        sides = "are width and length swapped, or is yaw counted from another axis?"
+        if track.size_m[1] > track.size_m[0]:
+            sides = "its width is larger than its length: they are swapped"
+        yield _warning(where, f"it moves sideways, {typical:.0f} degrees from its x axis; {sides}")
     elif typical > 150:
-        say("warning", where, "it moves backwards all the time; is its yaw turned by 180 degrees?")
+        yield _warning(where, "it moves backwards all the time; is its yaw turned by 180 degrees?")
 
 
-def _check_tracks(scene: Scene, say: Say) -> None:
-    if not scene.tracks:
-        say("note", "tracks", "no tracked boxes: everything counts as static")
-    for track in scene.tracks:
-        where = f"track {track.id} ({track.label})"
-        length, width, _ = track.size_m
-        if track.label in VEHICLES and width > 1.5 * length and length > 0.5:
-            say("warning", where, f"it is {width:.1f} m wide and {length:.1f} m long; are width and length swapped?")
-        if max(track.size_m) > 60:
-            say("warning", where, f"its box measures {max(track.size_m):.0f} m")
-        steps = np.diff(track.times_s)
-        if len(steps):
-            if steps.max() > MAX_TRACK_GAP_S:
-                say(
-                    "warning",
-                    where,
-                    f"it is not seen for {steps.max():.1f} s from {track.times_s[int(steps.argmax())]:.1f} s on; its path "
-                    "across the gap is a guess: split the track",
-                )
-            speed = np.linalg.norm(np.diff(track.world_from_object[:, :3, 3], axis=0), axis=1) / steps
-            if speed.max() > MAX_SPEED_M_S:
-                say("warning", where, f"it moves at {speed.max():.0f} m/s; check ids and poses")
-            _check_course(track, where, say)
-        tilt = np.rad2deg(np.arccos(np.clip(track.world_from_object[:, 2, 2], -1, 1))).max()
-        if tilt > 30:
-            say(
-                "warning", where, f"its z axis is tilted by {tilt:.0f} degrees; object axes are x forward, y left, z up"
-            )
-
-
-def _check_relations(scene: Scene, say: Say) -> None:
+def _check_relations(scene: Scene) -> Findings:
     if not scene.sweeps:
-        say("note", "sweeps", "no LiDAR: there is nothing to fuse")
+        yield _note("sweeps", "no LiDAR: there is nothing to fuse")
     sweep_times = np.array([sweep.time_s for sweep in scene.sweeps])
-    alone = [
-        f.id for f in scene.frames if len(sweep_times) and np.abs(sweep_times - f.view.time_s).min() > SAME_MOMENT_S
-    ]
-    if alone:
-        say(
-            "note",
-            f"frame {alone[0]}",
-            f"{len(alone)} frames have no sweep within {SAME_MOMENT_S} s and colour no points",
-        )
-    if not any(split == "test" for split in scene.split.values()):
-        say("note", "split", "no frame is held out: nothing can be scored at recorded views")
-    if not any(split == "train" for split in scene.split.values()):
-        say("error", "split", "no frame is left for training")
-    outside = [t.id for t in scene.tracks if scene.frames and not _overlaps(t.times_s, scene)]
-    if outside:
-        say(
-            "warning",
-            "tracks",
-            f"{len(outside)} tracks lie outside the time of the frames (first: {outside[0]}); are the clocks the same?",
-        )
+    frame_times = np.array([frame.view.time_s for frame in scene.frames])
+    if len(sweep_times):
+        alone = [f.id for f in scene.frames if np.abs(sweep_times - f.view.time_s).min() > SAME_MOMENT_S]
+        if alone:
+            message = f"{len(alone)} frames have no sweep within {SAME_MOMENT_S} s and colour no points"
+            yield _note(f"frame {alone[0]}", message)
+    if "test" not in scene.split.values():
+        yield _note("split", "no frame is held out: nothing can be scored at recorded views")
+    if "train" not in scene.split.values():
+        yield Finding("error", "split", "no frame is left for training")
+    if len(frame_times):
+        first_s, last_s = frame_times.min() - 1e-6, frame_times.max() + 1e-6
+        outside = [track.id for track in scene.tracks if track.times_s[0] > last_s or track.times_s[-1] < first_s]
+        if outside:
+            lie = f"{len(outside)} tracks lie outside the time of the frames (first: {outside[0]})"
+            yield _warning("tracks", f"{lie}; are the clocks the same?")
 
 
-def _overlaps(times_s: np.ndarray, scene: Scene) -> bool:
-    frame_times = [frame.view.time_s for frame in scene.frames]
-    return times_s[0] <= max(frame_times) + 1e-6 and times_s[-1] >= min(frame_times) - 1e-6
+def _check_image_file(scene: Scene, frame: Frame) -> Findings:
+    yield from check_image(frame, read_image(scene, frame))
 
 
-def _check_frame(scene: Scene, frame: Frame, complain: Complain, say: Say) -> None:
-    try:
-        check_image(frame, scene_read.read_image(scene, frame), say)
-    except MudgError as problem:
-        complain(problem)
-    for name in frame.labels:
-        try:
-            label = scene_read.read_label(scene, frame, name)
-            if name == "depth" and not np.isfinite(label).any():
-                say("warning", f"frame {frame.id}", "its depth label has no valid pixel")
-        except MudgError as problem:
-            complain(problem)
+def _check_sweep(scene: Scene, sweep: Sweep) -> Findings:
+    yield from check_points(scene, sweep, read_points(scene, sweep))
 
 
-def check_image(frame: Frame, image: np.ndarray, say: Say) -> None:
+def _check_label(scene: Scene, frame: Frame, name: str) -> Findings:
+    label = read_label(scene, frame, name)
+    if name == "depth" and not np.isfinite(label).any():
+        yield _warning(f"frame {frame.id}", "its depth label has no valid pixel")
+
+
+def check_image(frame: Frame, image: NDArray[np.uint8]) -> Findings:
     """What is odd about a decoded image u8[H, W, 3]."""
     if image.max() == image.min():
-        say("warning", f"frame {frame.id}", f"the image is one flat colour ({image.flat[0]})")
+        yield _warning(f"frame {frame.id}", f"the image is one flat colour ({image.flat[0]})")
 
 
-def _check_sweep(scene: Scene, sweep: Sweep, complain: Complain, say: Say) -> None:
-    try:
-        check_points(scene, sweep, scene_read.read_points(scene, sweep), say)
-    except MudgError as problem:
-        complain(problem)
-
-
-def check_points(scene: Scene, sweep: Sweep, points: SweepPoints, say: Say) -> None:
+def check_points(scene: Scene, sweep: Sweep, points: SweepPoints) -> Findings:
     """What is odd about the points of a sweep."""
     where = f"sweep {sweep.id}"
     if len(points.xyz) == 0:
-        say("warning", where, "it has no points")
+        yield _warning(where, "it has no points")
         return
-    reach = np.linalg.norm(points.xyz, axis=1)
-    if np.median(reach) > 500:
-        say(
-            "warning",
-            where,
-            f"half of its points are farther than {np.median(reach):.0f} m; are they metres in the LiDAR's frame?",
-        )
+    reach = np.median(np.linalg.norm(points.xyz, axis=1))
+    if reach > 500:
+        far = f"half of its points are farther than {reach:.0f} m"
+        yield _warning(where, f"{far}; are they metres in the LiDAR's frame?")
     if points.intensity.max(initial=0) > 1 or points.intensity.min(initial=0) < 0:
-        say("warning", where, f"intensity reaches {points.intensity.max():g}; expected 0..1")
-    if np.abs(points.dt_s).max(initial=0) > 1:
-        say(
-            "warning", where, f"point times reach {np.abs(points.dt_s).max():g} s beside the sweep's; are they seconds?"
-        )
+        yield _warning(where, f"intensity reaches {points.intensity.max():g}; expected 0..1")
+    latest_s = np.abs(points.dt_s).max(initial=0)
+    if latest_s > 1:
+        yield _warning(where, f"point times reach {latest_s:g} s beside the sweep's; are they seconds?")
     beside = [f for f in scene.frames if abs(f.view.time_s - sweep.time_s) <= SAME_MOMENT_S]
     if beside:
         world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
         if not any(_sees(frame, world) for frame in beside):
-            say("warning", where, "none of its points falls into the images taken at its time; check the calibration")
+            yield _warning(where, "none of its points falls into the images taken at its time; check the calibration")
 
 
-def _sees(frame: Frame, xyz_world: np.ndarray) -> bool:
+def _sees(frame: Frame, xyz_world: NDArray[np.float32]) -> bool:
     uv, z = geometry.project(frame.view, xyz_world)
     camera = frame.view.camera
     with np.errstate(invalid="ignore"):

@@ -13,15 +13,15 @@ import os
 import stat
 import zipfile
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError
 from mudg.data.scene.schema import parse_object, ref_problem
 
 MAX_FILE_BYTES: Final = 4 * 1024**3
+READABLE: Final = "a readable file inside the scene"
 
 
 class SceneFiles(Protocol):
@@ -33,12 +33,12 @@ class SceneFiles(Protocol):
         """All bytes of the file ``ref``, checked against the manifest where there is one."""
         ...
 
-    def problem(self, ref: str) -> str | None:
-        """Say why ``ref`` cannot be read (missing, outside the scene), or None. Cheap: nothing is opened."""
+    def is_hashed(self, ref: str) -> bool:
+        """Whether the manifest holds a hash of ``ref``, so that what ``read`` returns is known to be as it was written."""
         ...
 
-    def names(self) -> tuple[str, ...]:
-        """All files, as references, sorted."""
+    def problem(self, ref: str) -> str | None:
+        """Say why ``ref`` cannot be read (missing, outside the scene), or None. Cheap: nothing is opened."""
         ...
 
 
@@ -54,15 +54,11 @@ def open_files(path: Path | str) -> SceneFiles:
         state = index.stat()
     except FileNotFoundError as error:
         if path.is_dir():
-            raise InputError(
-                "folder is not a scene: it has no scene.json",
-                where=str(path),
-                expected="a scene directory",
-                remedy="make one with `mudg ingest`; an interrupted ingest leaves no scene.json",
-            ) from error
-        raise InputError(
-            "scene does not exist", where=str(path), expected="a scene directory or a stored zip of one"
-        ) from error
+            remedy = "make one with `mudg ingest`; an interrupted ingest leaves no scene.json"
+            what = "folder is not a scene: it has no scene.json"
+            raise InputError(what, where=str(path), expected="a scene directory", remedy=remedy) from error
+        expected = "a scene directory or a stored zip of one"
+        raise InputError("scene does not exist", where=str(path), expected=expected) from error
     except OSError as error:
         raise InputError("scene cannot be read", where=str(path), got=str(error)) from error
     manifest = path / store.MANIFEST
@@ -75,28 +71,30 @@ def _open_cached(path: str, _mtime_ns: int, _size: int, _manifest_ns: int) -> Sc
     return FolderFiles(path) if os.path.isdir(path) else ZipFiles(path)
 
 
-def _recorded_hashes(content: bytes, where: str) -> dict[str, str]:
-    try:
-        return {str(name): str(entry["sha256"]) for name, entry in parse_object(content, where)["files"].items()}
-    except (InputError, KeyError, TypeError, AttributeError) as error:
-        raise IntegrityError(
-            "the manifest is damaged",
-            where=where,
-            got=str(error),
-            remedy="ingest again, or delete the manifest if you edited the scene on purpose",
-        ) from error
+class _Manifest:
+    """The sha256 sums that were written with a scene; empty for a scene without any."""
 
+    def __init__(self, content: bytes | None, root: str) -> None:
+        self.root = root
+        self.hashes: dict[str, str] = {}
+        where = f"{root}: {store.MANIFEST}"
+        try:
+            if content is not None:
+                files = parse_object(content, where)["files"]
+                self.hashes = {str(name): str(entry["sha256"]) for name, entry in files.items()}
+        except (InputError, KeyError, TypeError, AttributeError) as error:
+            remedy = "ingest again, or delete the manifest if you edited the scene on purpose"
+            raise IntegrityError("the manifest is damaged", where=where, got=str(error), remedy=remedy) from error
 
-def _check_hash(content: bytes, ref: str, hashes: dict[str, str], root: str) -> bytes:
-    expected = hashes.get(ref)
-    if expected is not None and hashlib.sha256(content).hexdigest() != expected:
-        raise IntegrityError(
-            "a file differs from what was written",
-            where=f"{root}: {ref}",
-            expected=f"sha256 {expected[:16]}...",
-            remedy="restore the file or ingest again; delete manifest.json if you edited the scene on purpose",
-        )
-    return content
+    def checked(self, content: bytes, ref: str) -> bytes:
+        """The content of ``ref``; IntegrityError if it differs from what was written."""
+        expected = self.hashes.get(ref)
+        if expected is not None and hashlib.sha256(content).hexdigest() != expected:
+            raise IntegrityError(
+                "a file differs from what was written", where=f"{self.root}: {ref}", expected=f"sha256 {expected[:16]}...",
+                remedy="restore the file or ingest again; delete manifest.json if you edited the scene on purpose",
+            )  # fmt: skip
+        return content
 
 
 class FolderFiles:
@@ -106,18 +104,17 @@ class FolderFiles:
         self.root = root
         self._real_root = os.path.realpath(root)
         manifest = Path(root) / store.MANIFEST
-        self._hashes = _recorded_hashes(store.read_bytes(manifest), str(manifest)) if manifest.is_file() else {}
+        self._manifest = _Manifest(store.read_bytes(manifest) if manifest.is_file() else None, root)
 
     def read(self, ref: str) -> bytes:
         problem = self.problem(ref)
         if problem is not None:
-            raise InputError(
-                problem,
-                where=f"{self.root}: {ref}",
-                expected="a readable file inside the scene",
-                remedy="restore the file or ingest the log again",
-            )
-        return _check_hash(store.read_bytes(Path(self.root) / ref), ref, self._hashes, self.root)
+            remedy = "restore the file or ingest the log again"
+            raise InputError(problem, where=f"{self.root}: {ref}", expected=READABLE, remedy=remedy)
+        return self._manifest.checked(store.read_bytes(Path(self.root) / ref), ref)
+
+    def is_hashed(self, ref: str) -> bool:
+        return ref in self._manifest.hashes
 
     def problem(self, ref: str) -> str | None:
         text_problem = ref_problem(ref)
@@ -136,12 +133,8 @@ class FolderFiles:
             return f"a file is larger than {MAX_FILE_BYTES} bytes"
         return None
 
-    def names(self) -> tuple[str, ...]:
-        return tuple(store.list_files(Path(self.root)))
 
-
-@dataclass(frozen=True, slots=True)
-class _ZipEntry:
+class _ZipEntry(NamedTuple):
     header_offset: int
     size: int
     crc: int
@@ -153,8 +146,7 @@ class ZipFiles:
     def __init__(self, root: str) -> None:
         self.root = root
         self._entries = self._index(root)
-        content = self._raw(store.MANIFEST) if store.MANIFEST in self._entries else None
-        self._hashes = _recorded_hashes(content, f"{root}: {store.MANIFEST}") if content is not None else {}
+        self._manifest = _Manifest(self._raw(store.MANIFEST) if store.MANIFEST in self._entries else None, root)
 
     @staticmethod
     def _index(root: str) -> dict[str, _ZipEntry]:
@@ -163,37 +155,15 @@ class ZipFiles:
                 infos = archive.infolist()
         except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
             raise InputError(
-                "file is neither a scene directory nor a readable zip",
-                where=root,
-                got=str(error),
-                expected="a stored zip of a scene directory",
-                remedy="is it cut off? copy it again",
-            ) from error
+                "file is neither a scene directory nor a readable zip", where=root, got=str(error),
+                expected="a stored zip of a scene directory", remedy="is it cut off? copy it again",
+            ) from error  # fmt: skip
         entries: dict[str, _ZipEntry] = {}
         for info in infos:
             if info.is_dir():
                 continue
             name = info.orig_filename
-            problem = ref_problem(name)
-            if problem is not None:
-                raise InputError(
-                    f"zip entry {problem}", where=root, got=repr(name)[:120], expected="relative paths inside the scene"
-                )
-            if info.flag_bits & 0x1:
-                raise InputError("zip entry is encrypted", where=f"{root}: {name}")
-            if info.compress_type != zipfile.ZIP_STORED:
-                raise InputError(
-                    "zip entry is compressed",
-                    where=f"{root}: {name}",
-                    expected="a stored zip (no compression)",
-                    remedy="unpack it, or write it with `zip -0`",
-                )
-            if info.file_size != info.compress_size or info.file_size > MAX_FILE_BYTES:
-                raise InputError(
-                    "zip entry declares a size that cannot be", where=f"{root}: {name}", got=f"{info.file_size} bytes"
-                )
-            if stat.S_ISLNK(info.external_attr >> 16):
-                raise InputError("zip entry is a link", where=f"{root}: {name}", expected="plain files")
+            _check_entry(info, root)
             if name in entries:
                 raise InputError("zip holds the same name twice", where=root, got=name, expected="each file once")
             entries[name] = _ZipEntry(info.header_offset, info.file_size, info.CRC)
@@ -203,44 +173,54 @@ class ZipFiles:
         if len(folders) == 1 and f"{next(iter(folders))}/scene.json" in entries:
             prefix = f"{next(iter(folders))}/"
             return {name.removeprefix(prefix): entry for name, entry in entries.items() if name.startswith(prefix)}
-        raise InputError(
-            "zip is not a scene: it has no scene.json", where=root, expected="scene.json at the top of the zip"
-        )
+        expected = "scene.json at the top of the zip"
+        raise InputError("zip is not a scene: it has no scene.json", where=root, expected=expected)
 
     def _raw(self, ref: str) -> bytes:
-        entry = self._entries[ref]
+        entry, where = self._entries[ref], f"{self.root}: {ref}"
         try:
             with open(self.root, "rb") as handle:
                 handle.seek(entry.header_offset)
                 header = handle.read(30)
                 if len(header) != 30 or header[:4] != b"PK\x03\x04":
-                    raise InputError(
-                        "zip is damaged", where=f"{self.root}: {ref}", got="no local header where the index says"
-                    )
-                handle.seek(
-                    int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little"), os.SEEK_CUR
-                )
+                    raise InputError("zip is damaged", where=where, got="no local header where the index says")
+                name_length, extra_length = (int.from_bytes(header[n : n + 2], "little") for n in (26, 28))
+                handle.seek(name_length + extra_length, os.SEEK_CUR)
                 content = handle.read(entry.size)
         except OSError as error:
-            raise InputError("zip cannot be read", where=f"{self.root}: {ref}", got=str(error)) from error
+            raise InputError("zip cannot be read", where=where, got=str(error)) from error
         if len(content) != entry.size or zlib.crc32(content) != entry.crc:
-            raise InputError(
-                "zip is damaged",
-                where=f"{self.root}: {ref}",
-                expected=f"{entry.size} bytes with CRC {entry.crc:08x}",
-                got=f"{len(content)} bytes with CRC {zlib.crc32(content):08x}",
-                remedy="copy the zip again",
-            )
+            expected = f"{entry.size} bytes with CRC {entry.crc:08x}"
+            got = f"{len(content)} bytes with CRC {zlib.crc32(content):08x}"
+            raise InputError("zip is damaged", where=where, expected=expected, got=got, remedy="copy the zip again")
         return content
 
     def read(self, ref: str) -> bytes:
         problem = self.problem(ref)
         if problem is not None:
             raise InputError(problem, where=f"{self.root}: {ref}", expected="a file inside the zip")
-        return _check_hash(self._raw(ref), ref, self._hashes, self.root)
+        return self._manifest.checked(self._raw(ref), ref)
+
+    def is_hashed(self, ref: str) -> bool:
+        return ref in self._manifest.hashes
 
     def problem(self, ref: str) -> str | None:
         return None if ref in self._entries else "a file is missing"
 
-    def names(self) -> tuple[str, ...]:
-        return tuple(sorted(self._entries))
+
+def _check_entry(info: zipfile.ZipInfo, root: str) -> None:
+    """Refuse what a stored zip of a scene does not hold: names that lead out, compression, encryption, links."""
+    name = info.orig_filename
+    where, problem = f"{root}: {name}", ref_problem(name)
+    if problem is not None:
+        expected = "relative paths inside the scene"
+        raise InputError(f"zip entry {problem}", where=root, got=repr(name)[:120], expected=expected)
+    if info.flag_bits & 0x1:
+        raise InputError("zip entry is encrypted", where=where)
+    if info.compress_type != zipfile.ZIP_STORED:
+        expected, remedy = "a stored zip (no compression)", "unpack it, or write it with `zip -0`"
+        raise InputError("zip entry is compressed", where=where, expected=expected, remedy=remedy)
+    if info.file_size != info.compress_size or info.file_size > MAX_FILE_BYTES:
+        raise InputError("zip entry declares a size that cannot be", where=where, got=f"{info.file_size} bytes")
+    if stat.S_ISLNK(info.external_attr >> 16):
+        raise InputError("zip entry is a link", where=where, expected="plain files")

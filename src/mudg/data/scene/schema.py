@@ -1,48 +1,44 @@
-"""Strict parsing of ``scene.json`` and ``tracks.json`` into the words of ``base/types.py``, and the text they are written as.
+"""``scene.json`` and ``tracks.json``: what a record may hold, parsing into the types of ``base/types.py``, and the text written.
 
 Every refusal is an ``InputError`` that names file, record and field, says what was expected and found, and what to do.
-The parser takes ``complain``: the reader passes a function that raises at the first problem, ``mudg doctor`` passes one
-that collects them all, so that a person sees every mistake of a hand-made scene at once.
+Parsers take ``complain``: the reader passes a function that raises at the first problem, ``mudg doctor`` passes one that
+collects them all, so that a person sees every mistake of a hand-made scene at once.
 """
 
 from __future__ import annotations
 
-import difflib
 import json
-import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
 
 from mudg.base import store
+from mudg.base.checks import increasing_problem
 from mudg.base.errors import InputError
-from mudg.base.geometry import rigid_problem
+from mudg.base.records import Number, StrictRecord, after, checked_by, named_by, parse_record, place, refuse_unknown
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, Track, View
 
 FORMAT: Final = "mudg-scene"
+TRACKS_FORMAT: Final = "mudg-tracks"
 SCHEMA_VERSION: Final = 1
-RIGID_TOLERANCE: Final = 1e-4
 MAX_IMAGE_SIDE_PX: Final = 32768
+MAX_BOX_SIDE_M: Final = 200.0
 
 LABEL_NAMES: Final = (
-    "depth",
-    "semantics",
-    "sky",
-    "ego",
-    "dynamic",
-    "instance",
-    "semantics_confidence",
-    "depth_confidence",
-)
-"""Labels a frame may carry; see ``scenefile.read_label`` for the array each of them is."""
+    "depth", "semantics", "sky", "ego", "dynamic", "instance", "semantics_confidence", "depth_confidence",
+)  # fmt: skip
+"""Labels a frame may carry; see ``read_label`` for the array each of them is."""
 
 NAME_PATTERN: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-+]{0,63}")
 """Names that become folders: cameras, sensors."""
 
 Complain = Callable[[InputError], None]
+Parsed = TypeVar("Parsed")
 
 
 def raise_first(problem: InputError) -> None:
@@ -50,17 +46,16 @@ def raise_first(problem: InputError) -> None:
     raise problem
 
 
-# --- JSON -----------------------------------------------------------------------------------------------------------
-
-
 def parse_object(data: bytes, where: str) -> dict[str, Any]:
     """Parse one strict JSON object (no NaN, no duplicate keys, an object at the top); InputError names ``where``."""
     parsed = store.parse_json(data, where)
     if not isinstance(parsed, dict):
-        raise InputError(
-            "the top of the file is not an object", where=where, expected="{...}", got=type(parsed).__name__
-        )
+        got = type(parsed).__name__
+        raise InputError("the top of the file is not an object", where=where, expected="{...}", got=got)
     return parsed
+
+
+# --- fields ---------------------------------------------------------------------------------------------------------
 
 
 def ref_problem(text: object) -> str | None:
@@ -89,351 +84,222 @@ def ref_problem(text: object) -> str | None:
     return None
 
 
-class Record:
-    """One JSON object with its place in the file: typed access where each failure names path, record and field."""
-
-    def __init__(self, value: object, where: str, keys: Iterable[str], optional: Iterable[str] = ()) -> None:
-        self.where = where
-        if not isinstance(value, dict):
-            raise InputError("a record is not an object", where=where, expected="{...}", got=type(value).__name__)
-        self._fields: Mapping[str, Any] = value
-        required = tuple(keys)
-        known = (*required, *optional)
-        for key in value:
-            if key not in known:
-                near = difflib.get_close_matches(key, known, 1)
-                raise InputError(
-                    f"unknown field {key!r}",
-                    where=where,
-                    expected=f"one of {', '.join(known)}",
-                    remedy=f"did you mean {near[0]!r}?" if near else "remove it",
-                )
-        for key in required:
-            if key not in value:
-                raise InputError(
-                    f"the field {key!r} is missing",
-                    where=where,
-                    expected=f"{', '.join(required)}",
-                    got=", ".join(value) or "an empty object",
-                )
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._fields
-
-    def at(self, key: str) -> str:
-        """Where the field ``key`` stands."""
-        return f"{self.where}.{key}"
-
-    def raw(self, key: str) -> Any:
-        """The unchecked JSON value."""
-        return self._fields[key]
-
-    def text(self, key: str) -> str:
-        """A text."""
-        value = self._fields[key]
-        if not isinstance(value, str):
-            raise InputError("field is not a text", where=self.at(key), expected="a text", got=repr(value)[:80])
-        return value
-
-    def name(self, key: str) -> str:
-        """A text that can be a folder name."""
-        value = self.text(key)
-        check_name(value, self.at(key))
-        return value
-
-    def number(self, key: str) -> float:
-        """A finite number."""
-        return finite_number(self._fields[key], self.at(key))
-
-    def integer(self, key: str) -> int:
-        """A whole number."""
-        value = self._fields[key]
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise InputError(
-                "field is not a whole number", where=self.at(key), expected="an integer", got=repr(value)[:80]
-            )
-        return value
-
-    def ref(self, key: str) -> Ref:
-        """A reference to a file inside the scene."""
-        return checked_ref(self._fields[key], self.at(key))
-
-    def pose(self, key: str) -> NDArray[np.float64]:
-        """A rigid motion f64[4, 4]."""
-        return rigid_pose(self._fields[key], self.at(key))
-
-    def items(self, key: str) -> list[Any]:
-        """A list."""
-        value = self._fields[key]
-        if not isinstance(value, list):
-            raise InputError("field is not a list", where=self.at(key), expected="[...]", got=type(value).__name__)
-        return value
-
-
-def check_name(value: str, where: str) -> None:
-    """Refuse camera, sensor and label folder names that are not plain."""
-    if not NAME_PATTERN.fullmatch(value) or value.endswith("."):
-        raise InputError(
-            "name cannot be a folder name",
-            where=where,
-            expected="1-64 letters, digits or _ . - + starting with a letter or digit",
-            got=repr(value)[:80],
-        )
-
-
-def finite_number(value: object, where: str) -> float:
-    """A finite JSON number, else InputError."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError("value is not a number", where=where, expected="a number", got=repr(value)[:80])
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise InputError("value is not finite", where=where, expected="a finite number", got=repr(value)[:80])
-    return number
-
-
-def checked_ref(value: object, where: str) -> Ref:
+def check_ref(value: str) -> str:
     """A file reference inside the scene, else InputError."""
     problem = ref_problem(value)
     if problem is not None:
-        raise InputError(
-            f"file reference {problem}",
-            where=where,
-            got=repr(value)[:120],
-            expected="a relative path inside the scene, e.g. images/front/000000.png",
-        )
-    return Ref(str(value))
+        expected = "a relative path inside the folder, e.g. images/front/000000.png"
+        raise InputError(f"file reference {problem}", expected=expected, got=repr(value)[:120])
+    return value
 
 
-def rigid_pose(value: object, where: str) -> NDArray[np.float64]:
-    """A rigid motion given as 3 or 4 rows of 4 numbers, or as 12 or 16 numbers row by row; f64[4, 4]."""
-    rows = value
+def check_name(value: str, where: str = "") -> str:
+    """A camera or sensor name that can be a folder name, else InputError."""
+    if not NAME_PATTERN.fullmatch(value) or value.endswith("."):
+        expected = "1-64 letters, digits or _ . - + starting with a letter or digit"
+        raise InputError("name cannot be a folder name", where=where, expected=expected, got=repr(value)[:80])
+    return value
+
+
+def check_frame_id(frame_id: str, sensor: str, where: str) -> None:
+    """A frame's or sweep's id is ``<sensor>/<digits>``, else InputError."""
+    name, _, number = frame_id.rpartition("/")
+    if name != sensor or not re.fullmatch("[0-9]{1,12}", number):
+        expected, got = f"{sensor}/000012", repr(frame_id)[:80]
+        raise InputError("frame id does not fit its camera", where=where, expected=expected, got=got)
+
+
+def check_box_size(size_m: list[float]) -> list[float]:
+    """Length, width and height of a box, else InputError."""
+    if len(size_m) != 3 or not all(0 < side < MAX_BOX_SIDE_M for side in size_m):
+        expected = f"[length, width, height] in metres, each above 0 and below {MAX_BOX_SIDE_M:g}"
+        raise InputError("box size makes no sense", expected=expected, got=str(size_m)[:80])
+    return size_m
+
+
+def sixteen_numbers(value: Any) -> list[Any]:
+    """A 3x4 or 4x4 matrix, flat or in rows, as 16 values row by row."""
+    numbers = value
     if isinstance(value, list) and len(value) in (3, 4) and all(isinstance(row, list) for row in value):
-        rows = [number for row in value for number in row]
-    if not isinstance(rows, list) or len(rows) not in (12, 16):
-        raise InputError(
-            "pose is not a 3x4 or 4x4 matrix",
-            where=where,
-            expected="12 or 16 numbers, row by row (world metres)",
-            got=_shape_of(value),
-        )
-    numbers = [finite_number(number, f"{where}[{index}]") for index, number in enumerate(rows)]
-    matrix = np.vstack([np.array(numbers[:12]).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-    if len(numbers) == 16:
-        matrix = np.array(numbers).reshape(4, 4)
-    problem = rigid_problem(matrix, RIGID_TOLERANCE)
-    if problem is not None:
-        raise InputError(
-            "pose is not a rigid motion",
-            where=where,
-            got=problem,
-            expected=f"a right-handed rotation (orthonormal within {RIGID_TOLERANCE:g}) and a translation in metres",
-            remedy="remove scale or mirroring from the matrix; check row against column order",
-        )
-    return matrix
+        numbers = [number for row in value for number in row]
+    if not isinstance(numbers, list) or len(numbers) not in (12, 16):
+        expected = "12 or 16 numbers, row by row (world metres)"
+        raise InputError("pose is not a 3x4 or 4x4 matrix", expected=expected, got=_describe_shape(value))
+    return numbers if len(numbers) == 16 else [*numbers, 0.0, 0.0, 0.0, 1.0]
 
 
-def _shape_of(value: object) -> str:
-    if isinstance(value, list):
-        inner = {len(item) if isinstance(item, list) else 0 for item in value}
-        return f"a list of {len(value)}" + (f" lists of length {sorted(inner)}" if inner - {0} else " values")
-    return type(value).__name__
+def _describe_shape(value: object) -> str:
+    if not isinstance(value, list):
+        return type(value).__name__
+    lengths = {len(item) if isinstance(item, list) else 0 for item in value}
+    return f"a list of {len(value)}" + (f" lists of length {sorted(lengths)}" if lengths - {0} else " values")
 
 
-def increasing_problem(times_s: NDArray[np.float64]) -> str | None:
-    """Say where ``times_s`` stop increasing, or return None."""
-    steps = np.diff(times_s)
-    bad = np.flatnonzero(~(steps > 0))
-    if len(bad) == 0:
-        return None
-    at = int(bad[0])
-    return f"entry {at + 1} ({times_s[at + 1]:.6f} s) does not come after entry {at} ({times_s[at]:.6f} s)"
+def _known_labels(value: Any) -> Any:
+    if isinstance(value, dict):
+        refuse_unknown(value, LABEL_NAMES)
+    return value
+
+
+FileRef = Annotated[str, after(check_ref)]
+Name = Annotated[str, after(check_name)]
+PoseNumbers = Annotated[list[Number], BeforeValidator(checked_by(sixteen_numbers))]
+"""A matrix as 16 finite numbers. Whether it is rigid is checked by the type that is made of it."""
+BoxSize = Annotated[list[Number], after(check_box_size)]
+LabelRefs = Annotated[dict[str, FileRef], BeforeValidator(checked_by(_known_labels))]
+
+
+def matrices_of(poses: list[list[float]]) -> NDArray[np.float64]:
+    """f64[n, 4, 4] from n ``PoseNumbers``."""
+    return np.array(poses, np.float64).reshape(len(poses), 4, 4)
 
 
 # --- records --------------------------------------------------------------------------------------------------------
 
 
-def camera_from_json(name: str, value: object, where: str) -> Camera:
-    """Parse and check one camera."""
+class CameraEntry(StrictRecord):
+    """Intrinsics in pixels; the camera's name is its key."""
+
+    width: int
+    height: int
+    fx: Number
+    fy: Number
+    cx: Number
+    cy: Number
+    distortion: list[Number] = []
+    readout_s: Number = 0.0
+
+
+class FrameEntry(StrictRecord):
+    """One image."""
+
+    id: str
+    camera: str
+    time_s: Number
+    world_from_cam: PoseNumbers
+    image: FileRef
+    labels: LabelRefs = {}
+
+
+class SweepEntry(StrictRecord):
+    """One LiDAR sweep."""
+
+    id: str
+    sensor: Name
+    time_s: Number
+    world_from_lidar: PoseNumbers
+    points: FileRef
+
+
+class TrackEntry(StrictRecord):
+    """One tracked box."""
+
+    id: str
+    label: str
+    size_m: BoxSize
+    times_s: list[Number]
+    world_from_object: list[PoseNumbers]
+
+
+class EgoEntry(StrictRecord):
+    """The path of the vehicle."""
+
+    times_s: Annotated[list[Number], Field(min_length=1)]
+    world_from_ego: list[PoseNumbers]
+
+
+class SourceEntry(StrictRecord):
+    """Where the log comes from and under which licence."""
+
+    dataset: str
+    licence: str
+    recipe: dict[str, Any] | None = None
+    notes: list[str] = []
+
+
+class SceneIndex(StrictRecord):
+    """The top of ``scene.json``; frames and sweeps are checked one by one."""
+
+    format: str
+    schema_version: int
+    id: str
+    source: SourceEntry
+    cameras: dict[str, Any]
+    frames: list[Any]
+    ego: EgoEntry
+    sweeps: list[Any] = []
+    split: dict[str, Literal["train", "test"]] = {}
+    conventions: Any = None
+
+
+class TracksIndex(StrictRecord):
+    """The top of ``tracks.json``; tracks are checked one by one."""
+
+    format: str
+    schema_version: int
+    tracks: list[Any]
+
+
+def parse_camera(name: str, value: object, where: str) -> Camera:
+    """Parse and check one camera; InputError names ``where`` and the field."""
     check_name(name, where)
-    record = Record(value, where, ("width", "height", "fx", "fy", "cx", "cy"), ("distortion", "readout_s"))
-    width, height = record.integer("width"), record.integer("height")
-    for key, side in (("width", width), ("height", height)):
-        if not 1 <= side <= MAX_IMAGE_SIDE_PX:
-            raise InputError(
-                "image size makes no sense",
-                where=record.at(key),
-                expected=f"1..{MAX_IMAGE_SIDE_PX} pixels",
-                got=str(side),
-            )
-    fx, fy, cx, cy = (record.number(key) for key in ("fx", "fy", "cx", "cy"))
-    distortion: tuple[float, ...] = ()
-    if "distortion" in record:
-        numbers = record.items("distortion")
-        distortion = tuple(finite_number(n, f"{record.at('distortion')}[{i}]") for i, n in enumerate(numbers))
-    readout_s = record.number("readout_s") if "readout_s" in record else 0.0
-    check_intrinsics((width, height), (fx, fy), (cx, cy), readout_s, where)
-    return Camera(name, width, height, fx, fy, cx, cy, distortion, readout_s)
-
-
-def check_intrinsics(
-    size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float], readout_s: float, where: str
-) -> None:
-    """Refuse intrinsics (pixels) that no pinhole camera has: before a Camera is made, so that the field can be named."""
-    longest = max(size)
-    for key, value in zip(("fx", "fy"), focal, strict=True):
-        if not math.isfinite(value) or not 0.01 * longest <= value <= 1000 * longest:
-            raise InputError(
-                "focal length makes no sense",
-                where=f"{where}.{key}",
-                got=f"{value:g} pixels",
-                expected=f"pixels, between {0.01 * longest:g} and {1000 * longest:g} for this image size",
-                remedy="give the focal length in pixels, not millimetres, and not zero",
-            )
-    for key, value, side in zip(("cx", "cy"), centre, size, strict=True):
-        if not math.isfinite(value) or not -side <= value <= 2 * side:
-            raise InputError(
-                "principal point lies far outside the image",
-                where=f"{where}.{key}",
-                got=f"{value:g} pixels",
-                expected=f"pixels, usually near {side / 2:g}",
-                remedy="check units and whether the image was cropped",
-            )
-    if not math.isfinite(readout_s) or not 0 <= readout_s < 1:
-        raise InputError(
-            "rolling-shutter readout makes no sense",
-            where=f"{where}.readout_s",
-            expected="0 (global shutter) to 1 s",
-            got=f"{readout_s:g}",
-        )
-
-
-def frame_from_json(value: object, where: str, cameras: Mapping[str, Camera]) -> Frame:
-    """Parse one frame; its camera must be known."""
-    record = Record(value, where, ("id", "camera", "time_s", "world_from_cam", "image"), ("labels",))
-    camera_name = record.text("camera")
-    if camera_name not in cameras:
-        raise InputError(
-            f"frame names the camera {camera_name!r}, which the scene does not have",
-            where=record.at("camera"),
-            expected=f"one of {', '.join(cameras)}",
-            got=camera_name,
-        )
-    frame_id = record.text("id")
-    check_frame_id(frame_id, camera_name, record.at("id"))
-    view = View(cameras[camera_name], record.pose("world_from_cam"), record.number("time_s"))
-    labels: dict[str, Ref] = {}
-    if "labels" in record:
-        label_record = Record(record.raw("labels"), record.at("labels"), (), LABEL_NAMES)
-        labels = {key: label_record.ref(key) for key in LABEL_NAMES if key in label_record}
-    return Frame(frame_id, view, record.ref("image"), labels)
-
-
-def check_frame_id(frame_id: str, camera_name: str, where: str) -> None:
-    """A frame id is ``<camera>/<digits>``."""
-    if not re.fullmatch(re.escape(camera_name) + r"/[0-9]{1,12}", frame_id):
-        raise InputError(
-            "frame id does not fit its camera", where=where, expected=f"{camera_name}/000012", got=repr(frame_id)[:80]
-        )
-
-
-def sweep_from_json(value: object, where: str) -> Sweep:
-    """Parse one LiDAR sweep record."""
-    record = Record(value, where, ("id", "sensor", "time_s", "world_from_lidar", "points"))
-    return Sweep(
-        record.text("id"),
-        record.name("sensor"),
-        record.number("time_s"),
-        record.pose("world_from_lidar"),
-        record.ref("points"),
+    record = parse_record(CameraEntry, value, where)
+    width, height, longest = record.width, record.height, max(record.width, record.height)
+    focal = "give the focal length in pixels, not millimetres, and not zero"
+    cropped = "check units and whether the image was cropped"
+    limits = (
+        ("width", "image size makes no sense", 1, MAX_IMAGE_SIDE_PX, ""),
+        ("height", "image size makes no sense", 1, MAX_IMAGE_SIDE_PX, ""),
+        ("fx", "focal length makes no sense", 0.01 * longest, 1000 * longest, focal),
+        ("fy", "focal length makes no sense", 0.01 * longest, 1000 * longest, focal),
+        ("cx", "principal point lies far outside the image", -width, 2 * width, cropped),
+        ("cy", "principal point lies far outside the image", -height, 2 * height, cropped),
+        ("readout_s", "rolling-shutter readout makes no sense", 0, 1, ""),
     )
+    for key, what, least, most, remedy in limits:
+        value = getattr(record, key)
+        if not least <= value <= most:
+            expected = f"{least:g} to {most:g} {'s' if key == 'readout_s' else 'pixels'}"
+            raise InputError(what, where=place(where, key), expected=expected, got=f"{value:g}", remedy=remedy)
+    intrinsics = (record.fx, record.fy, record.cx, record.cy)
+    return Camera(name, width, height, *intrinsics, tuple(record.distortion), record.readout_s)
 
 
-def track_from_json(value: object, where: str) -> Track:
+def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Frame:
+    """Parse one frame; its camera must be known."""
+    record = parse_record(FrameEntry, value, where)
+    camera = cameras.get(record.camera)
+    if camera is None:
+        what = f"frame names the camera {record.camera!r}, which the scene does not have"
+        expected = f"one of {', '.join(cameras)}"
+        raise InputError(what, where=place(where, "camera"), expected=expected, got=record.camera)
+    check_frame_id(record.id, camera.name, place(where, "id"))
+    with named_by(where):
+        view = View(camera, matrices_of([record.world_from_cam])[0], record.time_s)
+    labels = {name: Ref(record.labels[name]) for name in LABEL_NAMES if name in record.labels}
+    return Frame(record.id, view, Ref(record.image), labels)
+
+
+def parse_sweep(value: object, where: str) -> Sweep:
+    """Parse one LiDAR sweep record."""
+    record = parse_record(SweepEntry, value, where)
+    pose = matrices_of([record.world_from_lidar])[0]
+    with named_by(where):
+        return Sweep(record.id, record.sensor, record.time_s, pose, Ref(record.points))
+
+
+def parse_track(value: object, where: str) -> Track:
     """Parse one tracked box."""
-    record = Record(value, where, ("id", "label", "size_m", "times_s", "world_from_object"))
-    size = np.array([finite_number(n, f"{record.at('size_m')}[{i}]") for i, n in enumerate(record.items("size_m"))])
-    if size.shape != (3,) or not ((size > 0) & (size < 200)).all():
-        raise InputError(
-            "box size makes no sense",
-            where=record.at("size_m"),
-            expected="[length, width, height] in metres, each above 0 and below 200",
-            got=str(size.tolist()),
-        )
-    times_s, poses = _timed_poses(record, "times_s", "world_from_object")
-    return Track(record.text("id"), record.text("label"), size, times_s, poses)
-
-
-def ego_from_json(value: object, where: str) -> EgoPath:
-    """Parse the ego path."""
-    record = Record(value, where, ("times_s", "world_from_ego"))
-    return EgoPath(*_timed_poses(record, "times_s", "world_from_ego"))
-
-
-def _timed_poses(record: Record, times_key: str, poses_key: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    times = [finite_number(t, f"{record.at(times_key)}[{i}]") for i, t in enumerate(record.items(times_key))]
-    items = record.items(poses_key)
-    poses = _poses_at_once(items)
-    if poses is None:  # something is wrong, or the rows are nested: one by one, so that the place can be named
-        poses = np.array([rigid_pose(p, f"{record.at(poses_key)}[{i}]") for i, p in enumerate(items)])
-    if not times or len(times) != len(poses):
-        raise InputError(
-            "times and poses do not pair up",
-            where=record.where,
-            expected="equally many, at least one",
-            got=f"{len(times)} times and {len(poses)} poses",
-        )
-    times_s = np.array(times)
-    problem = increasing_problem(times_s)
-    if problem is not None:
-        raise InputError(
-            "times do not increase",
-            where=record.at(times_key),
-            expected="seconds, strictly increasing",
-            got=problem,
-            remedy="sort the poses by time and drop duplicates",
-        )
-    return times_s, poses
-
-
-def _poses_at_once(items: list[Any]) -> NDArray[np.float64] | None:
-    """Many poses of 12 numbers each, f64[n, 4, 4]; None if anything is not as it should be."""
-    numbers = [number for item in items if isinstance(item, list) and len(item) == 12 for number in item]
-    if len(numbers) != 12 * len(items) or not all(type(number) in (float, int) for number in numbers):
-        return None
-    try:
-        rows = np.array(numbers, np.float64).reshape(len(items), 3, 4)
-    except OverflowError:
-        return None
-    rotations = rows[:, :, :3]
-    error = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0)
-    if not np.isfinite(rows).all() or error > RIGID_TOLERANCE or (np.linalg.det(rotations) < 0).any():
-        return None
-    poses = np.zeros((len(items), 4, 4))
-    poses[:, :3], poses[:, 3, 3] = rows, 1.0
-    return poses
-
-
-def source_from_json(value: object, where: str) -> Source:
-    """Parse where the log comes from and under which licence."""
-    record = Record(value, where, ("dataset", "licence"), ("recipe", "notes"))
-    recipe = record.raw("recipe") if "recipe" in record else None
-    if recipe is not None and not isinstance(recipe, dict):
-        raise InputError(
-            "recipe is not an object", where=record.at("recipe"), expected="{...} or null", got=type(recipe).__name__
-        )
-    notes = record.items("notes") if "notes" in record else []
-    if not all(isinstance(note, str) for note in notes):
-        raise InputError("notes are not a list of texts", where=record.at("notes"))
-    return Source(record.text("dataset"), record.text("licence"), recipe, tuple(notes))
+    record = parse_record(TrackEntry, value, where)
+    size_m, times_s = np.array(record.size_m), np.array(record.times_s)
+    with named_by(where):
+        return Track(record.id, record.label, size_m, times_s, matrices_of(record.world_from_object))
 
 
 # --- whole files ----------------------------------------------------------------------------------------------------
 
 
-def scene_from_json(
+def parse_scene(
     scene_json: dict[str, Any],
     tracks_json: dict[str, Any] | None,
     root: str,
@@ -453,113 +319,79 @@ def scene_from_json(
         InputError: the frame of the file itself is wrong, or ``complain`` raised.
     """
     _check_format(scene_json, FORMAT, where)
-    top = Record(
-        scene_json,
-        where,
-        ("format", "schema_version", "id", "source", "cameras", "frames", "ego"),
-        ("sweeps", "split", "conventions"),
-    )
-    if not isinstance(top.raw("cameras"), dict) or not top.raw("cameras"):
-        raise InputError("scene has no cameras", where=top.at("cameras"), expected="at least one camera by name")
-    cameras = _parse_each(
-        top.raw("cameras").items(), lambda key, item: camera_from_json(key, item, f"{where}: cameras.{key}"), complain
-    )
-    named_cameras = {camera.name: camera for camera in cameras}
-    frames = _parse_each(
-        enumerate(top.items("frames")),
-        lambda index, item: frame_from_json(item, f"{where}: frames[{index}]", named_cameras),
-        complain,
-    )
-    sweep_items = top.items("sweeps") if "sweeps" in top else []
-    sweeps = _parse_each(
-        enumerate(sweep_items), lambda index, item: sweep_from_json(item, f"{where}: sweeps[{index}]"), complain
-    )
-    tracks = (
-        tracks_from_json(tracks_json, complain, where.replace("scene.json", "tracks.json"))
-        if tracks_json is not None
-        else ()
-    )
-    scene = Scene(
-        id=top.text("id"),
-        root=root,
-        cameras=named_cameras,
-        frames=tuple(frames),
-        sweeps=tuple(sweeps),
-        tracks=tuple(tracks),
-        ego=ego_from_json(top.raw("ego"), f"{where}: ego"),
-        split=_split_from_json(top, frames),
-        source=source_from_json(top.raw("source"), f"{where}: source"),
-    )
+    top = parse_record(SceneIndex, scene_json, f"{where}: ")
+    if not top.cameras:
+        raise InputError("scene has no cameras", where=f"{where}: cameras", expected="at least one camera by name")
+    cameras = parse_table(top.cameras, f"{where}: cameras", parse_camera, complain)
+    frames = parse_each(top.frames, f"{where}: frames", lambda value, at: parse_frame(value, at, cameras), complain)
+    sweeps = parse_each(top.sweeps, f"{where}: sweeps", parse_sweep, complain)
+    tracks: list[Track] = []
+    if tracks_json is not None:
+        where_tracks = where.replace("scene.json", "tracks.json")
+        _check_format(tracks_json, TRACKS_FORMAT, where_tracks)
+        listed = parse_record(TracksIndex, tracks_json, f"{where_tracks}: ").tracks
+        tracks = parse_each(listed, f"{where_tracks}: tracks", parse_track, complain)
+    with named_by(f"{where}: ego"):
+        ego = EgoPath(np.array(top.ego.times_s), matrices_of(top.ego.world_from_ego))
+    source = Source(top.source.dataset, top.source.licence, top.source.recipe, tuple(top.source.notes))
+    split: dict[str, Literal["train", "test"]] = {**dict.fromkeys((f.id for f in frames), "train"), **top.split}
+    scene = Scene(top.id, root, cameras, tuple(frames), tuple(sweeps), tuple(tracks), ego, split, source)
     check_relations(scene, where, complain)
     return scene
 
 
-def tracks_from_json(tracks_json: dict[str, Any], complain: Complain, where: str) -> tuple[Track, ...]:
-    """Parse ``tracks.json``."""
-    _check_format(tracks_json, "mudg-tracks", where)
-    top = Record(tracks_json, where, ("format", "schema_version", "tracks"))
-    return tuple(
-        _parse_each(
-            enumerate(top.items("tracks")),
-            lambda index, item: track_from_json(item, f"{where}: tracks[{index}]"),
-            complain,
-        )
-    )
-
-
-def _check_format(top: dict[str, Any], name: str, where: str) -> None:
-    if top.get("format") != name:
-        raise InputError(
-            f"this is not a {name} file", where=where, expected=f'"format": "{name}"', got=repr(top.get("format"))[:80]
-        )
-    if top.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            "schema version is not one this program reads",
-            where=f"{where}: schema_version",
-            expected=str(SCHEMA_VERSION),
-            got=repr(top.get("schema_version"))[:80],
-            remedy="ingest the log again with this version, or use the version that wrote it",
-        )
-
-
-def _parse_each(items: Iterable[tuple[Any, Any]], parse: Callable[[Any, Any], Any], complain: Complain) -> list[Any]:
+def parse_each(
+    values: Iterable[Any], where: str, parse: Callable[[Any, str], Parsed], complain: Complain
+) -> list[Parsed]:
+    """Parse the records of a list at ``where``; one with a problem is complained about and left out."""
     parsed = []
-    for key, item in items:
+    for index, value in enumerate(values):
         try:
-            parsed.append(parse(key, item))
+            parsed.append(parse(value, f"{where}[{index}]"))
         except InputError as problem:
             complain(problem)
     return parsed
 
 
-def _split_from_json(top: Record, frames: Iterable[Frame]) -> dict[str, Literal["train", "test"]]:
-    frame_ids = [frame.id for frame in frames]
-    if "split" not in top:
-        return dict.fromkeys(frame_ids, "train")
-    split = top.raw("split")
-    if not isinstance(split, dict) or not all(value in ("train", "test") for value in split.values()):
+def parse_table(
+    table: Mapping[str, Any], where: str, parse: Callable[[str, Any, str], Parsed], complain: Complain
+) -> dict[str, Parsed]:
+    """Parse named records at ``where``; one with a problem is complained about and left out."""
+    parsed = {}
+    for name, value in table.items():
+        try:
+            parsed[name] = parse(name, value, f"{where}.{name}")
+        except InputError as problem:
+            complain(problem)
+    return parsed
+
+
+def _check_format(top: dict[str, Any], name: str, where: str) -> None:
+    found, version = repr(top.get("format"))[:80], repr(top.get("schema_version"))[:80]
+    if top.get("format") != name:
+        raise InputError(f"this is not a {name} file", where=where, expected=f'"format": "{name}"', got=found)
+    if top.get("schema_version") != SCHEMA_VERSION:
+        remedy = "ingest the log again with this version, or use the version that wrote it"
         raise InputError(
-            "split is not a table of train and test", where=top.at("split"), expected='{"front/000004": "test", ...}'
-        )
-    return {**dict.fromkeys(frame_ids, "train"), **split}
+            "schema version is not one this program reads", where=f"{where}: schema_version",
+            expected=str(SCHEMA_VERSION), got=version, remedy=remedy,
+        )  # fmt: skip
+
+
+def repeated(names: Iterable[str]) -> list[str]:
+    """The names that occur more than once, sorted."""
+    return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
 def check_relations(scene: Scene, where: str, complain: Complain = raise_first) -> None:
     """Checks that span records: frames exist, ids are unique, times increase per sensor, the split names real frames."""
     if not scene.frames:
         complain(InputError("scene has no frames", where=f"{where}: frames", expected="at least one image"))
-    for kind, ids in (
-        ("frames", [f.id for f in scene.frames]),
-        ("sweeps", [s.id for s in scene.sweeps]),
-        ("tracks", [t.id for t in scene.tracks]),
-    ):
-        twice = sorted({i for i in ids if ids.count(i) > 1}) if len(set(ids)) != len(ids) else []
+    for kind, records in (("frames", scene.frames), ("sweeps", scene.sweeps), ("tracks", scene.tracks)):
+        twice = repeated(record.id for record in records)
         if twice:
-            complain(
-                InputError(
-                    "an id occurs twice", where=f"{where}: {kind}", got=", ".join(twice[:5]), expected="unique ids"
-                )
-            )
+            got = ", ".join(twice[:5])
+            complain(InputError("an id occurs twice", where=f"{where}: {kind}", got=got, expected="unique ids"))
     times_by_sensor: dict[str, list[float]] = {}
     for frame in scene.frames:
         times_by_sensor.setdefault(f"frames of camera {frame.view.camera.name}", []).append(frame.view.time_s)
@@ -568,23 +400,14 @@ def check_relations(scene: Scene, where: str, complain: Complain = raise_first) 
     for sensor, times in times_by_sensor.items():
         problem = increasing_problem(np.array(times))
         if problem is not None:
-            complain(
-                InputError(
-                    "times do not increase",
-                    where=f"{where}: {sensor}",
-                    got=problem,
-                    expected="seconds, strictly increasing per sensor",
-                    remedy="sort the records by time",
-                )
-            )
+            expected, remedy = "seconds, strictly increasing per sensor", "sort the records by time"
+            place_of = f"{where}: {sensor}"
+            complain(InputError("times do not increase", where=place_of, got=problem, expected=expected, remedy=remedy))
     known = {frame.id for frame in scene.frames}
     unknown = [frame_id for frame_id in scene.split if frame_id not in known]
     if unknown:
-        complain(
-            InputError(
-                "split names frames that the scene does not have", where=f"{where}: split", got=", ".join(unknown[:5])
-            )
-        )
+        what, got = "split names frames that the scene does not have", ", ".join(unknown[:5])
+        complain(InputError(what, where=f"{where}: split", got=got))
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
@@ -592,6 +415,7 @@ def check_relations(scene: Scene, where: str, complain: Complain = raise_first) 
 
 def scene_to_json_text(scene: Scene) -> str:
     """The text of ``scene.json``: one record a line, so that people can read and compare it."""
+    source = scene.source
     head: dict[str, Any] = {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
@@ -599,27 +423,17 @@ def scene_to_json_text(scene: Scene) -> str:
         "conventions": "metres, seconds, pixels; world z up; camera x right, y down, z forward; a_from_b row-major 3x4; "
         "the centre of the top-left pixel is (0.5, 0.5)",
         "source": {
-            "dataset": scene.source.dataset,
-            "licence": scene.source.licence,
-            "recipe": scene.source.recipe,
-            "notes": list(scene.source.notes),
+            "dataset": source.dataset, "licence": source.licence, "recipe": source.recipe, "notes": list(source.notes),
         },
-    }
+    }  # fmt: skip
+    cameras = [f"{json.dumps(name)}: {_dumps(camera_to_json(camera))}" for name, camera in scene.cameras.items()]
+    ego = {"times_s": scene.ego.times_s.tolist(), "world_from_ego": _poses_to_json(scene.ego.world_from_ego)}
     lines = [f" {json.dumps(key)}: {_dumps(value)}," for key, value in head.items()]
-    cameras = [f"{json.dumps(name)}: {_dumps(_camera_to_json(camera))}" for name, camera in scene.cameras.items()]
     lines.append(' "cameras": {\n  ' + ",\n  ".join(cameras) + "\n },")
     lines.append(' "frames": [' + _record_lines(_frame_to_json(frame) for frame in scene.frames) + "],")
     lines.append(' "sweeps": [' + _record_lines(_sweep_to_json(sweep) for sweep in scene.sweeps) + "],")
     lines.append(' "split": ' + _dumps(dict(scene.split)) + ",")
-    lines.append(
-        ' "ego": '
-        + _dumps(
-            {
-                "times_s": scene.ego.times_s.tolist(),
-                "world_from_ego": [pose_to_json(pose) for pose in scene.ego.world_from_ego],
-            }
-        )
-    )
+    lines.append(' "ego": ' + _dumps(ego))
     return "{\n" + "\n".join(lines) + "\n}\n"
 
 
@@ -627,58 +441,41 @@ def tracks_to_json_text(tracks: Iterable[Track]) -> str:
     """The text of ``tracks.json``, one track a line."""
     records = (
         {
-            "id": track.id,
-            "label": track.label,
-            "size_m": np.asarray(track.size_m).tolist(),
-            "times_s": track.times_s.tolist(),
-            "world_from_object": [pose_to_json(pose) for pose in track.world_from_object],
+            "id": track.id, "label": track.label, "size_m": track.size_m.tolist(), "times_s": track.times_s.tolist(),
+            "world_from_object": _poses_to_json(track.world_from_object),
         }
         for track in tracks
-    )
-    return (
-        f'{{\n "format": "mudg-tracks",\n "schema_version": {SCHEMA_VERSION},\n "tracks": ['
-        + _record_lines(records)
-        + "]\n}\n"
-    )
+    )  # fmt: skip
+    head = f'"format": "{TRACKS_FORMAT}",\n "schema_version": {SCHEMA_VERSION}'
+    return f'{{\n {head},\n "tracks": [{_record_lines(records)}]\n}}\n'
 
 
-def pose_to_json(pose: NDArray[np.float64]) -> list[float]:
-    """A pose as 12 numbers, row by row."""
-    return [float(number) for number in np.asarray(pose, np.float64)[:3].reshape(-1)]
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """A camera without its name; ``parse_camera`` reads it."""
+    values = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {**values, "distortion": list(camera.distortion), "readout_s": camera.readout_s}
 
 
-def _camera_to_json(camera: Camera) -> dict[str, Any]:
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion": list(camera.distortion),
-        "readout_s": camera.readout_s,
-    }
+def _poses_to_json(poses: NDArray[np.float64]) -> list[list[float]]:
+    """f64[n, 4, 4] as n times 12 numbers, row by row."""
+    return poses[:, :3].reshape(len(poses), 12).tolist()
 
 
 def _frame_to_json(frame: Frame) -> dict[str, Any]:
+    view = frame.view
     return {
-        "id": frame.id,
-        "camera": frame.view.camera.name,
-        "time_s": float(frame.view.time_s),
-        "world_from_cam": pose_to_json(frame.view.world_from_cam),
-        "image": frame.image.path,
-        "labels": {name: ref.path for name, ref in frame.labels.items()},
-    }
+        "id": frame.id, "camera": view.camera.name, "time_s": view.time_s,
+        "world_from_cam": _poses_to_json(view.world_from_cam[None])[0],
+        "image": frame.image.path, "labels": {name: ref.path for name, ref in frame.labels.items()},
+    }  # fmt: skip
 
 
 def _sweep_to_json(sweep: Sweep) -> dict[str, Any]:
+    pose = _poses_to_json(sweep.world_from_lidar[None])[0]
     return {
-        "id": sweep.id,
-        "sensor": sweep.sensor,
-        "time_s": float(sweep.time_s),
-        "world_from_lidar": pose_to_json(sweep.world_from_lidar),
+        "id": sweep.id, "sensor": sweep.sensor, "time_s": sweep.time_s, "world_from_lidar": pose,
         "points": sweep.points.path,
-    }
+    }  # fmt: skip
 
 
 def _record_lines(records: Iterable[dict[str, Any]]) -> str:
@@ -690,16 +487,11 @@ def _dumps(value: object) -> str:
     try:
         return json.dumps(value, allow_nan=False)
     except ValueError as error:
-        raise InputError(
-            "a value that is NaN or infinite cannot be written into a scene",
-            where="scene.json",
-            got=str(error),
-            remedy="check poses and times handed to SceneWriter",
-        ) from error
+        what, remedy = "a value that is NaN or infinite cannot be written into a scene", "check poses and times"
+        raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error
     except TypeError as error:
-        raise InputError(
-            "a value that JSON cannot hold was handed to SceneWriter",
-            where="scene.json",
-            got=str(error),
-            remedy="give plain numbers, texts, lists and dicts in the source recipe",
-        ) from error
+        what, remedy = (
+            "a value that JSON cannot hold",
+            "give plain numbers, texts, lists and dicts in the source recipe",
+        )
+        raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error

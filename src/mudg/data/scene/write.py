@@ -20,15 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mudg.base import store
+from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError
-from mudg.base.geometry import rigid_problem
+from mudg.base.processes import process_alive
+from mudg.base.replacement import all_names
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
 from mudg.data.scene import schema
 from mudg.data.scene.files import open_files
-from mudg.data.scene.read import MASK_LABELS, all_refs, check_image, checked_points, label_ref, read_scene
+from mudg.data.scene.labels import encode_label, encode_png, encode_safetensors, label_ref, read_label
+from mudg.data.scene.read import all_refs, check_image, checked_points, is_grey, read_points, read_scene
 
 _MAX_PENDING_WRITES: Final = 8
+SCENE_FILES: Final = ("scene.json", "tracks.json", "images/*/*", "lidar/*/*.safetensors", "labels/*/*/*")
+"""Patterns of the names in a scene directory."""
 
 
 class SceneWriter:
@@ -55,16 +59,14 @@ class SceneWriter:
         self.root = Path(root)
         self._scene_id, self._source, self._jpeg_quality = scene_id, source, jpeg_quality
         if (self.root / "scene.json").exists():
-            raise InputError(
-                "there is a scene here already", where=str(self.root), remedy="choose another folder or remove it"
-            )
+            remedy = "choose another folder or remove it"
+            raise InputError("there is a scene here already", where=str(self.root), remedy=remedy)
         self._partial = _partial_folder(self.root)
         try:
             self._partial.mkdir(parents=True)
         except OSError as error:
-            raise ResourceError(
-                "cannot create the scene's folder", where=str(self.root), got=str(error), remedy="choose another --out"
-            ) from error
+            what, got = "cannot create the scene's folder", str(error)
+            raise ResourceError(what, where=str(self.root), got=got, remedy="choose another --out") from error
         self._cameras: dict[str, Camera] = {}
         self._frames: dict[str, Frame] = {}
         self._sweeps: dict[str, Sweep] = {}
@@ -96,14 +98,7 @@ class SceneWriter:
 
     def add_camera(self, camera: Camera) -> None:
         """Add a camera; frames may use it from then on."""
-        schema.check_name(camera.name, f"SceneWriter: camera {camera.name!r}")
-        schema.check_intrinsics(
-            (camera.width, camera.height),
-            (camera.fx, camera.fy),
-            (camera.cx, camera.cy),
-            camera.readout_s,
-            f"SceneWriter: camera {camera.name}",
-        )
+        schema.parse_camera(camera.name, schema.camera_to_json(camera), f"SceneWriter: camera {camera.name}")
         if self._cameras.setdefault(camera.name, camera) != camera:
             raise InputError("two cameras have one name", where=f"SceneWriter: camera {camera.name}")
 
@@ -123,47 +118,41 @@ class SceneWriter:
                 they can be decoded. Grey ones are counted in the scene's notes.
             labels: see ``add_label``.
         """
-        camera = self._cameras.get(view.camera.name)
         where = f"SceneWriter: frame {frame_id}"
-        if camera is None or camera != view.camera:
-            raise InputError(
-                "frame uses a camera that was not added like this",
-                where=where,
-                got=view.camera.name,
-                expected=", ".join(self._cameras) or "add_camera first",
-            )
-        schema.check_frame_id(frame_id, camera.name, where)
-        _check_pose(view.world_from_cam, where)
-        content = image if isinstance(image, bytes) else store.read_bytes(image) if isinstance(image, Path) else None
-        if isinstance(image, np.ndarray) and (
-            image.dtype != np.uint8 or image.shape != (camera.height, camera.width, 3)
-        ):
-            raise InputError(
-                "image array has the wrong form",
-                where=where,
-                got=f"{image.dtype} {image.shape}",
-                expected=f"uint8 ({camera.height}, {camera.width}, 3)",
-            )
-        if content is not None:
-            source = str(image) if isinstance(image, Path) else where
-            grey = check_image(content, source, camera)
-            suffix = "png" if content[:4] == b"\x89PNG" else "jpg"
+        if not isinstance(image, np.ndarray):
+            content = image if isinstance(image, bytes) else store.read_bytes(image)
+            grey = check_image(content, where if isinstance(image, bytes) else str(image), view.camera)
+            self._add_image_file(frame_id, view, content, grey)
         else:
-            grey = False
-            suffix = "png" if self._jpeg_quality is None else "jpg"
+            size = (view.camera.height, view.camera.width, 3)
+            if image.dtype != np.uint8 or image.shape != size:
+                expected, got = f"uint8 {size}", f"{image.dtype} {image.shape}"
+                raise InputError("image array has the wrong form", where=where, got=got, expected=expected)
+            pixels, quality = np.ascontiguousarray(image), self._jpeg_quality
+            ref = self._add_frame(frame_id, view, "png" if quality is None else "jpg")
+            self._submit(ref, lambda: encode_png(pixels) if quality is None else _jpeg(pixels, quality))
+        for name, array in (labels or {}).items():
+            self.add_label(frame_id, name, array)
+
+    def _add_image_file(self, frame_id: str, view: View, content: bytes, grey: bool) -> None:
+        ref = self._add_frame(frame_id, view, "png" if content[:4] == b"\x89PNG" else "jpg")
+        with self._lock:
+            self._grey[view.camera.name] += grey
+        self._submit(ref, lambda: content)
+
+    def _add_frame(self, frame_id: str, view: View, suffix: str) -> str:
+        """Record a frame; returns where its image goes."""
+        where, camera = f"SceneWriter: frame {frame_id}", self._cameras.get(view.camera.name)
+        if camera is None or camera != view.camera:
+            what, expected = "frame uses a camera that was not added like this", ", ".join(self._cameras)
+            raise InputError(what, where=where, got=view.camera.name, expected=expected or "add_camera first")
+        schema.check_frame_id(frame_id, camera.name, where)
         ref = f"images/{frame_id}.{suffix}"
         with self._lock:
             if frame_id in self._frames:
                 raise InputError("frame was added twice", where=where)
             self._frames[frame_id] = Frame(frame_id, view, Ref(ref), {})
-            self._grey[camera.name] += grey
-        if content is not None:
-            self._submit(ref, lambda: content)
-        else:
-            pixels = np.ascontiguousarray(image)
-            self._submit(ref, lambda: _png(pixels) if self._jpeg_quality is None else _jpeg(pixels, self._jpeg_quality))
-        for name, array in (labels or {}).items():
-            self.add_label(frame_id, name, array)
+        return ref
 
     def add_label(self, frame_id: str, name: str, array: NDArray[Any]) -> None:
         """Add a label [H, W] to a frame; names, types and meaning as in ``read_label``."""
@@ -172,39 +161,75 @@ class SceneWriter:
             frame = self._frames.get(frame_id)
         if frame is None:
             raise InputError("label for a frame that was not added", where=where, got=name)
-        content = encode_label(name, array, frame.view.camera, where)
+        self._add_label_file(frame_id, name, encode_label(name, array, frame.view.camera, where))
+
+    def _add_label_file(self, frame_id: str, name: str, content: bytes) -> None:
         ref = label_ref(name, frame_id)
         with self._lock:
             frame = self._frames[frame_id]
-            self._frames[frame_id] = Frame(frame.id, frame.view, frame.image, {**frame.labels, name: Ref(ref)})
+            self._frames[frame_id] = replace(frame, labels={**frame.labels, name: Ref(ref)})
         self._submit(ref, lambda: content)
 
     def add_sweep(
         self, sweep_id: str, sensor: str, time_s: float, world_from_lidar: NDArray[np.float64], points: SweepPoints
     ) -> None:
         """Add a LiDAR sweep: points in the LiDAR frame at ``time_s``. Ids are ``<sensor>/<digits>``."""
-        where = f"SceneWriter: sweep {sweep_id}"
-        schema.check_name(sensor, where)
-        schema.check_frame_id(sweep_id, sensor, where)
-        _check_pose(world_from_lidar, where)
-        checked_points(points.xyz, points.intensity, points.dt_s, where)
-        ref = f"lidar/{sweep_id}.safetensors"
+        sweep = Sweep(sweep_id, sensor, time_s, world_from_lidar, _sweep_ref(sweep_id))
+        checked_points(points.xyz, points.intensity, points.dt_s, f"SceneWriter: sweep {sweep_id}")
+        arrays = {"xyz": points.xyz, "intensity": points.intensity, "dt_s": points.dt_s}
+        self._add_sweep_file(sweep, encode_safetensors(arrays))
+
+    def _add_sweep_file(self, sweep: Sweep, content: bytes) -> None:
+        where = f"SceneWriter: sweep {sweep.id}"
+        schema.check_name(sweep.sensor, where)
+        schema.check_frame_id(sweep.id, sweep.sensor, where)
         with self._lock:
-            if sweep_id in self._sweeps:
+            if sweep.id in self._sweeps:
                 raise InputError("sweep was added twice", where=where)
-            self._sweeps[sweep_id] = Sweep(
-                sweep_id, sensor, float(time_s), np.asarray(world_from_lidar, np.float64), Ref(ref)
-            )
-        content = _safetensors({"xyz": points.xyz, "intensity": points.intensity, "dt_s": points.dt_s})
-        self._submit(ref, lambda: content)
+            self._sweeps[sweep.id] = sweep
+        self._submit(sweep.points.path, lambda: content)
+
+    def copy_frame(self, scene: Scene, frame: Frame, labels: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Add a frame of another scene with its image and its labels; ``labels`` (name -> array) fill in what it lacks.
+
+        Files that the other scene's manifest proves to be as they were written are copied byte for byte; others are
+        checked and labels encoded anew.
+        """
+        files, camera = open_files(scene.root), frame.view.camera
+        where, content = f"{scene.root}: {frame.image.path}", files.read(frame.image.path)
+        check = is_grey if files.is_hashed(frame.image.path) else check_image
+        self._add_image_file(frame.id, frame.view, content, check(content, where, camera))
+        given = labels or {}
+        for name in dict.fromkeys((*schema.LABEL_NAMES, *given)):  # in one order, whatever that of ``labels``
+            if name not in given and name not in frame.labels:
+                continue
+            ref = frame.labels.get(name)
+            if ref is not None and ref.path == label_ref(name, frame.id) and files.is_hashed(ref.path):
+                self._add_label_file(frame.id, name, files.read(ref.path))
+            else:
+                array = given[name] if ref is None else read_label(scene, frame, name)
+                self.add_label(frame.id, name, array)
+
+    def copy_all_but_frames(self, scene: Scene) -> None:
+        """Add everything of another scene but its frames: cameras, sweeps (as in ``copy_frame``), tracks, ego path, split."""
+        files = open_files(scene.root)
+        for camera in scene.cameras.values():
+            self.add_camera(camera)
+        for sweep in log.progress(scene.sweeps, len(scene.sweeps), "copying sweeps"):
+            if sweep.points == _sweep_ref(sweep.id) and files.is_hashed(sweep.points.path):
+                self._add_sweep_file(sweep, files.read(sweep.points.path))
+            else:
+                points = read_points(scene, sweep)
+                self.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, points)
+        for track in scene.tracks:
+            self.add_track(track)
+        self.set_ego(scene.ego)
+        self.set_split(scene.split)
 
     def add_track(self, track: Track) -> None:
         """Add a tracked box."""
-        where = f"SceneWriter: track {track.id}"
-        for index, pose in enumerate(track.world_from_object):
-            _check_pose(pose, f"{where}: world_from_object[{index}]")
         if track.id in self._tracks:
-            raise InputError("track was added twice", where=where)
+            raise InputError("track was added twice", where=f"SceneWriter: track {track.id}")
         self._tracks[track.id] = track
 
     def set_ego(self, ego: EgoPath) -> None:
@@ -220,7 +245,7 @@ class SceneWriter:
         self._split = dict(split)
 
     def finish(self) -> Scene:
-        """Check the whole, write the index and move the scene into place."""
+        """Check relations, write the index, read it back, and move the scene into place."""
         for future in self._futures:
             future.result()
         self._pool.shutdown(wait=True)
@@ -231,24 +256,18 @@ class SceneWriter:
         self.add_notes(note for note in grey if note not in self._source.notes)
         order = {name: index for index, name in enumerate(self._cameras)}
         frames = sorted(self._frames.values(), key=lambda f: (f.view.time_s, order[f.view.camera.name]))
-        split: dict[str, Literal["train", "test"]] = {f.id: self._split.get(f.id, "train") for f in frames}
+        sweeps = sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))
+        split: dict[str, Literal["train", "test"]] = {**dict.fromkeys((f.id for f in frames), "train"), **self._split}
         scene = Scene(
-            id=self._scene_id,
-            root=str(self.root),
-            cameras=dict(self._cameras),
-            frames=tuple(frames),
-            sweeps=tuple(sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))),
-            tracks=tuple(self._tracks.values()),
-            ego=self._ego,
-            split={**split, **self._split},
-            source=self._source,
-        )
+            self._scene_id, str(self.root), self._cameras, tuple(frames), tuple(sweeps), tuple(self._tracks.values()),
+            self._ego, split, self._source,
+        )  # fmt: skip
         schema.check_relations(scene, where)
         self._write("tracks.json", schema.tracks_to_json_text(scene.tracks).encode())
         self._write("scene.json", schema.scene_to_json_text(scene).encode())
         store.write_json(self._partial / store.MANIFEST, {"schema": 1, "files": dict(sorted(self._hashes.items()))})
         store.sync_tree(self._partial)
-        checked = read_scene(self._partial)  # nothing is moved into place that could not be read back
+        checked = read_scene(self._partial)  # nothing that cannot be read back is moved into place
         self._move_into_place()
         self._finished = True
         return replace(checked, root=str(self.root.absolute()))
@@ -260,11 +279,13 @@ class SceneWriter:
                 return
             entries = sorted(self._partial.iterdir(), key=lambda entry: entry.name == "scene.json")
             for entry in entries:  # scene.json last: without it the folder is no scene
-                target = self.root / entry.name
-                if target.is_dir():
-                    shutil.rmtree(target)
-                entry.replace(target)
-            self._partial.rmdir()
+                if (self.root / entry.name).is_dir():  # file by file: what else lies there stays
+                    for name in all_names(entry):
+                        (self.root / entry.name / name).parent.mkdir(parents=True, exist_ok=True)
+                        (entry / name).replace(self.root / entry.name / name)
+                else:
+                    entry.replace(self.root / entry.name)
+            shutil.rmtree(self._partial)
         except OSError as error:
             raise ResourceError("scene cannot be moved into place", where=str(self.root), got=str(error)) from error
 
@@ -291,7 +312,7 @@ class SceneWriter:
     def _write(self, ref: str, content: bytes) -> None:
         store.write_in_tree(self._partial / ref, content)
         with self._lock:
-            self._hashes[ref] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            self._hashes[ref] = _manifest_entry(content)
 
 
 def _partial_folder(root: Path) -> Path:
@@ -304,23 +325,17 @@ def _partial_folder(root: Path) -> Path:
     for stale in parent.iterdir() if parent.is_dir() else ():
         if stale.name.startswith(prefix) and stale.name.endswith(".part") and stale.is_dir():
             pid = stale.name.removeprefix(prefix).split("-")[0]
-            if pid.isdigit() and not store.process_alive(int(pid)):
+            if pid.isdigit() and not process_alive(int(pid)):
                 shutil.rmtree(stale, ignore_errors=True)
     return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
 
 
-def _check_pose(pose: NDArray[np.float64], where: str) -> None:
-    problem = rigid_problem(pose, schema.RIGID_TOLERANCE)
-    if problem is not None:
-        raise InputError(
-            "pose is not a rigid motion", where=where, expected="rotation and translation, f64[4, 4]", got=problem
-        )
+def _manifest_entry(content: bytes) -> dict[str, Any]:
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
-def _png(array: NDArray[np.uint8]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(array).save(buffer, "PNG", compress_level=1)
-    return buffer.getvalue()
+def _sweep_ref(sweep_id: str) -> Ref:
+    return Ref(f"lidar/{sweep_id}.safetensors")
 
 
 def _jpeg(array: NDArray[np.uint8], quality: int) -> bytes:
@@ -329,14 +344,8 @@ def _jpeg(array: NDArray[np.uint8], quality: int) -> bytes:
     return buffer.getvalue()
 
 
-def _safetensors(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    from safetensors.numpy import save
-
-    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
-
-
 def write_zip(scene_dir: Path | str, zip_path: Path | str) -> Path:
-    """Pack a scene directory into one stored zip (no compression: members are read by offset); returns ``zip_path``.
+    """Pack a scene directory into one portable file: a stored zip (members are read by offset); returns ``zip_path``.
 
     The scene is read first, so that a broken one is refused. Bookkeeping of the run that made it is left out.
     """
@@ -347,45 +356,11 @@ def write_zip(scene_dir: Path | str, zip_path: Path | str) -> Path:
     names = ["scene.json", *sorted({ref.path for _, ref in all_refs(scene)})]
     names[1:1] = ["tracks.json"] if (scene_dir / "tracks.json").is_file() else []
     files = open_files(scene_dir)
-    listed: dict[str, dict[str, Any]] = {}
+    listed = {}
     with store.atomic_path(zip_path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name in names:
             content = files.read(name)
-            listed[name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            listed[name] = _manifest_entry(content)
             archive.writestr(zipfile.ZipInfo(name), content)
         archive.writestr(zipfile.ZipInfo(store.MANIFEST), store.json_text({"schema": 1, "files": listed}))
     return zip_path
-
-
-def encode_label(name: str, array: NDArray[Any], camera: Camera, where: str) -> bytes:
-    """File bytes of a label; see ``read_label`` for the arrays. Depth that is not finite or not positive is missing."""
-    array = np.asarray(array)
-    if name not in schema.LABEL_NAMES:
-        raise InputError("there is no such label", where=where, expected=", ".join(schema.LABEL_NAMES), got=name)
-    if array.shape != (camera.height, camera.width):
-        raise InputError(
-            "label does not have its camera's size",
-            where=f"{where}: {name}",
-            expected=f"[{camera.height}, {camera.width}]",
-            got=str(list(array.shape)),
-        )
-    if name == "semantics":
-        if not np.isin(np.unique(array), [*range(19), 255]).all():
-            raise InputError(
-                "semantics hold values that are no train id",
-                where=where,
-                expected="0..18 or 255 (unlabelled)",
-                got=str([int(v) for v in np.unique(array) if v not in range(19) and v != 255][:8]),
-            )
-        return _png(array.astype(np.uint8))
-    if name in MASK_LABELS:
-        return _png(array.astype(bool).astype(np.uint8) * np.uint8(255))
-    if name == "instance":
-        return _safetensors({name: array.astype(np.int32)})
-    if name == "depth":
-        with np.errstate(invalid="ignore"):
-            valid = np.isfinite(array) & (array > 0)
-        return _safetensors({name: np.where(valid, array, 0).astype(np.float32), "valid": valid.astype(np.uint8)})
-    if not ((array >= 0) & (array <= 1)).all():
-        raise InputError("confidence lies outside 0..1", where=f"{where}: {name}")
-    return _safetensors({name: array.astype(np.float32)})

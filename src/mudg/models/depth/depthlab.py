@@ -24,17 +24,15 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import seeds, store
-from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base import seeds, shards
+from mudg.base.errors import InputError, UsageError
+from mudg.core.pictures import resize_bicubic
 from mudg.models import folders
 from mudg.models.depth.inputs import DepthInput, Prediction
 from mudg.models.depth.marigold import ddim_scheduler
@@ -175,7 +173,7 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
                          remedy="convert the published files again") from error  # fmt: skip
     made = blank_parts(configs)
     for name, network in made.items():
-        state = _tensors(folder / name, files[name])
+        state = shards.read_shards(folder / name, files[name], remedy="convert the published files again")
         wanted = shapes_of(network)
         wrong = sorted(set(wanted) ^ set(state)) or [n for n in wanted if tuple(state[n].shape) != wanted[n]]
         if wrong:
@@ -185,21 +183,6 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
         network.to(device).eval().requires_grad_(False)
     scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
     return DepthLabParts(**made, scheduler=ddim_scheduler(scheduler_class, schedule, f"{where}: scheduler"))
-
-
-def _tensors(folder: Path, files: Mapping[str, str]) -> dict[str, Tensor]:
-    """All tensors of a part's files; IntegrityError for a file that is missing or altered."""
-    found: dict[str, Tensor] = {}
-    for name, digest in files.items():
-        path = folder / Path(name).name
-        if not path.is_file() or store.sha256_file(path) != digest:
-            raise IntegrityError("a weight file is missing or altered", where=str(path), expected=f"sha256 {digest[:16]}...",
-                                 remedy="convert the published files again")  # fmt: skip
-        try:
-            found |= load_file(path)
-        except (SafetensorError, OSError) as error:
-            raise InputError("not a valid safetensors file", where=str(path), got=str(error)) from error
-    return found
 
 
 def _fill_tables(network: nn.Module, part: str) -> None:
@@ -317,7 +300,7 @@ def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: i
     low, high = float(depth[known].min()), float(depth[known].max())
     values = ((depth - low) / (high - low + 1e-6) - 0.5) * (2 * sampling.normalize_scale)
     index: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    scaled = np.array(Image.fromarray(given.rgb).resize((size[1], size[0]), Image.Resampling.BICUBIC))
+    scaled = resize_bicubic(given.rgb, size[1], size[0])
     fill = (0, -size[1] % cell, 0, -size[0] % cell)
 
     def padded(planes: NDArray[Any]) -> Tensor:
@@ -355,7 +338,7 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
     height, width = rgb.shape[:2]
     shorter = min(height, width)
     high, wide = height * side_px // shorter, width * side_px // shorter
-    scaled = np.array(Image.fromarray(rgb).resize((wide, high), Image.Resampling.BICUBIC))
+    scaled = resize_bicubic(rgb, wide, high)
     top, left = (high - side_px) // 2, (wide - side_px) // 2
     cut = torch.from_numpy(scaled[top : top + side_px, left : left + side_px]).permute(2, 0, 1)[None].float() / 255
     mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (_CLIP_MEAN, _CLIP_DEVIATION))

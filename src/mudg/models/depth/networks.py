@@ -22,7 +22,6 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
@@ -30,6 +29,7 @@ from torch.nn import functional
 from mudg.base.errors import InputError, ResourceError
 from mudg.core.align import MIN_POINTS, AffineFit, Space, fit_affine
 from mudg.core.complete import CompletionRules, DenseDepth
+from mudg.core.pictures import resize_bicubic
 from mudg.models import folders
 from mudg.models.depth.depthlab import DepthLab
 from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions, Prediction
@@ -85,8 +85,8 @@ class Preparation:
     def pixels(self, rgb: NDArray[np.uint8]) -> Tensor:
         """Image u8[H, W, 3] -> f32[1, 3, h, w] as the network wants it."""
         height, width = self.size_for(*rgb.shape[:2])
-        scaled = Image.fromarray(rgb).resize((width, height), Image.Resampling.BICUBIC)
-        image = torch.from_numpy(np.array(scaled)).permute(2, 0, 1)[None].float() / 255
+        scaled = resize_bicubic(rgb, width, height)
+        image = torch.from_numpy(scaled).permute(2, 0, 1)[None].float() / 255
         mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (self.mean, self.deviation))
         return (image - mean) / deviation
 

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from mudg.base import geometry
 from mudg.base.palette import ID
@@ -90,37 +89,11 @@ def box_outline(
     view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]
 ) -> NDArray[np.bool_] | None:
     """Convex outline of a projected box bool[H, W], cut at the camera's near plane; None if it lies outside the image."""
-    camera = view.camera
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
-    corners = geometry.transform_points(view.cam_from_world @ world_from_box, signs * size_m)
-    corners = _clipped_corners(corners)
-    if corners is None:
-        return None
-    uv = np.c_[
-        camera.fx * corners[:, 0] / corners[:, 2] + camera.cx, camera.fy * corners[:, 1] / corners[:, 2] + camera.cy
-    ]
-    if (uv.max(0) < 0).any() or uv[:, 0].min() > camera.width or uv[:, 1].min() > camera.height:
-        return None
-    try:
-        hull = ConvexHull(np.clip(uv, -1e5, 1e5))
-    except QhullError:
+    camera, hull = view.camera, geometry.box_hull(view, world_from_box, size_m)
+    if hull is None:
         return None
     u, v = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
     mask = np.ones((camera.height, camera.width), bool)
     for a, b, c in hull.equations:
         mask &= a * u[None] + b * v[:, None] + c <= 0
     return mask if mask.any() else None
-
-
-def _clipped_corners(corners: NDArray[np.float64], near_m: float = 0.3) -> NDArray[np.float64] | None:
-    """Corners of a box cut at the near plane: those in front, and where its edges cross the plane."""
-    front = corners[:, 2] >= near_m
-    if not front.any():
-        return None
-    points = [corners[front]]
-    for i in range(8):
-        for j in (i ^ 1, i ^ 2, i ^ 4):
-            if front[i] and not front[j]:
-                u = (near_m - corners[i, 2]) / (corners[j, 2] - corners[i, 2])
-                points.append(corners[i : i + 1] + u * (corners[j : j + 1] - corners[i : i + 1]))
-    return np.concatenate(points)

@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch.nn import functional
 
 from mudg.base.palette import CLASSES, ID
+from mudg.core.pictures import resize_area
 from mudg.models.folders import CPU, Place
 from mudg.models.labels import street_net
 from mudg.models.labels.by_geometry import GRASS, GROUND_M, find_sky, greenness_of, label_by_network
@@ -77,7 +77,7 @@ def reduced(given: LabelInput, focal_px: float) -> LabelInput:
     if scale >= 1:
         return given
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    rgb = np.asarray(Image.fromarray(given.rgb).resize((width, height), Image.Resampling.BOX))
+    rgb = resize_area(given.rgb, width, height)
     return dataclasses.replace(given, view=given.view.resized(width, height), rgb=rgb)
 
 

@@ -1,24 +1,14 @@
-"""Latent codecs: images, depth and semantics to small latent maps and back.
+"""The latent code of the small models: images, depth and semantics to small latent maps and back.
 
-A codec is a module with
-
-    factor                      pixels per latent cell along each axis
-    channels                    latent channels of each modality
-    encode_rgb(rgb)             f32[..,3,H,W] in [0,1]      -> [..,C,H/f,W/f]
-    encode_depth(depth_m)       f32[..,1,H,W] metres        -> [..,C,H/f,W/f]
-    encode_semantics(ids)       i64[..,H,W], 255 unlabelled -> [..,C,H/f,W/f]
-    decode(latents)             {modality: latent} -> Decoded
-
-`PatchCodec` is the one of the embedded small model: 2x2 pixel patches, a principal component basis for colour, an exact
-basis for log depth, class shares for semantics, and a small convolutional decoder that puts back what the basis lost.
-The convolutional KL autoencoder of the published model is another row of `CODECS`.
+`PatchCodec`: 2x2 pixel patches, a principal component basis for colour, an exact basis for log depth, class shares for
+semantics, and a small convolutional decoder that puts back what the basis lost.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -34,16 +24,12 @@ CLASSES = len(palette.CLASSES)
 
 @dataclass(frozen=True)
 class CodecConfig:
-    """Which latent codec, and how depth and semantics are coded."""
+    """How depth is coded, and the size of the decoder."""
 
-    kind: Literal["patch", "kl"] = "patch"
-    depth_code: Literal["log", "linear"] = "log"
     near_m: float = 2.0
-    """Depths below are coded as this one (log code only)."""
+    """Depths below are coded as this one."""
     far_m: float = 100.0
     """Depths beyond, and the sky, are coded as this one."""
-    semantics_code: Literal["shares", "palette"] = "shares"
-    """shares: class shares of a patch, 19 channels, decoded to class scores; palette: the published colour image."""
     decoder_width: int = 32
     decoder_blocks: int = 3
 
@@ -56,43 +42,17 @@ class CodecConfig:
 class Decoded:
     """Pixels again: rgb f32[..,3,H,W] in [0,1], depth f32[..,1,H,W] m, semantics i64[..,H,W], margin f32[..,1,H,W].
 
-    `margin` in [0,1] is how clearly the winning class won. A modality that was not given is None.
+    `margin` in [0,1] is how clearly the winning class won.
     """
 
-    rgb: Tensor | None
-    depth: Tensor | None
-    semantics: Tensor | None
-    margin: Tensor | None
-
-
-class Codec(Protocol):
-    """What a diffusion model asks of a codec (see the module text)."""
-
-    config: CodecConfig
-    factor: int
-    channels: dict[Modality, int]
-
-    def encode_rgb(self, rgb: Tensor) -> Tensor:
-        """[...,3,H,W] in [0,1] -> latent [...,C,h,w]."""
-        ...
-
-    def encode_depth(self, depth_m: Tensor) -> Tensor:
-        """[...,1,H,W] metres -> latent [...,C,h,w]."""
-        ...
-
-    def encode_semantics(self, ids: Tensor) -> Tensor:
-        """i64[...,H,W] train ids -> latent [...,C,h,w]."""
-        ...
-
-    def decode(self, latents: dict[Modality, Tensor]) -> Decoded:
-        """Latents [T,C,h,w] of some modalities -> images."""
-        ...
+    rgb: Tensor
+    depth: Tensor
+    semantics: Tensor
+    margin: Tensor
 
 
 def depth_to_code(depth_m: Tensor, config: CodecConfig) -> Tensor:
-    """Depth in metres to [-1, 1]: logarithm between near and far, or linear from 0 to far (the published code)."""
-    if config.depth_code == "linear":
-        return depth_m.clamp(0.0, config.far_m) * (2.0 / config.far_m) - 1.0
+    """Depth in metres to [-1, 1]: its logarithm between near and far."""
     span = math.log(config.far_m / config.near_m)
     return torch.log(depth_m.clamp(config.near_m, config.far_m) / config.near_m) * (2.0 / span) - 1.0
 
@@ -100,8 +60,6 @@ def depth_to_code(depth_m: Tensor, config: CodecConfig) -> Tensor:
 def code_to_depth(code: Tensor, config: CodecConfig) -> Tensor:
     """Inverse of `depth_to_code`; codes outside [-1, 1] are clamped."""
     share = (code.clamp(-1.0, 1.0) + 1.0) * 0.5
-    if config.depth_code == "linear":
-        return share * config.far_m
     return config.near_m * torch.exp(share * math.log(config.far_m / config.near_m))
 
 
@@ -145,7 +103,7 @@ class DecoderBlock(nn.Module):
 class PatchCodec(nn.Module):
     """Codec of the embedded model: linear 2x2 patches, 4 channels for colour and depth, class shares for semantics.
 
-    The colour basis is fitted once by `fit_colour`; the decoder is trained by the `learn` verb on the three latents
+    The colour basis is fitted once by `fit_color`; the decoder is trained by the `learn` verb on the three latents
     together, so that edges agree between modalities; a missing modality is fed as zeros (it is trained with such
     omissions). Depth keeps all four patch values, so its linear part loses nothing.
     """
@@ -160,15 +118,14 @@ class PatchCodec(nn.Module):
     def __init__(self, config: CodecConfig) -> None:
         super().__init__()
         self.config = config
-        semantic = CLASSES if config.semantics_code == "shares" else 4
-        self.channels: dict[Modality, int] = {"rgb": 4, "depth": 4, "semantics": semantic}
+        self.channels: dict[Modality, int] = {"rgb": 4, "depth": 4, "semantics": CLASSES}
         self.register_buffer("rgb_mean", torch.zeros(12))
         self.register_buffer("rgb_basis", torch.eye(12)[:, :4].contiguous())
         self.register_buffer("rgb_scale", torch.ones(4))
         haar = torch.tensor([[1.0, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]]) / 2
         self.register_buffer("depth_basis", haar)
         self.register_buffer("depth_scale", torch.tensor([1.0, 0.2, 0.2, 0.2]))
-        self.register_buffer("palette", torch.from_numpy(palette.COLORS.copy()).float() / 127.5 - 1.0)
+        self.register_buffer("palette", torch.from_numpy(palette.COLORS.copy()).float() / 127.5 - 1.0)  # not read
         width = config.decoder_width
         inside = sum(self.channels.values())
         outside = 12 + 4 + 4 * CLASSES
@@ -181,7 +138,7 @@ class PatchCodec(nn.Module):
     # linear parts -----------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def fit_colour(self, rgb: Tensor) -> None:
+    def fit_color(self, rgb: Tensor) -> None:
         """Fit the colour basis (principal components of 2x2 patches) on images f32[N,3,H,W] in [0,1].
 
         The two detail channels are scaled down by a further 1.5, so that they do not take a quarter of the loss.
@@ -220,14 +177,8 @@ class PatchCodec(nn.Module):
         return depth_to_code(depth_m, self.config)
 
     def encode_semantics(self, ids: Tensor) -> Tensor:
-        """i64[..,H,W] -> latent [..,C,H/2,W/2].
-
-        "shares": the share of each class among a patch's labelled pixels, times 2, minus its mean over classes; a patch
-        without labels is all zero. "palette": the colours of the published table coded like an image.
-        """
-        if self.config.semantics_code == "palette":
-            image = self.palette[ids.clamp(max=CLASSES - 1)].movedim(-1, -3)  # type: ignore[index]
-            return self.encode_rgb((image + 1) / 2)
+        """i64[..,H,W] -> latent [..,19,H/2,W/2]: the share of each class among a patch's labelled pixels, times 2, minus its mean
+        over classes; a patch without labels is all zero."""
         return self.shares_to_latent(semantic_shares(ids))
 
     @staticmethod
@@ -240,48 +191,31 @@ class PatchCodec(nn.Module):
     def decode_raw(self, latents: dict[Modality, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Decode latents [N,C,h,w] to rgb in [-1,1] [N,3,H,W], depth code [N,1,H,W] and class scores [N,19,H,W].
 
-        Not clamped; what training of the decoder differentiates. Missing modalities are zeros.
+        Not clamped; what training of the decoder differentiates.
         """
-        some = next(iter(latents.values()))
-        n, _, h, w = some.shape
-        full = {m: latents.get(m, some.new_zeros(n, c, h, w)) for m, c in self.channels.items()}
-        x = torch.cat([full[m] for m in MODALITIES], 1).contiguous(memory_format=torch.channels_last)
+        x = torch.cat([latents[m] for m in MODALITIES], 1).contiguous(memory_format=torch.channels_last)
         x = self.enter(x)
         for block in self.blocks:
             x = block(x)
         d_rgb, d_depth, d_scores = self.leave(functional.silu(x)).float().split([12, 4, 4 * CLASSES], 1)
-        with torch.autocast(some.device.type, enabled=False):  # half precision would cost a percent of depth
-            rgb = torch.einsum("nkhw,ck->nchw", full["rgb"].float() * self.rgb_scale.view(4, 1, 1), self.rgb_basis)
+        with torch.autocast(x.device.type, enabled=False):  # half precision would cost a percent of depth
+            rgb = torch.einsum("nkhw,ck->nchw", latents["rgb"].float() * self.rgb_scale.view(4, 1, 1), self.rgb_basis)
             depth = torch.einsum(
-                "nkhw,ck->nchw", full["depth"].float() * self.depth_scale.view(4, 1, 1), self.depth_basis
+                "nkhw,ck->nchw", latents["depth"].float() * self.depth_scale.view(4, 1, 1), self.depth_basis
             )
         rgb = functional.pixel_shuffle(rgb + self.rgb_mean.view(12, 1, 1) + 0.2 * d_rgb, 2)
         depth = functional.pixel_shuffle(depth + 0.05 * d_depth, 2)
         scores = functional.pixel_shuffle(d_scores, 2)
-        if self.config.semantics_code == "shares":
-            scores = scores + 4.0 * functional.interpolate(full["semantics"].float(), scale_factor=2.0)
-        return rgb, depth, scores
+        return rgb, depth, scores + 4.0 * functional.interpolate(latents["semantics"].float(), scale_factor=2.0)
 
     def decode(self, latents: dict[Modality, Tensor]) -> Decoded:
-        """Decode whatever latents [..,C,h,w] are given (same leading axes). See `Decoded`."""
-        lead = next(iter(latents.values())).shape[:-3]
-        flat: dict[Modality, Tensor] = {m: z.reshape(-1, *z.shape[-3:]) for m, z in latents.items()}
-        rgb, depth, scores = self.decode_raw(flat)
-        out_rgb = ((rgb + 1) / 2).clamp(0, 1).reshape(*lead, *rgb.shape[1:]) if "rgb" in latents else None
-        out_depth = code_to_depth(depth, self.config).reshape(*lead, *depth.shape[1:]) if "depth" in latents else None
-        if "semantics" not in latents:
-            return Decoded(out_rgb, out_depth, None, None)
-        if self.config.semantics_code == "palette":
-            z = flat["semantics"].float() * self.rgb_scale.view(4, 1, 1)
-            image = torch.einsum("nkhw,ck->nchw", z, self.rgb_basis) + self.rgb_mean.view(12, 1, 1)
-            colours = functional.pixel_shuffle(image, 2).permute(0, 2, 3, 1)
-            scores = (
-                -torch.cdist(colours.flatten(0, 2), self.palette).unflatten(0, colours.shape[:3]).permute(0, 3, 1, 2)
-            )  # type: ignore[arg-type]
+        """Pixels of latents [..,C,h,w] of all modalities, with the same leading axes."""
+        lead = latents["rgb"].shape[:-3]
+        rgb, depth, scores = self.decode_raw({m: z.reshape(-1, *z.shape[-3:]) for m, z in latents.items()})
         best = scores.softmax(1).topk(2, dim=1)
-        margin = best.values[:, :1] - best.values[:, 1:]
-        size = scores.shape[-2:]
-        return Decoded(out_rgb, out_depth, best.indices[:, 0].reshape(*lead, *size), margin.reshape(*lead, 1, *size))
+        made = (((rgb + 1) / 2).clamp(0, 1), code_to_depth(depth, self.config), best.indices[:, 0],
+                best.values[:, :1] - best.values[:, 1:])  # fmt: skip
+        return Decoded(*(x.reshape(*lead, *x.shape[1:]) for x in made))
 
 
 def semantic_shares(ids: Tensor, factor: int = 2) -> Tensor:
@@ -296,17 +230,3 @@ def semantic_shares(ids: Tensor, factor: int = 2) -> Tensor:
         counts.scatter_add_(1, cells[:, place : place + 1], torch.ones_like(counts[:, :1]))
     share = counts[:, :CLASSES]
     return (share / share.sum(1, keepdim=True).clamp(min=1.0)).reshape(*lead, CLASSES, *cells.shape[-2:])
-
-
-CODECS: dict[str, type[PatchCodec]] = {"patch": PatchCodec}
-
-
-def build_codec(config: CodecConfig) -> PatchCodec:
-    """The codec that `config.kind` names; UsageError lists what there is."""
-    if config.kind not in CODECS:
-        raise UsageError(
-            f"the latent codec {config.kind!r} is not available in this version",
-            expected="one of " + ", ".join(CODECS),
-            got=config.kind,
-        )
-    return CODECS[config.kind](config)

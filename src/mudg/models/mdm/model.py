@@ -1,12 +1,11 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
 Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to do,
-`encode_condition`, `loss` and `sample`. The network is in `models.unet`, the step from latents to pixels in
-`models.refine`. `MDMConfig` is all that distinguishes one model from another.
+`encode_condition`, `loss` and `sample`. The network and the step from latents to pixels are in
+`models.mdm.network`, reading and writing in `models.mdm.files`.
 
-The network's input is, per latent cell, [noisy latent | latent of the colour condition | latent of the depth condition],
-12 channels in the published model, with optional mask planes after them. What it denoises is chosen by the modality label
-(colour 0, semantics 1, depth 500, as published), or, with `joint`, all modalities at once.
+The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition | backdrop | masks of
+what was seen | classes of the condition]. It states the clean latents of all modalities at once, and may copy the condition's own.
 
 Layouts: conditions and samples [T,C,H,W] of one clip; inside the model [B,T,C,h,w], with (h, w) the latent size; inside
 the UNet [B*T,C,h,w] stored channels-last.
@@ -14,181 +13,109 @@ the UNet [B*T,C,h,w] stored channels-last.
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import palette, seeds, store
-from mudg.base.errors import InputError, IntegrityError, UsageError
-from mudg.base.types import Condition
-from mudg.core import noise
-from mudg.core.align import DepthFit, align_depth
-from mudg.core.noise import Schedule, ScheduleConfig
+from mudg.base import palette, seeds
+from mudg.base.errors import UsageError
+from mudg.base.types import Clip, Condition
+from mudg.core import losses, noise
+from mudg.core.align import align_depth
+from mudg.core.noise import Schedule
+from mudg.models.diffusion import (
+    GeneratedClip,
+    SampleRequest,
+    check_image_size,
+    confidence_of,
+    denoised,
+    depth_agreement,
+    mean_change,
+    settle_depth,
+    sized_to_area,
+    sized_to_width,
+)  # fmt: skip
 from mudg.models.mdm.codec import (
     CLASSES,
     MODALITIES,
-    CodecConfig,
     Decoded,
     Modality,
-    build_codec,
+    PatchCodec,
     code_to_depth,
     semantic_shares,
 )  # fmt: skip
-from mudg.models.mdm.refine import ConditionPixels, PixelTruth, Refined, Refiner, refine_loss, shares
-from mudg.models.mdm.unet import TemporalAttention, UNet
+from mudg.models.mdm.network import (
+    ConditionPixels,
+    MDMConfig,
+    PixelTruth,
+    Refined,
+    Refiner,
+    TemporalAttention,
+    UNet,
+    shares,
+)  # fmt: skip
 
 SKY = palette.ID["sky"]
-LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
-"""Modality labels of the published checkpoints; fed through a sinusoid like a time step."""
-
-SHOWN_LABEL_JOINT = 0
-
-
-@dataclass(frozen=True)
-class MDMConfig:
-    """Everything that fixes a model's function except its weights."""
-
-    codec: CodecConfig = CodecConfig()
-    schedule: ScheduleConfig = ScheduleConfig()
-    joint: bool = True
-    """One pass denoises all modalities together; otherwise one pass per modality, told apart by its label."""
-    head: Literal["x0", "v"] = "x0"
-    """Meaning of the network's output."""
-    copy_condition: bool = True
-    """x0 head only: the output is added to the condition's own latent, times a gate that the network predicts."""
-    backdrop: bool = True
-    """Four more input channels: a recorded image carried over as if far away; it can be copied like the condition."""
-    mask_planes: Literal["none", "valid", "valid_image"] = "valid_image"
-    """Extra input planes: none (12 channels, published), where points were seen, and where a recorded image was warped."""
-    reference: Literal["first_frame", "warped", "concatenated", "none"] = "warped"
-    """first_frame: the dense reference replaces frame 0 of the colour condition (published); warped: the condition
-    builder has already warped recorded images into every frame; concatenated: four more planes hold its latent in every
-    frame; none: it is not used."""
-    patch: int = 2
-    """Latent cells per side of one network cell."""
-    widths: tuple[int, ...] = (64, 128, 224)
-    blocks: tuple[int, ...] = (1, 1, 2)
-    spatial_attention: tuple[bool, ...] = (False, True, True)
-    temporal_attention: tuple[bool, ...] = (False, False, True)
-    head_width: int = 32
-    embed_width: int = 192
-    given_classes: bool = True
-    """The condition's classes (255 = unknown) are read, and can be copied. Without: 20 input planes fewer."""
-    refine_widths: tuple[int, ...] = (64, 128)
-    """Channels of the refiner (see `models.refine`) at the latent resolution and at half of it; empty = no refiner."""
-    refine_blocks: tuple[int, ...] = (2, 3)
-    window: int = 8
-    """Frames per clip the model was made for; other numbers work, only this one is tested."""
-    area_px: int = 192 * 128
-    """Pixels per frame that the model was trained at."""
-    shared_noise: float = 0.3
-    """Share of the noise variance common to all frames, in training and sampling."""
-
-    def __post_init__(self) -> None:
-        levels = {len(self.widths), len(self.blocks), len(self.spatial_attention), len(self.temporal_attention)}
-        if len(levels) != 1:
-            raise UsageError(
-                "widths, blocks and attention switches must have one entry per level", got=f"{sorted(levels)}"
-            )
-        attended = zip(self.widths, self.spatial_attention, self.temporal_attention)
-        if any((spatial or temporal) and width % self.head_width for width, spatial, temporal in attended):
-            raise UsageError("a width is no multiple of the attention head width", got=f"{self.widths}")
-        if self.joint is False and self.codec.semantics_code != "palette":
-            raise UsageError(
-                "separate passes need all modalities in the same latent shape",
-                expected="codec.semantics_code = palette",
-                got=self.codec.semantics_code,
-            )
-        if self.backdrop and not self.copy_condition:
-            raise UsageError("a backdrop is only used together with copy_condition")
-        if self.given_classes and not (self.joint and self.copy_condition and self.codec.semantics_code == "shares"):
-            raise UsageError("given classes are only read by a joint model with class shares that copies its condition")
-        if (len(self.refine_widths), len(self.refine_blocks)) not in ((0, 0), (2, 2)):
-            raise UsageError(
-                "refine_widths and refine_blocks have two entries each, or none", got=str(self.refine_widths)
-            )
-        if self.refine_widths and not (self.joint and self.head == "x0" and self.codec.semantics_code == "shares"):
-            raise UsageError("a refiner needs a joint model with an x0 head and class shares")
-        if self.head == "v" and (self.copy_condition or self.codec.semantics_code != "palette"):
-            raise UsageError("a v head can neither copy the condition nor give class scores", expected="head = x0")
-
-    @property
-    def pixel_multiple(self) -> int:
-        """Image sides must be multiples of this many pixels."""
-        return 2 * self.patch * 2 ** (len(self.widths) - 1)
-
-
-def config_to_dict(config: MDMConfig) -> dict[str, Any]:
-    """Plain JSON values of a configuration."""
-    return dataclasses.asdict(config)
-
-
-def config_from_dict(values: Mapping[str, Any], where: str = "model configuration") -> MDMConfig:
-    """Inverse of `config_to_dict`; unknown or missing keys are an InputError that names them."""
-
-    def strict(cls: Any, given: Any, path: str) -> dict[str, Any]:
-        known = {f.name for f in dataclasses.fields(cls)}
-        if not isinstance(given, Mapping) or set(given) != known:
-            names = set(given) if isinstance(given, Mapping) else set()
-            raise InputError(
-                "a model configuration has other fields than this version knows",
-                where=f"{where}: {path}",
-                expected=", ".join(sorted(known)),
-                got="missing " + ", ".join(sorted(known - names)) + "; unknown " + ", ".join(sorted(names - known)),
-            )
-        return {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
-
-    top = strict(MDMConfig, values, "top")
-    top["codec"] = CodecConfig(**strict(CodecConfig, top["codec"], "codec"))
-    top["schedule"] = ScheduleConfig(**strict(ScheduleConfig, top["schedule"], "schedule"))
-    try:
-        return MDMConfig(**top)
-    except TypeError as error:
-        raise InputError("a model configuration has a value of a wrong type", where=where, got=str(error)) from error
 
 
 # model ----------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Encoded:
+class ConditionLatents:
     """A batch of conditions as the network wants them.
 
-    planes f32[B,T,8+backdrop+masks+classes,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class
-    shares [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour, or None; seen: share of the cell that is
+    planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
+    [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
     trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..].
     """
 
     planes: Tensor
     copy: dict[Modality, Tensor]
-    backdrop: Tensor | None
+    backdrop: Tensor
     seen: dict[Modality, Tensor]
     pixels: ConditionPixels
 
 
 @dataclass(frozen=True)
-class Sample:
-    """A generated clip.
+class BatchPart:
+    """Clips number `first` and following of the `count` clips of a training step. Whatever training draws for a clip depends on
+    (seed, step, its number), and not on how the step's batch is divided."""
 
-    rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1]; modalities not asked
-    for are None. `latents`: modality -> [T,C,h,w], to be handed to the next window as `known`.
+    seed: int
+    step: int
+    first: int
+    count: int
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """What a training run says about the loss.
+
+    class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
+    refined_share      share of each side of the image on which the refiner is trained at a step
+    reference_dropout  share of the clips that go without their reference image; the published kind
     """
 
-    rgb: Tensor | None
-    depth: Tensor | None
-    semantics: Tensor | None
-    confidence: Tensor
-    latents: dict[Modality, Tensor] = field(repr=False)
-    depth_fits: tuple[DepthFit, ...] = ()
-    """One per frame: how depth was brought to the measured scale; empty if that was not asked for."""
+    class_weights: Tensor | None = None
+    refined_share: float = 1.0
+    reference_dropout: float = 0.2
+
+
+@dataclass(frozen=True)
+class EncodedTruth:
+    """Encoded truth of a batch: latents [B,T,C,h,w]; class shares [B,T,19,h,w]; depth_known f32[B,T,1,h,w], share of the cell with
+    valid depth; and all of it at pixel resolution."""
+
+    latents: dict[Modality, Tensor]
+    shares: Tensor
+    depth_known: Tensor
+    pixels: PixelTruth
 
 
 @dataclass(frozen=True)
@@ -205,29 +132,29 @@ TRUSTED_ERROR = 0.08
 COPY_BIAS = 4.0
 """Start value of the copy gates' logits where the cell is seen (minus this for the backdrop); 0 where it is not."""
 
+CONDITION_PLANES = 3 * 4 + 2 * PatchCodec.factor**2 + CLASSES + 1
+"""Planes of a condition: latents of colour, depth and backdrop, two masks at pixel resolution, class shares and their sum."""
+
+GATES = 4
+"""Outputs that say how much of the condition is copied: its colour, its depth, the backdrop's colour, its classes."""
+
 LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
 """Weights of the modalities in the joint loss."""
 
 
 class MDM(nn.Module):
-    """The multi-modal diffusion model (see the module text). Weights are random until `load` or `learn` sets them."""
+    """The multi-modal diffusion model (see the module text). Weights are random until `files.load` or `learn` sets them."""
+
+    points_alone = False
+    """The condition is filled, and recorded images are warped into it."""
 
     def __init__(self, config: MDMConfig) -> None:
         super().__init__()
         self.config = config
-        self.codec = build_codec(config.codec)
+        self.codec = PatchCodec(config.codec)
         self.schedule = Schedule(config.schedule)
-        self.passes: tuple[tuple[Modality, ...], ...] = (
-            (MODALITIES,) if config.joint else tuple((m,) for m in MODALITIES)
-        )
-        masks = {"none": 0, "valid": 1, "valid_image": 2}[config.mask_planes] * self.codec.factor**2
-        noisy = sum(self.codec.channels[m] for m in self.passes[0])
-        self.gates = (
-            (2 if config.copy_condition else 0) + (1 if config.backdrop else 0) + (1 if config.given_classes else 0)
-        )
-        concatenated = 4 if config.reference == "concatenated" else 0
-        planes = noisy + 8 + (4 if config.backdrop else 0) + masks + concatenated + (CLASSES + 1 if config.given_classes else 0)
-        self.net = UNet(config, planes, noisy + self.gates).to(memory_format=torch.channels_last)
+        noisy = sum(self.codec.channels.values())
+        self.net = UNet(config, noisy + CONDITION_PLANES, noisy + GATES).to(memory_format=torch.channels_last)
         self.refiner: Refiner | None = None
         if config.refine_widths:
             (fine, coarse), (outer, inner) = config.refine_widths, config.refine_blocks
@@ -237,168 +164,112 @@ class MDM(nn.Module):
 
     def check_size(self, height: int, width: int) -> None:
         """UsageError unless an image of this size fits the network's strides."""
-        multiple = self.config.pixel_multiple
-        if height % multiple or width % multiple or height < multiple or width < multiple:
-            raise UsageError(
-                "image size does not fit the diffusion model",
-                expected=f"multiples of {multiple} pixels",
-                got=f"{width}x{height}",
-            )
+        check_image_size(height, width, self.config.pixel_multiple)
 
-    def encode_condition(self, condition: Condition | Sequence[Condition]) -> Encoded:
-        """Latents and mask planes of one clip's condition, or of several of the same shape (see `Encoded`)."""
+    def check_clip(self, frames: int, height: int, width: int) -> None:
+        """UsageError unless the model can make clips of this image size; any number of frames will do."""
+        del frames
+        self.check_size(height, width)
+
+    def encode_condition(self, condition: Condition | Sequence[Condition]) -> ConditionLatents:
+        """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`).
+
+        A condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop, and
+        unknown classes.
+        """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
-        stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
+        color, depth, valid = (torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth", "valid"))
         warped = torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch])
         backdrop = torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch])
-        unknown = torch.full(batch[0].valid.shape, 255, dtype=torch.uint8)
+        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
         ids = torch.stack([unknown if c.semantics is None else c.semantics for c in batch])
-        far_ids = torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch])
-        color, depth, valid, reference = (stack(name) for name in ("color", "depth", "valid", "reference"))
-        return self.encode_planes(color, depth, valid, warped, backdrop, reference, ids, far_ids)
-
-    def encode_planes(
-        self, color: Tensor, depth: Tensor, valid: Tensor, warped: Tensor, backdrop: Tensor, reference: Tensor, ids: Tensor,
-        backdrop_ids: Tensor,
-    ) -> Encoded:  # fmt: skip
-        """As `encode_condition`, from stacked tensors.
-
-        color, backdrop f32[B,T,3,H,W]; depth f32[B,T,1,H,W] metres; valid, warped bool[B,T,1,H,W]; reference f32[B,3,H,W], used
-        only with `reference = "first_frame"`; ids, backdrop_ids u8[B,T,1,H,W], 255 = unknown.
-        """
+        backdrop_ids = torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch])
         self.check_size(*color.shape[-2:])
         valid, warped = valid.float(), warped.float()
-        if self.config.reference == "first_frame":
-            color = torch.cat([reference[:, None], color[:, 1:]], 1)
-            warped = torch.cat([torch.ones_like(warped[:, :1]), warped[:, 1:]], 1)
-        copy: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth)}
         factor = self.codec.factor
-        masks = {"none": [], "valid": [valid], "valid_image": [valid, warped]}[self.config.mask_planes]
-        far = self.codec.encode_rgb(backdrop) if self.config.backdrop else None
-        planes = [
-            copy["rgb"],
-            copy["depth"],
-            *([] if far is None else [far]),
-            *(functional.pixel_unshuffle(m, factor) for m in masks),
-        ]
-        if self.config.reference == "concatenated":
-            planes.append(self.codec.encode_rgb(reference)[:, None].expand(-1, color.shape[1], -1, -1, -1))
         pool = lambda m: functional.avg_pool2d(m.flatten(0, 1), factor).unflatten(0, m.shape[:2])  # noqa: E731
-        seen: dict[Modality, Tensor] = {"rgb": pool(torch.maximum(valid, warped)), "depth": pool(valid)}
-        if self.config.given_classes:
-            copy["semantics"] = shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2])
-            seen["semantics"] = copy["semantics"].sum(2, keepdim=True)
-            planes += [copy["semantics"], seen["semantics"]]
+        copy: dict[Modality, Tensor] = {
+            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth),
+            "semantics": shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2]),
+        }  # fmt: skip
+        seen: dict[Modality, Tensor] = {
+            "rgb": pool(torch.maximum(valid, warped)), "depth": pool(valid), "semantics": copy["semantics"].sum(2, keepdim=True)
+        }  # fmt: skip
+        far = self.codec.encode_rgb(backdrop)
+        masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
+        planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
         depth_code = self.codec.linear_depth_code(depth)
         pixels = (color * 2 - 1, backdrop * 2 - 1, depth_code, valid, warped, ids, backdrop_ids)
-        return Encoded(torch.cat(planes, 2), copy, far, seen, ConditionPixels(*(x.flatten(0, 1) for x in pixels)))
+        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, ConditionPixels(*(x.flatten(0, 1) for x in pixels)))
 
     # network ----------------------------------------------------------------------------------------------------------
 
     def predict(
-        self, x: dict[Modality, Tensor], encoded: Encoded, t: Tensor
-    ) -> tuple[dict[Modality, Tensor], Tensor | None]:
-        """One pass of the network over the modalities in `x` (noisy latents [B,T,C,h,w]) at steps `t` i64[B].
+        self, x: dict[Modality, Tensor], encoded: ConditionLatents, t: Tensor
+    ) -> tuple[dict[Modality, Tensor], Tensor]:
+        """One pass of the network over the noisy latents `x` [B,T,C,h,w] of all modalities at steps `t` i64[B].
 
-        Returns the network's statement per modality (x0, or v with a v head), and the log-shares of the classes
-        [B,T,19,h,w] if semantics were among them and are coded as shares.
+        Returns the clean latents it states, and the log-shares of the classes [B,T,19,h,w].
         """
-        names = tuple(x)
-        sizes = [x[m].shape[2] for m in names]
-        label = torch.full_like(t, SHOWN_LABEL_JOINT if len(names) > 1 else LABELS[names[0]])
-        out = self.net(torch.cat([*x.values(), encoded.planes], 2), t, label)
-        gates = None
-        if self.config.copy_condition:
-            out, gates = out.split([sum(sizes), self.gates], 2)
-        stated = dict(zip(names, out.split(sizes, 2)))
-        if gates is not None:
-            for channel, m in enumerate(("rgb", "depth")):
-                if m in stated:
-                    gate = (gates[:, :, channel : channel + 1] + COPY_BIAS * encoded.seen[m]).sigmoid()
-                    stated[m] = stated[m] + gate * encoded.copy[m]
-            if encoded.backdrop is not None and "rgb" in stated:
-                gate = (gates[:, :, 2:3] - COPY_BIAS * encoded.seen["rgb"]).sigmoid()
-                stated["rgb"] = stated["rgb"] + gate * encoded.backdrop
-            if "semantics" in encoded.copy and "semantics" in stated:
-                stated["semantics"] = stated["semantics"] + 4.0 * gates[:, :, -1:].sigmoid() * encoded.copy["semantics"]
-        log_shares = None
-        if "semantics" in stated and self.config.codec.semantics_code == "shares":
-            log_shares = stated["semantics"].log_softmax(2)
-            stated["semantics"] = self.codec.shares_to_latent(log_shares.exp())
-        return stated, log_shares
+        sizes = [x[m].shape[2] for m in MODALITIES]
+        out, gates = self.net(torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), t).split([sum(sizes), GATES], 2)
+        copy_rgb, copy_depth, copy_far, copy_classes = gates.split(1, 2)
+        rgb, depth, classes = out.split(sizes, 2)
+        rgb = rgb + (copy_rgb + COPY_BIAS * encoded.seen["rgb"]).sigmoid() * encoded.copy["rgb"]
+        depth = depth + (copy_depth + COPY_BIAS * encoded.seen["depth"]).sigmoid() * encoded.copy["depth"]
+        rgb = rgb + (copy_far - COPY_BIAS * encoded.seen["rgb"]).sigmoid() * encoded.backdrop
+        log_shares = (classes + 4.0 * copy_classes.sigmoid() * encoded.copy["semantics"]).log_softmax(2)
+        return {"rgb": rgb, "depth": depth, "semantics": self.codec.shares_to_latent(log_shares.exp())}, log_shares
 
     # training ---------------------------------------------------------------------------------------------------------
 
-    def encode_truth(self, rgb: Tensor, depth: Tensor, semantics: Tensor) -> dict[Modality, Tensor]:
-        """Latents of a clip's truth: rgb [B,T,3,H,W], depth [B,T,1,H,W] m, semantics i64[B,T,H,W]."""
-        return {
-            "rgb": self.codec.encode_rgb(rgb),
-            "depth": self.codec.encode_depth(depth),
-            "semantics": self.codec.encode_semantics(semantics),
-        }
+    def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
+        """Denoising loss of clips of one size; all that is drawn comes from `part`.
 
-    def loss(
-        self,
-        truth: dict[Modality, Tensor],
-        encoded: Encoded,
-        generator: torch.Generator,
-        *,
-        shares: Tensor | None = None,
-        class_weights: Tensor | None = None,
-        depth_known: Tensor | None = None,
-        pixels: PixelTruth | None = None,
-        window: tuple[slice, slice] | None = None,
-        first: int = 0,
-        whole: int = 0,
-    ) -> Losses:
-        """Denoising loss of a batch, steps and noise drawn from `generator`.
-
-        truth        latents of `encode_truth`
-        shares       class shares [B,T,19,h,w]; needed when semantics are coded as shares
-        class_weights  f32[19], weights of the classes in the cross-entropy; None = all 1
-        depth_known  f32[B,T,1,h,w] share of the cell with true depth; None = everywhere
-        pixels, window  truth at pixel resolution, and the rectangle of latent cells to train the refiner on (None = all);
-                     its terms are added, and their gradient reaches the denoiser
-        first, whole  these clips are number `first` and following of a batch of `whole` clips (0 = of just these); what is
-                     drawn for a clip does not depend on how that batch is divided
-
-        x0 head: squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a
-        clip; cross-entropy for class shares. v head: squared error of v. Steps are stratified over the batch.
+        Squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a clip; cross-entropy for class
+        shares. Steps are stratified over the batch. Where depth is not valid it has no part.
+        With a refiner its terms are added, and their gradient reaches the denoiser.
         """
-        some = next(iter(truth.values()))
-        batch = len(some)
-        t = noise.stratified_steps(whole or batch, len(self.schedule), generator)[first : first + batch].to(some.device)
+        with torch.no_grad():
+            encoded = self.encode_condition([clip.condition for clip in clips])
+            truth = self.encode_truth(clips)
+        generator = seeds.torch_generator(part.seed, part.step, "noise")
+        steps = noise.stratified_steps(part.count, len(self.schedule), generator)
+        t = steps[part.first : part.first + len(clips)].to(truth.shares.device)
         weight = noise.loss_weight(self.schedule, t).view(-1, 1, 1, 1, 1)
-        total: Tensor | float = 0.0
-        terms: dict[str, float] = {}
-        for names in self._drawn_passes(generator):
-            eps = {m: self._clip_noise(truth[m], generator.initial_seed(), first, m) for m in names}
-            x = {m: self.schedule.add_noise(truth[m], eps[m], t) for m in names}
-            stated, log_shares = self.predict(x, encoded, t)
-            for m in names:
-                if m == "semantics" and log_shares is not None:
-                    if shares is None:
-                        raise UsageError("class shares are needed for the semantic loss", where="MDM.loss")
-                    weighted = shares if class_weights is None else shares * class_weights.view(-1, 1, 1)
-                    part = -(weighted * log_shares).sum(2).mean()
-                elif self.config.head == "v":
-                    error = (stated[m] - self.schedule.velocity(truth[m], eps[m], t)).square()
-                    part = (error if m != "depth" or depth_known is None else error * depth_known).mean()
-                elif m == "depth":
-                    error = functional.huber_loss(stated[m], truth[m], reduction="none", delta=0.2) * 5.0
-                    known = torch.ones_like(error[:, :, :1]) if depth_known is None else depth_known
-                    part = (weight * error * known).mean()
-                else:
-                    part = (weight * (stated[m] - truth[m]).square()).mean()
-                terms[m] = float(part.detach())
-                total = total + LOSS_SHARES[m] * part
-            if self.refiner is not None and pixels is not None:
-                parts = self._refiner_terms(stated, encoded, pixels, window, class_weights)
-                terms |= {name: float(part.detach()) for name, part in parts.items()}
-                total = total + sum(parts.values())
-        if not isinstance(total, Tensor):
-            raise UsageError("nothing to train on", where="MDM.loss")
-        return Losses(total, terms)
+        eps = {m: self._clip_noise(truth.latents[m], generator.initial_seed(), part.first, m) for m in MODALITIES}
+        x = {m: self.schedule.add_noise(truth.latents[m], eps[m], t) for m in MODALITIES}
+        stated, log_shares = self.predict(x, encoded, t)
+        errors = {
+            "rgb": losses.latent_error(stated["rgb"], truth.latents["rgb"], weight),
+            "depth": losses.latent_depth_error(stated["depth"], truth.latents["depth"], weight, truth.depth_known),
+            "semantics": losses.share_cross_entropy(log_shares, truth.shares, settings.class_weights),
+        }
+        terms = {m: float(error.detach()) for m, error in errors.items()}
+        total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
+        if self.refiner is not None:
+            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings)
+            terms |= {name: float(error.detach()) for name, error in errors.items()}
+            total = total + sum(errors.values())
+        return Losses(total, terms)  # type: ignore[arg-type]
+
+    forward = loss
+    """What `DistributedDataParallel` calls, to exchange gradients behind it."""
+
+    def encode_truth(self, clips: Sequence[Clip]) -> EncodedTruth:
+        """What `loss` compares with."""
+        rgb, depth, valid, ids = (
+            torch.stack([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+        )
+        known = valid.float().flatten(0, 1)
+        latents: dict[Modality, Tensor] = {
+            "rgb": self.codec.encode_rgb(rgb), "depth": self.codec.encode_depth(depth),
+            "semantics": self.codec.encode_semantics(ids),
+        }  # fmt: skip
+        code = self.codec.linear_depth_code(depth)
+        pixels = PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), ids.flatten(0, 1), known)
+        cells = functional.avg_pool2d(known, self.codec.factor).unflatten(0, valid.shape[:2])
+        return EncodedTruth(latents, semantic_shares(ids), cells, pixels)
 
     def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
         """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""
@@ -410,33 +281,41 @@ class MDM(nn.Module):
         return torch.cat(draws).to(like.device)
 
     def _refiner_terms(
-        self, stated: dict[Modality, Tensor], encoded: Encoded, truth: PixelTruth, window: tuple[slice, slice] | None,
-        class_weights: Tensor | None,
-    ) -> dict[str, Tensor]:  # fmt: skip
-        frames = encoded.planes.shape[1]
-        rows, columns = window or (slice(0, encoded.planes.shape[-2]), slice(0, encoded.planes.shape[-1]))
-        latents: dict[Modality, Tensor] = {m: z[..., rows, columns].flatten(0, 1) for m, z in stated.items()}
-        factor = self.codec.factor
-        tall, wide = (slice(s.start * factor, s.stop * factor) for s in (rows, columns))
-        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
-        codec = self.config.codec
-        log_per_code = math.log(codec.far_m / codec.near_m) / 2 if codec.depth_code == "log" else 1.0
-        return refine_loss(made, truth.crop(tall, wide), class_weights, log_per_code=log_per_code)
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, truth: PixelTruth, part: BatchPart, settings: LossSettings
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the pixel loss in a rectangle of the image; depth in the sky counts threefold."""
+        frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
+        cells = self._refined_window(part, settings.refined_share, h, w)
+        latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
+        factor, codec = self.codec.factor, self.config.codec
+        tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
+        made, truth = self.refine(latents, encoded.pixels.crop(tall, wide), frames), truth.crop(tall, wide)
+        log_per_code = math.log(codec.far_m / codec.near_m) / 2
+        counted = (1.0 + 2.0 * (truth.ids == SKY).unsqueeze(1)) * truth.depth_known
+        error = made.rgb - truth.rgb
+        return {
+            "pixel_rgb": losses.image_error(error, square=2.0, gradient=0.5),
+            "pixel_depth": losses.depth_code_error(made.depth_code, truth.depth_code, counted, log_per_code),
+            "pixel_semantics": 0.2 * losses.class_error(made.scores, truth.ids, settings.class_weights),
+            "pixel_error": 0.05 * losses.stated_error(made.log_error, error),
+        }
+
+    @staticmethod
+    def _refined_window(part: BatchPart, share: float, height: int, width: int) -> tuple[slice, slice]:
+        """Rows and columns of latent cells on which the refiner is trained at a step: a share of each side, anywhere."""
+        rng = seeds.numpy_rng(part.seed, part.step, "refined window")
+        spans = []
+        for cells in (height, width):
+            size = min(cells, max(8, round(cells * share / 8) * 8))
+            start = 2 * int(rng.integers((cells - size) // 2 + 1))
+            spans.append(slice(start, start + size))
+        return spans[0], spans[1]
 
     def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
-        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.refine`)."""
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`)."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
         return self.refiner(self.codec, latents, given, frames)
-
-    def pixel_truth(
-        self, rgb: Tensor, depth: Tensor, semantics: Tensor, depth_known: Tensor | None = None
-    ) -> PixelTruth:
-        """Truth for `loss`: rgb f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres, semantics i64[B,T,H,W], and where the
-        depth is true, bool[B,T,1,H,W] (None = everywhere)."""
-        code = self.codec.linear_depth_code(depth)
-        known = None if depth_known is None else depth_known.float().flatten(0, 1)
-        return PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), semantics.flatten(0, 1), known)
 
     def trained_part(self) -> nn.ModuleDict:
         """What training changes once the codec is fixed, by attribute name: the denoiser and, if there is one, the refiner."""
@@ -451,93 +330,57 @@ class MDM(nn.Module):
         kinds = {name for name, module in self.trained_part().named_modules() if isinstance(module, TemporalAttention)}
         return {f"{owner}.{name}" for owner in kinds for name, _ in self.trained_part().get_submodule(owner).named_parameters()}
 
-    def _drawn_passes(self, generator: torch.Generator) -> Sequence[tuple[Modality, ...]]:
-        """Joint: the one pass. Separate: one modality per batch, colour half of the time, as published."""
-        if self.config.joint:
-            return self.passes
-        u = float(torch.rand((), generator=generator))
-        return [self.passes[0 if u < 0.5 else 1 if u < 0.75 else 2]]
-
-    def condition_latents(self, condition: Condition) -> dict[Modality, Tensor]:
-        """The condition as latents [T,C,h,w] of all modalities, to `start` from; classes that are not given are all alike."""
-        encoded = self.encode_condition(condition)
-        latents = {m: encoded.copy[m][0] for m in ("rgb", "depth")}
-        unknown = torch.full_like(condition.valid[:, 0], 255, dtype=torch.long)
-        ids = unknown if condition.semantics is None else condition.semantics[:, 0].long()
-        return {**latents, "semantics": self.codec.encode_semantics(ids)}  # type: ignore[dict-item]
-
     # sampling ---------------------------------------------------------------------------------------------------------
 
+    @staticmethod
+    def check_request(request: SampleRequest) -> None:
+        """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
+        request.sampler_settings()
+        if request.guidance is not None or request.guidance_rescale is not None:
+            raise UsageError("only published-type models have guidance", where="guidance, guidance_rescale",
+                             got=f"{request.guidance}, {request.guidance_rescale}", remedy="leave them out")  # fmt: skip
+
+    def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
+        """Width and height the model works at for a camera of width x height: about the area it was trained at, or about
+        `width_px` wide, in the camera's aspect."""
+        aspect, multiple = width / height, self.config.pixel_multiple
+        if width_px:
+            return sized_to_width(width_px, aspect, multiple)
+        return sized_to_area(self.config.area_px, aspect, multiple)
+
     @torch.no_grad()
-    def sample(
-        self,
-        condition: Condition,
-        *,
-        steps: int = 2,
-        seed: int = 0,
-        index: int = 0,
-        sampler: str = "ddim",
-        eta: float = 1.0,
-        modalities: Sequence[Modality] = MODALITIES,
-        n_samples: int = 1,
-        known: Mapping[Modality, Tensor] | None = None,
-        start: Mapping[Modality, Tensor] | None = None,
-        strength: float = 1.0,
-        align: bool = True,
-        bf16: bool = False,
-    ) -> Sample:
-        """Generate one clip.
+    def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
+        """Generate one clip (see `SampleRequest`).
 
-        condition   T views; H and W multiples of `config.pixel_multiple`
-        steps       denoiser passes (per modality unless joint); 1 is the regression of the clip on its condition
-        seed, index all noise is drawn from (seed, index): same in, same out
-        sampler     a row of `noise.SAMPLERS`
-        known       latents [k,C,h,w] of the clip's first k frames, from the previous window: they are kept
-        start       latents [T,C,h,w] of all modalities to start from instead of pure noise, for example of the condition
-                    (`condition_latents`) or of a render; `strength` in (0, 1] is the share of the schedule that is run
-        n_samples   > 1: the first sample is returned, the spread of all lowers the confidence
-        align       bring each frame's depth to the measured scale first (`core.align`)
-        bf16        run the network in bfloat16
-
-        Measured depth (`condition.valid`) replaces generated depth.
+        The condition has T views; H and W are multiples of `config.pixel_multiple`. Frames of which `request.known` has latents
+        keep them. Measured depth (`condition.valid`) replaces generated depth.
         """
-        check_request(sampler, modalities)
+        self.check_request(request)
         encoded = self.encode_condition(condition)
-        passes = self.passes if self.config.joint else tuple((m,) for m in MODALITIES if m in modalities)
         drawn: list[dict[Modality, Tensor]] = []
         change = torch.zeros_like(encoded.seen["rgb"])
-        for number in range(n_samples):
-            latents: dict[Modality, Tensor] = {}
-            for names in passes:
-                part, moved = self._denoise(encoded, names, steps, seeds.key(seed, index * 64 + number, "sample"), sampler,
-                                            eta, known, start, strength, bf16)  # fmt: skip
-                latents |= part
-                change = torch.maximum(change, moved)
+        for number in range(request.n_samples):
+            latents, moved = self._denoise(encoded, request, number)
+            change = torch.maximum(change, moved)
             drawn.append(latents)
-        if n_samples > 1:
-            stacked = torch.stack([d.get("rgb", next(iter(d.values()))) for d in drawn])
-            change = stacked.std(0).mean(2, keepdim=True) * 2
+        if request.n_samples > 1:
+            change = torch.stack([d["rgb"] for d in drawn]).std(0).mean(2, keepdim=True) * 2
         latents = {m: z[0] for m, z in drawn[0].items()}
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=request.bf16):
             if self.refiner is None:
-                decoded = self.codec.decode({m: z for m, z in latents.items() if m in modalities})
+                decoded = self.codec.decode(latents)
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
                 decoded, error = self._decode_refined(latents, encoded.pixels)
                 confidence = torch.exp(-error / TRUSTED_ERROR)
-                if n_samples > 1:
+                if request.n_samples > 1:
                     confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
-        depth, ids = decoded.depth, decoded.semantics
-        fits: list[DepthFit] = []
-        if depth is not None:
-            if align:
-                depth, fits = align_depth(depth, condition.depth, condition.valid)
-            confidence = confidence * depth_agreement(depth, condition)
-            depth = settle_depth(depth, condition, self.config.codec.far_m)
-        wanted = lambda m, x: x if m in modalities else None  # noqa: E731
-        return Sample(
-            wanted("rgb", decoded.rgb), wanted("depth", depth), wanted("semantics", ids), confidence, latents, tuple(fits)
-        )
+        depth, fits = decoded.depth, []
+        if request.align:
+            depth, fits = align_depth(depth, condition.depth, condition.valid)
+        confidence = confidence * depth_agreement(depth, condition)
+        depth = settle_depth(depth, condition, self.config.codec.far_m)
+        return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits))
 
     def _decode_refined(self, latents: dict[Modality, Tensor], given: ConditionPixels) -> tuple[Decoded, Tensor]:
         """Pixels of one clip through the refiner, and the expected error of the colour f32[T,1,H,W] in [0,1]."""
@@ -548,185 +391,37 @@ class MDM(nn.Module):
         rgb = ((made.rgb + 1) / 2).clamp(0, 1)
         return Decoded(rgb, depth, best.indices[:, 0], margin), made.log_error.clamp(-6, 1).exp() / 2
 
-    def _denoise(
-        self,
-        encoded: Encoded,
-        names: tuple[Modality, ...],
-        steps: int,
-        noise_seed: int,
-        sampler: str,
-        eta: float,
-        known: Mapping[Modality, Tensor] | None,
-        start: Mapping[Modality, Tensor] | None,
-        strength: float,
-        bf16: bool,
-    ) -> tuple[dict[Modality, Tensor], Tensor]:
-        """Run the sampler for the modalities of one pass; returns latents [1,T,C,h,w] and the change over the late steps."""
-        lead = encoded.planes.shape[:2]
-        cell = encoded.planes.shape[-2:]
-        sizes = [self.codec.channels[m] for m in names]
-        generator = torch.Generator().manual_seed(noise_seed)
-        shape = (*lead, sum(sizes), *cell)
-        draw = lambda: noise.video_noise(shape, generator, self.config.shared_noise)  # noqa: E731
-        estimates: list[Tensor] = []
-        indices = noise.trailing_steps(len(self.schedule), steps)
-        begin = draw()
-        if start is not None:
-            indices = noise.partial_steps(indices, len(self.schedule), strength)
-            given = torch.cat([start[m] for m in names], 1)[None]
-            begin = self.schedule.add_noise(given, begin, torch.full((lead[0],), indices[0]))
-        elif strength != 1.0:
-            raise UsageError("strength needs something to start from", got=str(strength), remedy="strength = 1")
+    def _denoise(self, encoded: ConditionLatents, request: SampleRequest, number: int) -> tuple[dict[Modality, Tensor], Tensor]:
+        """Draw sample `number` of a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
+        lead, cell = encoded.planes.shape[:2], encoded.planes.shape[-2:]
+        sizes = [self.codec.channels[m] for m in MODALITIES]
+        generator = torch.Generator().manual_seed(seeds.key(request.seed, request.index * 64 + number, "sample"))
+        draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, self.config.shared_noise)  # noqa: E731
+        known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None]
 
         def denoise(x: Tensor, t: int) -> Tensor:
-            stated, _ = self.predict(dict(zip(names, x.split(sizes, 2))), encoded, torch.full((lead[0],), t))
-            out = torch.cat([stated[m].float() for m in names], 2)
-            if known and self.config.head == "x0":
-                kept = torch.cat([known[m] for m in names], 1)
-                out = torch.cat([kept[None], out[:, kept.shape[0] :]], 1)
-            return out
+            stated, _ = self.predict(dict(zip(MODALITIES, x.split(sizes, 2))), encoded, torch.full((lead[0],), t))
+            out = torch.cat([stated[m].float() for m in MODALITIES], 2)
+            return out if known is None else torch.cat([known, out[:, known.shape[1] :]], 1)
 
-        def watch(number: int, x0: Tensor) -> None:
-            if 2 * number >= len(indices) - 1:
-                estimates.append(x0[:, :, : sizes[0]])
-
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):  # around all steps: the weights are converted once
-            x = noise.SAMPLERS[sampler](
-                denoise, begin, self.schedule, indices, prediction=self.config.head, eta=eta, draw=draw, on_step=watch
-            )
-        moved = torch.stack([(e - x[:, :, : sizes[0]]).abs().mean(2, keepdim=True) for e in estimates]).mean(0)
-        return dict(zip(names, x.split(sizes, 2))), moved
-
-
-def check_request(sampler: str, modalities: Sequence[str]) -> None:
-    """UsageError unless there is such a sampler and at least one modality is asked for, all of them known."""
-    if sampler not in noise.SAMPLERS:
-        raise UsageError("unknown sampler", expected=", ".join(noise.SAMPLERS), got=sampler)
-    if not modalities or any(m not in MODALITIES for m in modalities):
-        raise UsageError("unknown or no modality", expected=", ".join(MODALITIES), got=str(list(modalities)))
-
-
-def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
-    """How far a generated pixel can be trusted, f32[T,1,H,W] in [0,1].
-
-    seen    [T,1,h,w] share of the latent cell that was measured or warped from a recorded image
-    change  [T,1,h,w] how much the colour latent still moved in the later half of sampling (or its spread over samples)
-    factor  pixels per cell
-
-    The product of a coverage term (1 where seen, 0.35 far from anything seen, smoothed over 5 cells) and exp(-2 change).
-    """
-    near = functional.avg_pool2d(seen, 5, stride=1, padding=2, count_include_pad=False)
-    coverage = 0.35 + 0.65 * torch.maximum(seen, near)
-    value = coverage * torch.exp(-2.0 * change)
-    return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
-
-
-def depth_agreement(depth: Tensor, condition: Condition, reach_px: int = 2) -> Tensor:
-    """How far generated depth f32[T,1,H,W] agrees with what was measured nearby, f32[T,1,H,W] in [0.2, 1].
-
-    exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within `reach_px` as the mean of
-    those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not to
-    be trusted either.
-    """
-    seen = condition.valid.float()
-    ratio = (depth.clamp(min=0.1) / condition.depth.clamp(min=0.1)).log().abs()
-    agrees = torch.exp(-5.0 * ratio).clamp(min=0.2)
-    window = 2 * reach_px + 1
-    pool = lambda x: functional.avg_pool2d(x, window, stride=1, padding=reach_px, count_include_pad=True)  # noqa: E731
-    near = pool(seen)
-    return torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
-
-
-def settle_depth(depth: Tensor, condition: Condition, far_m: float) -> Tensor:
-    """Generated depth with measured depth put in wherever a point was seen, f32[T,1,H,W] metres, at most `far_m`.
-
-    The condition's points have passed a visibility test, so they are taken as they are.
-    """
-    return torch.where(condition.valid, condition.depth, depth).clamp(max=far_m)
-
-
-# files ----------------------------------------------------------------------------------------------------------------
-
-MODEL_FILE = "model.json"
-_ASSETS = Path(__file__).resolve().parents[2] / "assets"
-EMBEDDED: dict[str, Path] = {"embedded": _ASSETS / "mdm_small", "embedded-tiny": _ASSETS / "mdm_tiny"}
-"""Models that come with the package, by the names that stand for their folders."""
-PART_BYTES = 15 * 1024 * 1024
-"""Weights are split into files of at most this size."""
-
-
-def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
-    """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and MODEL_CARD.md."""
-    parts: list[dict[str, Tensor]] = [{}]
-    size = 0
-    for name, value in model.state_dict().items():
-        half = value.half() if value.is_floating_point() else value
-        if size + half.nbytes > PART_BYTES and parts[-1]:
-            parts.append({})
-            size = 0
-        parts[-1][name] = half.contiguous()
-        size += half.nbytes
-    files = {}
-    for number, part in enumerate(parts):
-        name = f"weights_{number:02d}.safetensors"
-        store.write_safetensors(folder / name, part)
-        files[name] = store.sha256_file(folder / name)
-    store.write_text(folder / "MODEL_CARD.md", card)
-    store.write_json(
-        folder / MODEL_FILE, {"schema": 1, "config": config_to_dict(model.config), "files": files, "facts": dict(facts)}
-    )
-
-
-def folder_of(path: Path | str) -> Path:
-    """The folder that a name of `EMBEDDED` stands for; any other text is a folder itself."""
-    return EMBEDDED.get(str(path), Path(path))
-
-
-def load(path: Path | str = "embedded") -> MDM:
-    """Read a model folder written by `save`; the names of `EMBEDDED` stand for those shipped with the package.
-
-    Raises:
-        InputError: no model there, other fields or other weights than the configuration implies.
-        IntegrityError: a weight file does not match its recorded hash.
-    """
-    folder = folder_of(path)
-    where = folder / MODEL_FILE
-    if not where.is_file():
-        raise InputError("no diffusion model here", where=str(folder), expected=f"a file {MODEL_FILE}")
-    content = store.parse_json(json.dumps(store.read_json(where)), str(where))
-    if not isinstance(content, dict) or content.get("schema") != 1 or not isinstance(content.get("files"), dict):
-        raise InputError("not a model description of this version", where=str(where))
-    model = MDM(config_from_dict(content.get("config", {}), str(where)))
-    state: dict[str, Tensor] = {}
-    for name, digest in content["files"].items():
-        file = folder / Path(name).name
-        if not file.is_file() or store.sha256_file(file) != digest:
-            raise IntegrityError(
-                "a weight file is missing or altered", where=str(file), expected=f"sha256 {digest[:16]}..."
-            )
-        state |= {k: torch.from_numpy(v.copy()) for k, v in store.read_safetensors(file).items()}
-    wanted = model.state_dict()
-    wrong = sorted(set(wanted) ^ set(state)) or [k for k in wanted if wanted[k].shape != state[k].shape]
-    if wrong:
-        raise InputError("weights do not fit the configuration", where=str(folder), got=", ".join(wrong[:6]))
-    model.load_state_dict({k: v.to(wanted[k].dtype) for k, v in state.items()})
-    return model.eval()
+        with torch.autocast("cpu", torch.bfloat16, enabled=request.bf16):  # around all steps: the weights are converted once
+            x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
+        color = lambda z: z[:, :, : sizes[0]]  # noqa: E731
+        return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
 
 
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in what `grown` can add, and in the size they were trained at."""
-    plain: dict[str, Any] = {"given_classes": False, "refine_widths": (), "refine_blocks": (), "area_px": 0}
-    return dataclasses.replace(one, **plain) == dataclasses.replace(other, **plain)
+    """Whether two networks differ at most in their refiners, and in the size they were trained at."""
+    without = lambda config: replace(config, refine_widths=(), refine_blocks=(), area_px=0)  # noqa: E731
+    return without(one) == without(other)
 
 
-def grown(before: MDM, config: MDMConfig) -> MDM:
-    """A model of `config` with the weights of `before`, whose inputs and outputs are the first of its own.
-
-    Weights of further inputs and outputs are 0, so that the denoiser starts as the same function; a refiner is taken over
-    if `before` has one of the same shape. For continuing the training of an earlier, plainer model.
+def extended(before: MDM, config: MDMConfig) -> MDM:
+    """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape. For
+    continuing the training of an earlier, plainer model.
 
     Raises:
-        UsageError: the two differ in more than `given_classes`, the refiner and the size trained at.
+        UsageError: the two differ in more than the refiner and the size trained at.
     """
     if not same_denoiser(before.config, config):
         raise UsageError(
@@ -735,33 +430,6 @@ def grown(before: MDM, config: MDMConfig) -> MDM:
         )  # fmt: skip
     model = MDM(config)
     state = model.state_dict()
-    for name, old in before.state_dict().items():
-        if name not in state or (name.startswith("refiner.") and state[name].shape != old.shape):
-            continue
-        new = torch.zeros_like(state[name]) if name.startswith("net.") else state[name]
-        new[tuple(slice(0, size) for size in old.shape)] = old
-        state[name] = new
-    model.load_state_dict(state)
+    kept = {name: old for name, old in before.state_dict().items() if name in state and state[name].shape == old.shape}
+    model.load_state_dict({**state, **kept})
     return model
-
-
-def facts(path: Path | str) -> dict[str, Any]:
-    """The facts (recipe, scores) that `save` was given for a model folder or "embedded"."""
-    content = store.read_json(folder_of(path) / MODEL_FILE)
-    return dict(content.get("facts", {}))
-
-
-def digest(path: Path | str) -> str:
-    """Digest of a model's description, which holds the hashes of its weights."""
-    return store.digest(folder_of(path) / MODEL_FILE)
-
-
-def truth_shares(semantics: Tensor) -> Tensor:
-    """Class shares [B,T,19,h,w] of ids i64[B,T,H,W], as `MDM.loss` wants them."""
-    return semantic_shares(semantics)
-
-
-__all__ = [
-    "CLASSES", "EMBEDDED", "LABELS", "MDM", "MODALITIES", "Encoded", "Losses", "MDMConfig", "Sample", "UNet", "config_from_dict",
-    "config_to_dict", "load", "save", "truth_shares",
-]  # fmt: skip

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from mudg.base import palette
 from mudg.base.errors import UsageError
-from mudg.models.mdm.codec import CodecConfig, Decoded, Modality, code_to_depth, depth_to_code
+from mudg.models.mdm.codec import Decoded, Modality
 
 GROUPS = 32
 LATENT_SCALE = 0.18215
@@ -74,7 +74,7 @@ class CellAttention(nn.Module):
         return x + self.out(mixed.transpose(1, 2).unflatten(2, x.shape[2:]))
 
 
-class Middle(nn.Module):
+class CoderMiddle(nn.Module):
     """block - attention - block."""
 
     def __init__(self, width: int) -> None:
@@ -109,7 +109,7 @@ class Encoder(nn.Module):
             shrink = nn.Conv2d(outside, outside, 3, stride=2) if level < top else None
             self.down.append(Level(inside, outside, config.blocks, shrink))
             inside = outside
-        self.middle = Middle(inside)
+        self.middle = CoderMiddle(inside)
         self.norm = nn.GroupNorm(GROUPS, inside, eps=1e-6)
         self.leave = nn.Conv2d(inside, 2 * config.latent_channels, 3, padding=1)
 
@@ -130,7 +130,7 @@ class Decoder(nn.Module):
         super().__init__()
         inside = config.multipliers[-1] * config.width
         self.enter = nn.Conv2d(config.latent_channels, inside, 3, padding=1)
-        self.middle = Middle(inside)
+        self.middle = CoderMiddle(inside)
         levels = []
         for level in reversed(range(len(config.multipliers))):
             outside = config.multipliers[level] * config.width
@@ -156,9 +156,7 @@ class Autoencoder(nn.Module):
 
     def __init__(self, config: AutoencoderConfig) -> None:
         super().__init__()
-        self.sizes = config
-        # far_m and the codes in the words that `models/mdm/codec.py` uses; its fields about patches do not apply here
-        self.config = CodecConfig(kind="kl", depth_code="linear", far_m=config.far_m, semantics_code="palette")
+        self.config = config
         self.factor = 2 ** (len(config.multipliers) - 1)
         self.channels: dict[Modality, int] = dict.fromkeys(("rgb", "depth", "semantics"), config.latent_channels)
         self.encoder, self.decoder = Encoder(config), Decoder(config)
@@ -206,7 +204,8 @@ class Autoencoder(nn.Module):
 
     def depth_image(self, depth_m: Tensor) -> Tensor:
         """Depth [..,1,H,W] metres -> image [..,3,H,W]: 0..100 m to [-1,1], three times."""
-        return depth_to_code(depth_m, self.config).expand(*depth_m.shape[:-3], 3, *depth_m.shape[-2:])
+        code = depth_m.clamp(0.0, self.config.far_m) * (2.0 / self.config.far_m) - 1.0
+        return code.expand(*depth_m.shape[:-3], 3, *depth_m.shape[-2:])
 
     def semantic_image(self, ids: Tensor) -> Tensor:
         """Train ids i64[..,H,W] -> palette colours [..,3,H,W] in [-1,1]; unlabelled pixels are black."""
@@ -227,18 +226,18 @@ class Autoencoder(nn.Module):
         return self.encode(self.semantic_image(ids), generator)
 
     def decode(self, latents: dict[Modality, Tensor], frames_at_once: int = 1) -> Decoded:
-        """Scaled latents [..,4,h,w] of some modalities -> pixels. See `Decoded`.
+        """Pixels of scaled latents [..,4,h,w] of all modalities.
 
         Depth is the mean of the three channels; a class is the nearest palette colour, its margin the distance to the second
         nearest minus that to the nearest, divided by the distance between those two colours.
         """
         images = {m: self.decode_image(z, frames_at_once).clamp(-1.0, 1.0) for m, z in latents.items()}
-        rgb = (images["rgb"] + 1) / 2 if "rgb" in images else None
-        depth = code_to_depth(images["depth"].mean(-3, keepdim=True), self.config) if "depth" in images else None
-        if "semantics" not in images:
-            return Decoded(rgb, depth, None, None)
-        ids, margin = nearest_class(images["semantics"])
-        return Decoded(rgb, depth, ids, margin)
+        depth = (images["depth"].mean(-3, keepdim=True).clamp(-1.0, 1.0) + 1.0) * 0.5 * self.config.far_m
+        return Decoded((images["rgb"] + 1) / 2, depth, *nearest_class(images["semantics"]))
+
+    def decode_rgb(self, z: Tensor, frames_at_once: int = 1) -> Tensor:
+        """Colour f32[..,3,H,W] in [0,1] of its scaled latents."""
+        return (self.decode_image(z, frames_at_once).clamp(-1.0, 1.0) + 1) / 2
 
 
 def nearest_class(image: Tensor) -> tuple[Tensor, Tensor]:

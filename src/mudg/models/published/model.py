@@ -11,27 +11,44 @@ the defaults follow the released weights; docs/published.md lists the difference
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import seeds
+from mudg.base import palette, seeds
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Condition
+from mudg.base.types import Clip, Condition
 from mudg.core import noise
 from mudg.core.align import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
+from mudg.models.diffusion import (
+    GeneratedClip,
+    SampleRequest,
+    check_image_size,
+    confidence_of,
+    denoised,
+    depth_agreement,
+    mean_change,
+    sized_to_width,
+)  # fmt: skip
 from mudg.models.mdm.codec import MODALITIES, Modality
-from mudg.models.mdm.model import LABELS, Losses, Sample, check_request, confidence_of, depth_agreement
+from mudg.models.mdm.model import BatchPart, Losses, LossSettings
 from mudg.models.published.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, ImageTower, TowerConfig
 from mudg.models.published.kl_vae import Autoencoder, AutoencoderConfig
 from mudg.models.published.resampler import Resampler, ResamplerConfig
 from mudg.models.published.video_unet import SeededDropout, VideoUNet, VideoUNetConfig, temporal_layers
+
+LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
+"""Modality labels of the published checkpoints; fed through a sinusoid like a time step."""
+
+GUIDANCE = 7.5
+"""Weight of the guided over the unguided velocity, where a request has none; 1 switches guidance off and halves the work."""
+GUIDANCE_RESCALE = 0.7
+"""Share of the guided velocity whose spread is pulled back to that of the conditional one."""
 
 SCALE_ENTRIES = 1400
 """Length of the published table of the dynamic rescale; one entry per noise step is used, the rest repeats the last."""
@@ -54,7 +71,7 @@ class PublishedConfig:
     width: int = 1024
     height: int = 576
     fps: int = 10
-    """Frame rate that the model is told; the published one was never told another."""
+    """Frame rate given to the network; the published one never saw another."""
     missing_is_zero: bool = True
     """Give the network black and 0 m where nothing was seen, as in the published training, whatever the condition holds there."""
 
@@ -89,43 +106,8 @@ class PublishedConfig:
         return 2 ** (len(self.codec.multipliers) + len(self.net.multipliers) - 2)
 
 
-def config_to_dict(config: PublishedConfig) -> dict[str, Any]:
-    """Plain JSON values of a configuration."""
-    return dataclasses.asdict(config)
-
-
-def config_from_dict(values: Any, where: str = "model configuration") -> PublishedConfig:
-    """Inverse of `config_to_dict`; unknown, missing or ill-typed fields are an InputError that names them."""
-    return _rebuild(PublishedConfig(), values, where)
-
-
-def _rebuild(default: Any, values: Any, where: str) -> Any:
-    known = {f.name for f in dataclasses.fields(default)}
-    given = set(values) if isinstance(values, Mapping) else set()
-    if given != known:
-        raise InputError(
-            "a model configuration has other fields than this version knows", where=where, expected=", ".join(sorted(known)),
-            got="missing " + ", ".join(sorted(known - given)) + "; unknown " + ", ".join(sorted(given - known)),
-        )  # fmt: skip
-    built: dict[str, Any] = {}
-    for name in sorted(known):
-        before, value = getattr(default, name), values[name]
-        if dataclasses.is_dataclass(before):
-            built[name] = _rebuild(before, value, f"{where}: {name}")
-            continue
-        value = tuple(value) if isinstance(value, list) else value
-        number = isinstance(before, float) and isinstance(value, int) and not isinstance(value, bool)
-        if not number and type(value) is not type(before) and not (name == "base_scale" and value is None):
-            raise InputError(
-                "a model configuration has a value of a wrong type", where=f"{where}: {name}", expected=type(before).__name__,
-                got=repr(value)[:80],
-            )  # fmt: skip
-        built[name] = value
-    return type(default)(**built)
-
-
 @dataclass(frozen=True)
-class Encoded:
+class PublishedLatents:
     """A batch of conditions as the network wants them.
 
     planes f32[B,T,8,h,w]: latents of the colour and the depth condition; features [B,257,D] image tower's output for the reference and
@@ -139,13 +121,9 @@ class Encoded:
 
 
 @dataclass(frozen=True)
-class Sampling:
-    """How samples are drawn, and how the work is cut into pieces; the pieces do not change what is computed."""
+class WorkSplit:
+    """How the work of sampling is cut into pieces, which does not change what is computed."""
 
-    guidance: float = 7.5
-    """Weight of the guided over the unguided velocity; 1 switches guidance off and halves the work."""
-    rescale: float = 0.7
-    """Share of the guided velocity whose spread is pulled back to that of the conditional one."""
     modalities_together: bool = True
     guidance_together: bool = True
     frames_at_once: int = 16
@@ -177,15 +155,20 @@ MODALITY_SHARES: dict[Modality, float] = {"rgb": 0.5, "semantics": 0.25, "depth"
 
 
 class PublishedMDM(nn.Module):
-    """The model (see the module text). The caption's embedding is a buffer: the text tower is not part of it."""
+    """The model (see the module text). The caption's embedding is a buffer: the text tower is not part of it.
 
+    `split` says how its work is cut into pieces.
+    """
+
+    points_alone = True
+    """The condition is points, 0 where nothing was seen, and one recorded image, which stands in frame 0."""
     text: Tensor
     scale: Tensor
 
     def __init__(self, config: PublishedConfig) -> None:
         super().__init__()
         self.config = config
-        self.sampling = Sampling()
+        self.split = WorkSplit()
         self.codec = Autoencoder(config.codec)
         self.net = VideoUNet(config.net)
         self.image = ImageTower(config.image, config.image_patch, config.image_side)
@@ -213,13 +196,12 @@ class PublishedMDM(nn.Module):
 
     def check_size(self, height: int, width: int) -> None:
         """UsageError unless an image of this size fits the network's strides."""
-        multiple = self.config.pixel_multiple
-        if height % multiple or width % multiple or height < multiple or width < multiple:
-            raise UsageError(
-                "image size does not fit the diffusion model",
-                expected=f"multiples of {multiple} pixels",
-                got=f"{width}x{height}",
-            )
+        check_image_size(height, width, self.config.pixel_multiple)
+
+    def check_clip(self, frames: int, height: int, width: int) -> None:
+        """UsageError unless the model can make clips of this many frames and this image size."""
+        self.check_frames(frames)
+        self.check_size(height, width)
 
     def check_frames(self, frames: int) -> None:
         """UsageError unless a clip has exactly the number of frames that the image tokens are made for."""
@@ -235,26 +217,18 @@ class PublishedMDM(nn.Module):
         condition: Condition | Sequence[Condition],
         generator: torch.Generator | None = None,
         known: Tensor | None = None,
-    ) -> Encoded:
-        """Latents of the conditions of clips of one shape, and image features of their references (see `Encoded`).
+    ) -> PublishedLatents:
+        """Latents of the conditions of clips of one shape, and image features of their references (see `PublishedLatents`).
 
         generator   noise of the autoencoder's posterior; needed unless the configuration asks for its mean
         known       colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
                     colour there (of every clip), frame 0 excepted
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
-        stack = lambda name: torch.stack([getattr(c, name) for c in batch])  # noqa: E731
-        return self.encode_planes(
-            stack("color"), stack("depth"), stack("valid"), stack("reference"), generator, known
-        )  # fmt: skip
-
-    def encode_planes(
-        self, color: Tensor, depth: Tensor, valid: Tensor, reference: Tensor, generator: torch.Generator | None = None,
-        known: Tensor | None = None,
-    ) -> Encoded:  # fmt: skip
-        """As `encode_condition`, from stacked tensors: color f32[B,T,3,H,W] in [0,1], depth f32[B,T,1,H,W] metres,
-        valid bool[B,T,1,H,W], reference f32[B,3,H,W] in [0,1]."""
-        color, depth, valid, reference = (x.to(self.device) for x in (color, depth, valid.float(), reference))
+        color, depth, valid, reference = (
+            torch.stack([getattr(c, name) for c in batch]).to(self.device) for name in ("color", "depth", "valid", "reference")
+        )
+        valid = valid.float()
         self.check_size(*color.shape[-2:])
         self.check_frames(color.shape[1])
         if self.config.missing_is_zero:
@@ -272,8 +246,7 @@ class PublishedMDM(nn.Module):
         images = torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])])
         with torch.no_grad():
             features = self.image(images)
-        seen = functional.avg_pool2d(seen.flatten(0, 1), self.codec.factor).unflatten(0, seen.shape[:2])
-        return Encoded(planes, features[:-1], features[-1:], seen)
+        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
 
     def encode_truth(
         self, rgb: Tensor, depth: Tensor, semantics: Tensor, generator: torch.Generator | None = None
@@ -287,7 +260,7 @@ class PublishedMDM(nn.Module):
 
     def _encode(self, image: Tensor, generator: torch.Generator | None) -> Tensor:
         with torch.no_grad():
-            return self.codec.encode(image.to(self.device), generator, self.sampling.frames_at_once)
+            return self.codec.encode(image.to(self.device), generator, self.split.frames_at_once)
 
     def _posterior(self, generator: torch.Generator | None) -> torch.Generator | None:
         if self.config.codec.posterior == "mean":
@@ -316,10 +289,47 @@ class PublishedMDM(nn.Module):
 
     # training ---------------------------------------------------------------------------------------------------------
 
-    def loss(
+    def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
+        """`velocity_loss` of clips of one size; all that is drawn comes from `part`, the autoencoder's posterior clip by clip.
+
+        Raises:
+            InputError: the clips' condition is not the published one.
+        """
+        encoded, truths = [], []
+        with torch.no_grad():
+            for number, clip in enumerate(clips, part.first):
+                if clip.condition.warped is not None and bool(clip.condition.warped.any()):
+                    raise InputError(
+                        "the training clips show warped images in their condition", where=f"step {part.step}",
+                        expected="points alone, as the published-type model is given",
+                        remedy="give another folder of clips; they are made anew",
+                    )  # fmt: skip
+                draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
+                encoded.append(self.encode_condition(clip.condition, draws))
+                truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
+            truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
+            classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)
+            known: dict[Modality, Tensor] = {
+                "depth": self._share_of_cells(torch.stack([clip.depth_valid for clip in clips])),
+                "semantics": self._share_of_cells(classes),
+            }
+        planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
+        return self.velocity_loss(
+            truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
+            dropout=ContextDropout.of(settings.reference_dropout), known=known, first=part.first, whole=part.count,
+        )  # fmt: skip
+
+    forward = loss
+    """What `DistributedDataParallel` calls, to exchange gradients behind it."""
+
+    def _share_of_cells(self, mask: Tensor) -> Tensor:
+        """Share f32[B,T,1,h,w] of each latent cell in which bool[B,T,1,H,W] is set."""
+        return functional.avg_pool2d(mask.float().flatten(0, 1), self.codec.factor).unflatten(0, mask.shape[:2])
+
+    def velocity_loss(
         self,
         truth: Mapping[Modality, Tensor],
-        encoded: Encoded,
+        encoded: PublishedLatents,
         generator: torch.Generator,
         *,
         dropout: ContextDropout = PAPER_DROPOUT,
@@ -382,130 +392,83 @@ class PublishedMDM(nn.Module):
 
     # sampling ---------------------------------------------------------------------------------------------------------
 
-    @torch.no_grad()
-    def sample(
-        self,
-        condition: Condition,
-        *,
-        steps: int = 50,
-        seed: int = 0,
-        index: int = 0,
-        sampler: str = "ddim",
-        eta: float = 1.0,
-        modalities: Sequence[Modality] = MODALITIES,
-        n_samples: int = 1,
-        known: Mapping[Modality, Tensor] | None = None,
-        start: Mapping[Modality, Tensor] | None = None,
-        strength: float = 1.0,
-        align: bool = True,
-        bf16: bool = False,
-    ) -> Sample:
-        """Generate one clip of exactly `config.window` frames; guidance and the cutting of the work are in `self.sampling`.
+    @staticmethod
+    def check_request(request: SampleRequest) -> None:
+        """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
+        request.sampler_settings()
+        if "last" not in noise.SAMPLER_SETTINGS[request.sampler]:
+            raise UsageError(
+                "the sampler does not suit a published-type model, which has a dynamic rescale and ends at the first noise level",
+                where="sampler", expected="ddim", got=request.sampler,
+            )  # fmt: skip
 
-        condition   H and W multiples of `config.pixel_multiple`
-        steps       denoiser passes per modality (two networks' worth each with guidance), from the noisiest step down
-        known       latents [k,4,h,w] of the first k frames from the previous window. Their colour, decoded, takes the place of the
-                    sparse colour of these frames: the published way to continue a video. Depth and semantics are not continued.
-        bf16        run the networks in bfloat16 where their weights are wider
-        align       bring each frame's depth to the measured scale (`core.align`); otherwise depth is what the model says
-        Other arguments as in `MDM.sample`.
+    def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
+        """Width and height the model works at: its own whatever the camera's are, or about `width_px` wide in the same aspect."""
+        del width, height
+        own = self.config
+        return sized_to_width(width_px, own.width / own.height, own.pixel_multiple) if width_px else (own.width, own.height)
+
+    @torch.no_grad()
+    def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
+        """Generate one clip of exactly `config.window` frames (see `SampleRequest`).
+
+        Steps run from the noisiest one down. Of frames whose latents are known, the decoded colour takes the place of the sparse
+        colour: the published way to continue a video. Depth and semantics are not continued. Without `align`, depth is
+        what the model says.
         """
-        check_request(sampler, modalities)
+        self.check_request(request)
         self.check_frames(len(condition.views))
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16 and self.dtype == torch.float32):
-            before = known.get("rgb") if known else None
-            if before is not None:
-                before = self.codec.decode({"rgb": before.to(self.device)}, self.sampling.frames_at_once).rgb
-            encoded = self.encode_condition(condition, seeds.torch_generator(seed, index, "posterior"), before)
+        frames_at_once = self.split.frames_at_once
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=request.bf16 and self.dtype == torch.float32):
+            before = None if request.known is None else request.known["rgb"].to(self.device)
+            before = None if before is None else self.codec.decode_rgb(before, frames_at_once)
+            encoded = self.encode_condition(condition, seeds.torch_generator(request.seed, request.index, "posterior"), before)
             tokens = self.image_tokens(torch.cat([encoded.features, encoded.grey]).to(self.image_tokens.queries.dtype))
-            together: tuple[Modality, ...] = tuple(modalities)
-            groups = (
-                [together] if self.sampling.modalities_together else [together[n : n + 1] for n in range(len(together))]
-            )
+            groups = [MODALITIES] if self.split.modalities_together else [(m,) for m in MODALITIES]
             drawn: list[dict[Modality, Tensor]] = []
-            change: Tensor | None = None
-            for number in range(n_samples):
+            changes: list[Tensor] = []
+            for number in range(request.n_samples):
                 latents: dict[Modality, Tensor] = {}
                 for names in groups:
-                    part, moved = self._denoise(encoded, names, tokens, steps, seed, index * 64 + number, sampler, eta, start,
-                                                strength)  # fmt: skip
+                    part, moved = self._denoise(encoded, names, tokens, request, number)
                     latents |= part
-                    change = moved if change is None else change
+                    changes.append(moved)
                 drawn.append(latents)
-            latents = drawn[0]
-            if n_samples > 1:
-                first = next(iter(latents))
-                change = torch.stack([d[first] for d in drawn]).std(0).mean(1, keepdim=True) * 2
-            decoded = self.codec.decode(latents, self.sampling.frames_at_once)
-        if change is None:
-            raise UsageError("no sampling step was made", where="PublishedMDM.sample")
+            latents, change = drawn[0], changes[0]
+            if request.n_samples > 1:
+                change = torch.stack([d["rgb"] for d in drawn]).std(0).mean(1, keepdim=True) * 2
+            decoded = self.codec.decode(latents, frames_at_once)
         confidence = confidence_of(encoded.seen[0].cpu(), change.cpu(), self.codec.factor)
-        rgb, depth, ids = (None if y is None else y.cpu() for y in (decoded.rgb, decoded.depth, decoded.semantics))
+        rgb, depth, ids = (y.cpu() for y in (decoded.rgb, decoded.depth, decoded.semantics))
         fits: list[DepthFit] = []
-        if depth is not None and align:
+        if request.align:
             depth, fits = align_depth(depth, condition.depth, condition.valid)
             confidence = confidence * depth_agreement(depth, condition)
-        return Sample(rgb, depth, ids, confidence, {m: z.cpu() for m, z in latents.items()}, tuple(fits))
-
-    def condition_latents(self, condition: Condition) -> dict[Modality, Tensor]:
-        """The condition's colour and depth as latents [T,4,h,w] of all modalities, to `start` from; its colour stands in for
-        classes, which it does not have."""
-        rgb, depth = self.codec.encode_rgb(condition.color.to(self.device)), self.codec.encode_depth(condition.depth.to(self.device))
-        return {"rgb": rgb, "depth": depth, "semantics": rgb}
+        return GeneratedClip(rgb, depth, ids, confidence, {m: z.cpu() for m, z in latents.items()}, tuple(fits))
 
     def _denoise(
-        self,
-        encoded: Encoded,
-        names: tuple[Modality, ...],
-        tokens: Tensor,
-        steps: int,
-        seed: int,
-        index: int,
-        sampler: str,
-        eta: float,
-        start: Mapping[Modality, Tensor] | None,
-        strength: float,
+        self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest, number: int
     ) -> tuple[dict[Modality, Tensor], Tensor]:
-        """Sample some modalities in one batch; returns their latents [T,4,h,w] and how much the first still changed [T,1,h,w].
+        """Draw sample `number` of some modalities in one batch; returns their latents [T,4,h,w] and how much the first's still
+        changed [T,1,h,w].
 
         `tokens` [2,T,16,D]: with the reference and without. Every modality has its own stream of noise.
         """
         _, frames, _, h, w = encoded.planes.shape
         shape = (1, frames, self.config.codec.latent_channels, h, w)
-        streams = [seeds.torch_generator(seed, index, f"sample {m}") for m in names]
+        streams = [seeds.torch_generator(request.seed, request.index * 64 + number, f"sample {m}") for m in names]
         draw = lambda: torch.cat([noise.video_noise(shape, g) for g in streams]).to(self.device)  # noqa: E731
-        velocity = self._guided(encoded, names, tokens)
-        estimates: list[Tensor] = []
-        indices = noise.trailing_steps(len(self.schedule), steps)
-        begin = draw()
-        if start is not None:
-            indices = noise.partial_steps(indices, len(self.schedule), strength)
-            given = torch.stack([start[m].to(self.device) for m in names])
-            begin = self.schedule.add_noise(given, begin, torch.full((len(names),), indices[0], device=self.device))
-        elif strength != 1.0:
-            raise UsageError("strength needs something to start from", got=str(strength), remedy="strength = 1")
+        velocity = self._guided(encoded, names, tokens, request)
+        x, estimates = denoised(velocity, draw, self.schedule, request, "v", last="first_alpha")
+        return {m: x[n] for n, m in enumerate(names)}, mean_change([e[0] for e in estimates], x[0])
 
-        def watch(number: int, x0: Tensor) -> None:
-            if 2 * number >= len(indices) - 1:
-                estimates.append(x0[0])
-
-        x = noise.SAMPLERS[sampler](
-            velocity,
-            begin,
-            self.schedule,
-            indices,
-            prediction="v",
-            eta=eta,
-            draw=draw,
-            last="first_alpha",
-            on_step=watch,
-        )
-        moved = torch.stack([(e - x[0]).abs().mean(1, keepdim=True) for e in estimates]).mean(0)
-        return {m: x[n] for n, m in enumerate(names)}, moved
-
-    def _guided(self, encoded: Encoded, names: tuple[Modality, ...], tokens: Tensor) -> Callable[[Tensor, int], Tensor]:
+    def _guided(
+        self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest
+    ) -> noise.Denoise:
         """The denoiser for `names` in one batch: velocity with classifier-free guidance."""
-        rules, count = self.sampling, len(names)
+        guidance = GUIDANCE if request.guidance is None else request.guidance
+        rescale = GUIDANCE_RESCALE if request.guidance_rescale is None else request.guidance_rescale
+        count = len(names)
 
         def passed(x: Tensor, t: int, kinds: Sequence[int]) -> Tensor:
             """Velocities [K*N,...] with (0) and without (1) caption and reference."""
@@ -517,13 +480,13 @@ class PublishedMDM(nn.Module):
             )  # fmt: skip
 
         def velocity(x: Tensor, t: int) -> Tensor:
-            if rules.guidance == 1:
+            if guidance == 1:
                 return passed(x, t, [0])
-            if rules.guidance_together:
+            if self.split.guidance_together:
                 with_context, without = passed(x, t, [0, 1]).chunk(2)
             else:
                 with_context, without = passed(x, t, [0]), passed(x, t, [1])
-            return noise.guide(with_context, without, rules.guidance, rules.rescale)
+            return noise.guide(with_context, without, guidance, rescale)
 
         return velocity
 

@@ -21,7 +21,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from mudg.base.errors import UsageError
-from mudg.models.mdm.unet import sinusoid
+from mudg.models.mdm.network import sinusoid
 
 GROUPS = 32
 MAX_ATTENTION_BATCH = 32768

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from mudg.base.errors import InputError, NumericsError
 from mudg.base.types import View
+from mudg.core import losses
 from mudg.core.table import AdamKernel, Table
 
 Exposure = Literal["none", "camera", "image"]
@@ -85,7 +86,7 @@ class Appearance:
     def penalty(self, name: str, kind: str) -> Tensor | None:
         """Mean distance of the view's colour map from the identity (scalar), or None where it has none."""
         found = self._affine(name, kind)
-        return None if found is None else found.abs().mean()
+        return None if found is None else losses.identity_distance(found)
 
     def world_from_cam(self, view: View, name: str) -> Tensor | None:
         """Corrected pose f32[4, 4] of a recorded view, differentiable; None where poses are not corrected."""

@@ -21,8 +21,10 @@ from torch import Tensor
 
 from mudg.base import seeds
 from mudg.base.types import RasterTrace
+from mudg.core.quaternions import rotate
 from mudg.core.table import Table
-from mudg.models.scene.nodes import RigidNode, SceneModel
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
 
 SPLIT_SHRINK = 1.6
 """Both halves of a split Gaussian are this much smaller (published value)."""
@@ -124,10 +126,8 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
     clone_rows = (grow & (largest <= settings.split_above_m)).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool)
     keep[split_rows] = False
-    halves = [(split_rows, *half) for half in _halves(model, split_rows, step, run_seed)]
-    for parents, columns, labels in ((clone_rows, *_rows(model, clone_rows)), *halves):
-        if len(parents):
-            model.table.append(columns, labels, like=parents)
+    for columns, labels in (_rows(model, clone_rows), *_halves(model, split_rows, step, run_seed)):
+        model.table.append(columns, labels)
     keep = torch.cat([keep, torch.ones(len(model.table) - len(keep), dtype=torch.bool)])
     doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
     pruned = int((doomed & keep).sum())
@@ -202,11 +202,3 @@ def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, 
         if isinstance(node, RigidNode):
             half_size[index] = torch.tensor(node.size_m) / 2 * box_margin + 0.1
     return doomed | (means.abs() > half_size[table.labels["node"].long()]).any(1)
-
-
-def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate ``[n, 3]`` vectors by ``[n, 4]`` quaternions (w, x, y, z), normalised here."""
-    unit = torch.nn.functional.normalize(quats, dim=1)
-    w, axis = unit[:, :1], unit[:, 1:]
-    cross = torch.linalg.cross(axis, vectors)
-    return vectors + 2 * (w * cross + torch.linalg.cross(axis, cross))

@@ -24,8 +24,9 @@ import torch
 from torch import Tensor
 
 from mudg.base import seeds
-from mudg.models.scene.densify import rotate, useless_rows
-from mudg.models.scene.nodes import SceneModel
+from mudg.core.quaternions import rotate
+from mudg.models.scene.densify import useless_rows
+from mudg.models.scene.model import SceneModel
 
 LARGEST_STACK = 51
 """Most Gaussians that one may become in a round (published value)."""
@@ -146,10 +147,9 @@ def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_
     repeated = sources.repeat_interleave(copies[sources])
     columns = {name: value.detach()[repeated] for name, value in table.columns.items()}
     labels = {name: value[repeated] for name, value in table.labels.items()}
-    place_left = torch.cumsum(~dead, 0) - 1
     table.take(~dead)
     if len(repeated):
-        table.append(columns, labels, like=place_left[repeated])
+        table.append(columns, labels)
     model.sort_rows()
     gone, came = int(dead.sum()), len(repeated)
     return {
@@ -193,8 +193,6 @@ def _correct(model: SceneModel, sources: Tensor, members: Tensor, opacity: Tenso
     log_scales[sources] = (log_scales[sources].double() + torch.log(factor)[:, None]).float()
     for name in table.columns:
         table.reset_moments(name, sources)
-    for name in table.partial:
-        table.reset_moments(name, table.partial_index(sources))
 
 
 def drift(model: SceneModel, step: int, rate: float, settings: McmcSettings, run_seed: int) -> None:

@@ -1,4 +1,4 @@
-"""How tracked things move: noise of a track, its smoothest likely version, and periodic functions of time.
+"""How tracked objects move: the noise of a track, and its smoothest likely version.
 
 A detector puts a box a little wrong at every key, each time anew; a car cannot follow such a path. Two sizes decide: that of the
 noise, which the track itself betrays, and that of usual accelerations. The likeliest
@@ -7,13 +7,10 @@ path between the two minimises a sum of squares (the Whittaker smoother, on seco
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 ACCELERATION_M_S2: Final = 2.0
 """Usual acceleration of road users (standard deviation); hard braking is three to four times as much."""
@@ -73,17 +70,3 @@ def smoothed(
         found = np.linalg.solve(np.eye(len(times_s)) + (difference.T * weights) @ difference, values)
         weights = motion_weights(difference @ found / noise)
     return found
-
-
-def periodic_weights(time_s: float, first_s: float, last_s: float, terms: int) -> Tensor:
-    """Values f32[terms] of sin and cos of 2 pi u, 4 pi u, ..., with u running from 0 to 1 over a track's span.
-
-    Street Gaussians (Yan et al. 2024) gives every Gaussian of an object such coefficients beside its constant colour; with four,
-    theirs. Zeros for a track of one key.
-    """
-    span = last_s - first_s
-    if span <= 0:
-        return torch.zeros(terms)
-    phase = 2 * math.pi * (time_s - first_s) / span
-    values = [f(phase * (1 + pair)) for pair in range((terms + 1) // 2) for f in (math.sin, math.cos)]
-    return torch.tensor(values[:terms])

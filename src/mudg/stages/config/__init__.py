@@ -1,24 +1,47 @@
 """The frozen configuration of every verb, one file per verb or group; none imports torch, so that ``--help`` answers at once.
 
-Defaults are a full run on a small machine. Every field is one flag; units are in the names.
+Defaults are a full run on a small machine. Every field is one flag; units are in the names. Names are looked up on first use, so that a
+command reads the settings of its own verb only.
 """
 
 from __future__ import annotations
 
-from mudg.stages.config.bench import BenchConfig
-from mudg.stages.config.convert import ConvertConfig
-from mudg.stages.config.fit import FitConfig
-from mudg.stages.config.learn import LearnConfig
-from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
-from mudg.stages.config.run import DEMO_CITY, RunConfig, run_preset, with_lines, with_seed
-from mudg.stages.config.synthesize import SynthesizeConfig
-from mudg.stages.config.views import RenderConfig, ScoreConfig
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mudg.stages.config.bench import BenchConfig
+    from mudg.stages.config.convert import ConvertConfig
+    from mudg.stages.config.fit import FitConfig
+    from mudg.stages.config.learn import LearnConfig
+    from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
+    from mudg.stages.config.run import DEMO_CITY, RunConfig, run_preset, with_lines, with_seed
+    from mudg.stages.config.synthesize import SynthesizeConfig
+    from mudg.stages.config.views import RenderConfig, ScoreConfig
+
+_HOMES = {
+    "BenchConfig": "mudg.stages.config.bench",
+    "ConvertConfig": "mudg.stages.config.convert",
+    "FitConfig": "mudg.stages.config.fit",
+    "LearnConfig": "mudg.stages.config.learn",
+    "AnnotateConfig": "mudg.stages.config.prepare",
+    "FuseConfig": "mudg.stages.config.prepare",
+    "IngestConfig": "mudg.stages.config.prepare",
+    "DEMO_CITY": "mudg.stages.config.run",
+    "RunConfig": "mudg.stages.config.run",
+    "run_preset": "mudg.stages.config.run",
+    "with_lines": "mudg.stages.config.run",
+    "with_seed": "mudg.stages.config.run",
+    "SynthesizeConfig": "mudg.stages.config.synthesize",
+    "RenderConfig": "mudg.stages.config.views",
+    "ScoreConfig": "mudg.stages.config.views",
+}
 
 __all__ = [
+    "DEMO_CITY",
     "AnnotateConfig",
     "BenchConfig",
     "ConvertConfig",
-    "DEMO_CITY",
     "FitConfig",
     "FuseConfig",
     "IngestConfig",
@@ -31,3 +54,11 @@ __all__ = [
     "with_lines",
     "with_seed",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value

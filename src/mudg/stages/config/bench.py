@@ -22,20 +22,16 @@ class BenchConfig:
     """How many cities of the list; four clips each (2, 3, 4 m and the recorded path)."""
     steps: tuple[int, ...] = (1, 2, 8)
     """Denoising steps to compare."""
-    sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
+    sampler: Literal["ddim", "dpm_solver"] = "ddim"
     """How the denoising steps are taken."""
-    eta: float = Field(default=1.0, ge=0, le=1)
-    """Noise that ddim adds between steps: 0 = deterministic, 1 = ancestral."""
+    eta: float | None = Field(default=None, ge=0, le=1)
+    """ddim: noise added between steps, 0 = deterministic, 1 = as much as the reverse process has (not given: 1)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
-    """mdm, mdm-ablation, poses: threads of torch."""
+    """mdm, poses: threads of torch."""
     seed: int = 0
     """Fixes every random draw."""
-    ablation_steps: int = Field(default=1500, ge=1)
-    """mdm-ablation: training steps of each variant."""
-    ablation_cities: int = Field(default=40, ge=1)
-    """mdm-ablation: cities to train on."""
     list: Literal["development", "reported"] = "development"
     """shift: list of logs; nothing is chosen on the reported one."""
     logs: int = Field(default=8, ge=1, le=8)
@@ -47,7 +43,7 @@ class BenchConfig:
     ablation: bool = False
     """shift: also mudg_s with only some of its virtual terms: colour; colour and depth; colour and classes."""
     variant: tuple[str, ...] = ()
-    """shift: also mudg_s with other settings of fit, each NAME=FIELD:VALUE,FIELD:VALUE."""
+    """shift: also mudg_s with other settings of fit, each NAME=FIELD:VALUE,FIELD:VALUE (virtual.start is a field)."""
     processes: int = Field(default=0, ge=0)
     """shift: logs worked on at the same time, one thread each (0 = one per core)."""
     videos: bool = True

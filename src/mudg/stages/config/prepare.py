@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -78,7 +78,9 @@ class AnnotateConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FuseConfig:
-    """Fuse sweeps and images into a static coloured cloud and one cloud per moving object."""
+    """Fuse sweeps and images into a static coloured cloud and one cloud per dynamic object."""
+
+    MOVED: ClassVar[dict[str, str | None]] = {"colour_from_held_out": "color_from_held_out"}
 
     voxel_m: float = Field(default=0.0, ge=0)
     """Keep one point per voxel of this size (0 = keep all)."""
@@ -86,7 +88,7 @@ class FuseConfig:
     """Give no colour to points behind a nearer surface."""
     max_image_gap_s: float = Field(default=0.06, ge=0)
     """Images at most this far in time from a sweep colour its points."""
-    colour_from_held_out: bool = False
+    color_from_held_out: bool = False
     """Also take colours from held-out images (scores at held-out frames then mean little)."""
     box_growth_m: float = Field(default=0.1, ge=0, le=2)
     """Moving boxes are grown by this on each side."""

@@ -22,15 +22,11 @@ class SynthesizeConfig:
     """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
     steps: int = Field(default=2, ge=1, le=1000)
     """Denoising steps. More give more texture, and less agreement with the truth pixel by pixel."""
-    sampler: Literal["ddim", "ancestral", "dpm_solver", "renoise"] = "ddim"
-    """How the steps are taken. Each costs one pass of the network per step."""
-    eta: float = Field(default=1.0, ge=0, le=1)
-    """Noise that ddim adds between steps: 0 = deterministic, 1 = ancestral."""
-    start: Literal["noise", "condition", "render"] = "noise"
-    """condition, render: start from the condition, or from the fitted scene's renders, with noise on it, and run only the
-    share `strength` of the schedule."""
-    strength: float = Field(default=1.0, gt=0, le=1)
-    """start condition, render: share of the noise schedule that is run (1 = all of it)."""
+    sampler: Literal["ddim", "dpm_solver"] = "ddim"
+    """How the steps are taken. Each costs one pass of the network per step. ddim: first order, with fresh noise between steps.
+    dpm_solver: second order and deterministic, for many steps."""
+    eta: float | None = Field(default=None, ge=0, le=1)
+    """ddim: noise added between steps, 0 = deterministic, 1 = as much as the reverse process has (not given: 1)."""
     samples: int = Field(default=1, ge=1)
     """Samples per clip; the first is kept, the spread of all lowers the confidence. Costs that many times the passes."""
     given_classes: bool = True
@@ -51,10 +47,10 @@ class SynthesizeConfig:
     """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     processes: int = Field(default=0, ge=0)
     """Trajectories made at the same time, one thread each (0 = one per core; one for a published-type model)."""
-    guidance: float = Field(default=7.5, ge=1)
-    """Published-type models: weight of the guided prediction; 1 = none, at half the work."""
-    guidance_rescale: float = Field(default=0.7, ge=0, le=1)
-    """Published-type models: how far the spread of the guided prediction is pulled back."""
+    guidance: float | None = Field(default=None, ge=1)
+    """Published-type models: weight of the guided prediction; 1 = none, at half the work (not given: 7.5)."""
+    guidance_rescale: float | None = Field(default=None, ge=0, le=1)
+    """Published-type models: how far the spread of the guided prediction is pulled back (not given: 0.7)."""
     memory_budget_gb: float = Field(default=0.0, ge=0)
     """Published-type models: cut the work so that it fits into this memory (0 = do not cut)."""
     seed: int = 0

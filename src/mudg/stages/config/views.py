@@ -15,40 +15,40 @@ class RenderConfig:
     """Render a fitted scene on recorded and shifted trajectories."""
 
     cameras: tuple[str, ...] = ("front",)
-    """Cameras to render. Names that the scene lacks are an error; empty = the first camera."""
+    """Cameras to render; empty = the first camera. A name that the scene lacks is an error."""
     shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
-    """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded drive."""
+    """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path."""
     height_m: float = 0.0
-    """Added to the height of shifted cameras."""
+    """Vertical shift in metres, positive upwards; applies to every trajectory."""
     yaw_deg: float = 0.0
-    """Turn of shifted cameras about the vertical, counter-clockwise from above."""
+    """Yaw in degrees, counter-clockwise seen from above; applies to every trajectory."""
     width_px: int = Field(default=0, ge=0)
-    """Image width (0 = as recorded)."""
+    """Image width in pixels (0 = as recorded); the height follows."""
     remove_tracks: tuple[str, ...] = ()
-    """Moving objects to leave out."""
+    """Ids of tracked objects to leave out."""
     sky_below_alpha: float = Field(default=0.5, ge=0, le=1)
-    """Pixels covered less than this are sky: no depth, semantics sky."""
+    """Pixels with an opacity below this become sky: class sky, no depth."""
     video: bool = True
-    """Also write a video per trajectory."""
+    """Also write one MP4 video per trajectory."""
     fps: float = Field(default=10.0, gt=0)
-    """Pictures per second of the videos."""
+    """Frames per second of the videos."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
-    """Backend of the renderer; auto takes the fastest there is and says which."""
+    """Rasteriser; auto picks the fastest one available and names it."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class ScoreConfig:
-    """Score renders and generated views against truth where it exists."""
+    """Score rendered and generated views against ground truth where it exists."""
 
     width_px: int = Field(default=0, ge=0)
-    """Width at which everything is compared; the height follows (0 = the size of the scene's camera)."""
+    """Image width in pixels at which everything is compared; the height follows (0 = the size of the scene's camera)."""
     baseline: bool = True
-    """Also score the sparse condition with its holes filled by the nearest point: the bar a model has to clear."""
+    """Also score a baseline without learning: the fused points, every hole filled with the nearest point."""
     perceptual_views: int = Field(default=8, ge=0)
-    """At so many views of every trajectory, evenly spread, also the perceptual distance, which costs more than all other metrics
-    together (0 = never)."""
+    """Number of views per trajectory, evenly spread, at which the perceptual distance is computed; it costs more than all other
+    metrics together (0 = never)."""
     lpips_weights: str = ""
-    """Safetensors file with LPIPS weights (AlexNet, version 0.1, the lpips package's names), for LPIPS at the same views (empty = not
-    computed)."""
+    """Safetensors file with LPIPS weights (AlexNet, version 0.1, names of the lpips package); LPIPS is computed at the same views
+    (empty = not computed)."""
     error_pictures: bool = True
-    """Write one picture of the colour error for the middle view of every trajectory."""
+    """Write an image of the colour error at the middle view of every trajectory."""

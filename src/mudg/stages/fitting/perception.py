@@ -1,8 +1,8 @@
-"""In whose eyes a render is compared with a virtual view: fixed filters, the shipped codec's network, or LPIPS."""
+"""The features by which a render is compared with a virtual view: fixed filters, the shipped codec's network, or LPIPS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -11,30 +11,35 @@ from torch import Tensor, nn
 from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.core import losses
+from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures
-from mudg.models.mdm import model as mdm
-from mudg.stages.config import FitConfig
+from mudg.models.mdm import files as mdm_files
+from mudg.stages.config.fit import VirtualConfig
 
 Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Render ``[3, H, W]`` and target ``[3, H, W]`` in [0, 1], weight ``[1, H, W]`` -> distance, differentiable in the render."""
 
 
-def perception_of(config: FitConfig) -> Perception:
-    """The distance that ``config.virtual_perception`` names.
+def perception_of(config: VirtualConfig) -> Perception:
+    """The distance that ``config.perception`` names.
 
     Raises:
         UsageError: LPIPS without a file of its weights. InputError: the file holds something else.
     """
-    if config.virtual_perception == "filters":
+    if config.perception == "filters":
         return _compared(FilterBank(), losses.feature_distance)
-    if config.virtual_perception == "codec":
-        codec = mdm.load("embedded").codec
-        return _compared(CodecFeatures(codec.requires_grad_(False)), losses.unit_feature_distance)
+    if config.perception == "codec":
+        codec = mdm_files.load("embedded").codec
+        return _compared(CodecFeatures(codec.requires_grad_(False)), _lpips())
     if not config.lpips_weights:
-        raise UsageError("LPIPS needs a file of its weights", where="--virtual-perception lpips", remedy="give it with --lpips-weights")
+        raise UsageError("LPIPS needs a file of its weights", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
     state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
     trunk = LpipsFeatures(state, config.lpips_weights)
-    return _compared(trunk, lambda a, b, weight: losses.unit_feature_distance(a, b, weight, trunk.channel_weights))
+    return _compared(trunk, _lpips(trunk.channel_weights))
+
+
+def _lpips(channel_weights: Sequence[Tensor] | None = None) -> Callable[[list[Tensor], list[Tensor], Tensor], Tensor]:
+    return lambda render, target, weight: lpips_distance(render, unit_features(target), weight, channel_weights)
 
 
 def _compared(features: nn.Module, distance: Callable[[list[Tensor], list[Tensor], Tensor], Tensor]) -> Perception:

@@ -1,16 +1,16 @@
-"""Correct the boxes of moving objects from the pictures: a few Gauss-Newton rounds in the course of a fit.
+"""Correct the boxes of dynamic objects from the pictures: a few Gauss-Newton rounds in the course of a fit.
 
-Four numbers per key of a track (shift along the box's axes, yaw) are asked three questions at once:
+A key of a track has four unknowns: a shift along the box's three axes, and a yaw. Three kinds of evidence are solved for together:
 
-    pictures   how would the rendered colours inside the box's outline change, and what is missing to the recorded ones?
-    track      how far are we from the track, once the noise that it betrays is taken out of it (``RigidNode.settled_offsets``)?
-    motion     does the correction accelerate no more than road users do? (So neighbouring keys are corrected alike.)
+    pictures   the rendered colours inside the box's outline should become the recorded ones
+    track      the correction should stay near the track, once the noise of the track is taken out (``RigidNode.settled_offsets``)
+    motion     the correction should accelerate no more than road users do (so neighbouring keys are corrected alike)
 
-Each answer counts by its expected error, so what the pictures cannot tell (the yaw of a distant car) stays with the track and its
-neighbours in time; a gradient method that scales steps to its gradients, as Adam does, walks at random there. Derivatives are
+Each is weighted by its expected error. What the pictures cannot tell (the yaw of a distant car) therefore stays with the track and its
+neighbours in time; a gradient method that scales its steps to the gradients, as Adam does, walks at random there. Derivatives are
 differences of renders: all objects of a view are displaced together, so a view costs five pictures without gradients.
 
-LiDAR depth is not asked: with a known scene, colours alone took 0.13 m of drift to under 0.02 m; with depths beside them it stayed
+LiDAR depth is not used: with a known scene, colours alone took 0.13 m of drift to under 0.02 m; with depths beside them it stayed
 above 0.06 m. At the edge of an object a rendered depth is a mean of near and far, and the nearest return is not that of the pixel.
 """
 
@@ -27,10 +27,12 @@ from torch import Tensor
 
 from mudg.base import geometry
 from mudg.base.types import Gaussians
+from mudg.core.quaternions import left_product_matrix
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.models.scene import motion
 from mudg.models.scene.appearance import Appearance
-from mudg.models.scene.nodes import RigidNode, SceneModel, compose, composite_sky, left_product_matrix
+from mudg.models.scene.model import SceneModel, compose, composite_sky
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages.fitting.objects import outline_mask
 from mudg.stages.fitting.views import StoredView
 
@@ -48,7 +50,7 @@ COLOR_SHARE = 1 / 120
 
 
 @dataclass
-class Evidence:
+class PoseEvidence:
     """Sums of the pictures' normal equations: ``matrix`` f64[K, 4, 4] and ``vector`` f64[K, 4] per key of one object."""
 
     matrix: NDArray[np.float64]
@@ -56,7 +58,7 @@ class Evidence:
     views: int = field(default=0)
 
     @classmethod
-    def none(cls, keys: int) -> Evidence:
+    def none(cls, keys: int) -> PoseEvidence:
         """Nothing seen yet."""
         return cls(np.zeros((keys, 4, 4)), np.zeros((keys, 4)))
 
@@ -73,11 +75,11 @@ def refine_poses(
     learning = {
         index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.learn_pose
     }
-    evidence = {index: Evidence.none(len(node.times_s)) for index, node in learning.items()}
+    evidence = {index: PoseEvidence.none(len(node.times_s)) for index, node in learning.items()}
     for stored in views:
         outlines = _outlines(learning, stored)
         if outlines:
-            _look(model, stored, outlines, evidence, raster, appearance)
+            _add_evidence(model, stored, outlines, evidence, raster, appearance)
     moves = [_move(node, evidence[index]) for index, node in learning.items() if evidence[index].views]
     return float(np.sqrt(np.mean(np.concatenate(moves) ** 2))) if moves else 0.0
 
@@ -97,11 +99,11 @@ def _outlines(learning: dict[int, RigidNode], stored: StoredView) -> dict[int, T
     return found
 
 
-def _look(
-    model: SceneModel, stored: StoredView, outlines: dict[int, Tensor], evidence: dict[int, Evidence], raster: RasterConfig,
+def _add_evidence(
+    model: SceneModel, stored: StoredView, outlines: dict[int, Tensor], evidence: dict[int, PoseEvidence], raster: RasterConfig,
     appearance: Appearance | None,
 ) -> None:  # fmt: skip
-    """Add what one recorded view says about the objects it shows."""
+    """Add what one recorded view tells about the objects in it."""
     time_s = stored.view.time_s
     here = compose(model, time_s, semantics=False)
     rows = {index: (here.node == index).nonzero()[:, 0] for index in outlines}  # type: ignore[operator]
@@ -116,13 +118,13 @@ def _look(
     for index, outline in outlines.items():
         jacobian = torch.stack([change[:, outline].flatten() for change in changes], 1).double()
         matrix, vector = _normal_equations(jacobian, missing[:, outline].flatten().double())
-        _credit(model.nodes[index], time_s, matrix, vector, evidence[index])  # type: ignore[arg-type]
+        _add_to_keys(model.nodes[index], time_s, matrix, vector, evidence[index])  # type: ignore[arg-type]
 
 
-def _credit(
-    node: RigidNode, time_s: float, matrix: NDArray[np.float64], vector: NDArray[np.float64], into: Evidence
+def _add_to_keys(
+    node: RigidNode, time_s: float, matrix: NDArray[np.float64], vector: NDArray[np.float64], into: PoseEvidence
 ) -> None:
-    """Give the evidence of a moment to the two keys around it, by their share in the pose."""
+    """Add the evidence of a moment to the two keys around it, by their share in the pose."""
     found = node.keys_around(time_s)
     if found is None:
         return
@@ -181,7 +183,7 @@ def _normal_equations(jacobian: Tensor, missing: Tensor) -> tuple[NDArray[np.flo
     return (jacobian.T @ weighted).numpy(), (weighted.T @ missing).numpy()
 
 
-def _move(node: RigidNode, evidence: Evidence) -> NDArray[np.float64]:
+def _move(node: RigidNode, evidence: PoseEvidence) -> NDArray[np.float64]:
     """Solve for all keys of a track together and move them; returns the moves f64[K, 3] in metres.
 
     Unknown is the correction c of every key beyond ``settled_offsets``, which have weighed noise against motion already: the sum of

@@ -1,7 +1,7 @@
 """Starting values of a scene model: fused points become Gaussians, what LiDAR never reached is filled in, the sky is painted.
 
 What LiDAR does not reach in a street: facades above the topmost beam, and everything beyond its range. Both are filled from
-the recorded images: a pixel that is not sky, not a moving thing and has no point near it takes the depth of the surface of
+the recorded images: a pixel that is neither sky nor a dynamic object and has no point near it takes the depth of the surface of
 the same class below it in its column (walls, trees and poles stand upright, so their camera z hardly changes upwards); where
 there is none it is put on a far shell. This needs semantic labels; without them nothing is filled and the sky stands in.
 """
@@ -21,17 +21,12 @@ from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
 from mudg.core.table import Table
-from mudg.models.scene.nodes import (
-    RigidNode,
-    SceneModel,
-    SkyNode,
-    StaticNode,
-    box_grid,
-    columns_from_points,
-    neighbour_scale,
-    object_node,
-    voxel_filter,
-)  # fmt: skip
+from mudg.methods import METHODS
+from mudg.models.scene.initial import box_grid, columns_from_points, neighbour_scale, voxel_filter
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode, StaticNode, object_node
+from mudg.models.scene.sky import SkyNode
+from mudg.stages.config import FitConfig
 from mudg.stages.fitting.views import StoredView
 
 UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation"))
@@ -43,26 +38,8 @@ FEWEST_OBJECT_POINTS = 150
 MIRROR_APART_M = 0.25
 
 
-@dataclass(frozen=True)
-class StartSettings:
-    """Numbers of the start; see ``FitConfig`` for their meaning."""
-
-    initial_gaussians: int
-    voxel_m: float
-    far_m: float
-    sh_degree: int
-    with_objects: bool
-    with_sky: bool
-    learn_poses: bool
-    seed: int
-    deformable: bool = False
-    color_terms: int = 0
-    mirror: bool = False
-    outlier_deviations: float = 0.0
-
-
 def start_model(
-    scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], settings: StartSettings
+    scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
 ) -> SceneModel:
     """Build the scene model that the fit starts from.
 
@@ -71,68 +48,47 @@ def start_model(
     """
     if len(fused.static) == 0:
         raise InputError("the fused cloud has no static points to start from", where=scene.root, remedy="check the LiDAR of the scene")
-    blocks = [_static_columns(scene, fused.static, views, classes, settings)]
+    kinds = METHODS[config.method].nodes
+    blocks = [_static_columns(fused.static, views, classes, config)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]
-    if settings.with_objects:
-        share = settings.initial_gaussians // max(1, len(fused.objects))
+    if "objects" in kinds:
+        share = config.start.gaussians // max(1, len(fused.objects))
         for track_id, cloud in sorted(fused.objects.items()):
-            node = object_node(scene.track(track_id), settings.learn_poses, settings.deformable)
-            blocks.append(_object_columns(node, cloud, classes, settings, min(share, 8000)))
+            node = object_node(scene.track(track_id), config.poses.learn, config.objects.deformable)
+            blocks.append(_object_columns(node, cloud, classes, config, min(share, 8000)))
             nodes.append(node)
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
-    sky = _painted_sky(views) if settings.with_sky else None
+    sky = _painted_sky(views) if "sky" in kinds else None
     log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} objects")
-    moving = len(owner) - len(blocks[0]["means"])
-    partial = {"sh_time": torch.zeros(moving, settings.color_terms, 3)} if settings.color_terms and moving else {}
-    return SceneModel(Table(columns, {"node": owner}, partial), tuple(nodes), sky, classes, settings.sh_degree)
+    return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree)
 
 
 def _static_columns(
-    scene: Scene, cloud: PointCloud, views: Sequence[StoredView], classes: tuple[int, ...], settings: StartSettings
+    cloud: PointCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
 ) -> Mapping[str, torch.Tensor]:
     centers = np.stack([view.view.center_world for view in views]).astype(np.float32)
-    rows = _thinned(cloud.xyz, centers, settings)
-    if settings.outlier_deviations:
-        rows = rows[~_lonely(cloud.xyz[rows], centers, settings.outlier_deviations)]
+    rows = _thinned(cloud.xyz, centers, config)
     xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
     semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
     scale = neighbour_scale(xyz)
-    filled = _fill_unreached(views, xyz, classes, settings.far_m)
+    filled = _fill_unreached(views, xyz, classes, config.start.far_m)
     if filled is not None:
         xyz, rgb = np.concatenate([xyz, filled.xyz]), np.concatenate([rgb, filled.rgb])
         semantics, scale = np.concatenate([semantics, filled.semantics]), np.concatenate([scale, filled.scale_m])
-    return columns_from_points(xyz, rgb, semantics, classes, settings.sh_degree, scale_m=scale)
+    return columns_from_points(xyz, rgb, semantics, classes, config.sh_degree, scale_m=scale)
 
 
-def _thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], settings: StartSettings) -> NDArray[np.int64]:
+def _thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitConfig) -> NDArray[np.int64]:
     """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera, at most the wanted number."""
     distance, _ = cKDTree(centers).query(xyz, k=1, workers=1)
-    size = settings.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
+    size = config.start.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
     for _ in range(12):
         rows = voxel_filter(xyz, size)
-        if len(rows) <= settings.initial_gaussians:
+        if len(rows) <= config.start.gaussians:
             return rows
-        size = size * np.clip((len(rows) / settings.initial_gaussians) ** 0.5, 1.08, 2.0)
-    return rows[np.sort(seeds.numpy_rng(settings.seed, 0, "thin").permutation(len(rows))[: settings.initial_gaussians])]
-
-
-def _lonely(xyz: NDArray[np.float32], centers: NDArray[np.float32], deviations: float, neighbours: int = 6) -> NDArray[np.bool_]:
-    """Bool[N]: points whose neighbours are unusually far for their distance from the drive.
-
-    The mean distance to the nearest neighbours grows with the range and has a long tail, so its logarithm is compared with the
-    mean and spread (median and quartiles, which outliers do not move) of points in the same band of range.
-    """
-    if len(xyz) <= neighbours:
-        return np.zeros(len(xyz), bool)
-    apart = np.log(cKDTree(xyz).query(xyz, k=neighbours + 1, workers=1)[0][:, 1:].mean(1) + 1e-6)
-    band = np.round(2 * np.log2(1 + cKDTree(centers).query(xyz, k=1, workers=1)[0])).astype(int)
-    lonely = np.zeros(len(xyz), bool)
-    for one in np.unique(band):
-        mine = band == one
-        low, middle, high = np.percentile(apart[mine], (25, 50, 75))
-        lonely[mine] = apart[mine] > middle + deviations * max((high - low) / 1.349, 1e-3)
-    return lonely
+        size = size * np.clip((len(rows) / config.start.gaussians) ** 0.5, 1.08, 2.0)
+    return rows[np.sort(seeds.numpy_rng(config.seed, 0, "thin").permutation(len(rows))[: config.start.gaussians])]
 
 
 def mirrored_points(xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
@@ -146,13 +102,13 @@ def mirrored_points(xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M) -
 
 
 def _object_columns(
-    node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], settings: StartSettings, most: int
+    node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], config: FitConfig, most: int
 ) -> Mapping[str, torch.Tensor]:
     rows = voxel_filter(cloud.xyz, 0.06)
-    rows = rows[np.sort(seeds.numpy_rng(settings.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
+    rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
     xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
     semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
-    if settings.mirror and node.symmetric:
+    if config.objects.mirror_start and node.symmetric:
         other, source = mirrored_points(xyz)
         xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
         semantics = np.concatenate([semantics, semantics[source]])
@@ -162,7 +118,7 @@ def _object_columns(
         commonest = np.bincount(semantics, minlength=256).argmax() if len(semantics) else UNLABELLED
         xyz, rgb = np.concatenate([xyz, grid_xyz]), np.concatenate([rgb, grid_rgb])
         semantics = np.concatenate([semantics, np.full(len(grid_xyz), commonest, np.uint8)])
-    return columns_from_points(xyz, rgb, semantics, classes, settings.sh_degree, scale_m=neighbour_scale(xyz, 0.02, 0.3))
+    return columns_from_points(xyz, rgb, semantics, classes, config.sh_degree, scale_m=neighbour_scale(xyz, 0.02, 0.3))
 
 
 # ---- beyond LiDAR ---------------------------------------------------------------------------------------------------
@@ -180,7 +136,7 @@ def _fill_unreached(
     views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float
 ) -> _Fill | None:
     """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
-    labelled = [view for view in views if view.channel is not None]
+    labelled = [view for view in views if view.channels is not None]
     if not labelled or not classes:
         return None
     chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
@@ -201,7 +157,7 @@ def _fill_view(stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int,
     center_row = (np.arange(rows) * cell + cell // 2)[:, None]
     center_column = (np.arange(columns) * cell + cell // 2)[None, :]
     train_ids = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))
-    channel = stored.channel[center_row, center_column]  # type: ignore[index]
+    channel = stored.channels[center_row, center_column]  # type: ignore[index]
     label = train_ids[np.minimum(channel, len(classes))]
     depth = _cell_depth(stored, xyz, rows, columns)
     covered = np.isfinite(depth)

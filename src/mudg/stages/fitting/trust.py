@@ -1,11 +1,10 @@
-"""Where a virtual view has something to say: the part of it that no recorded camera ever saw.
+"""Which part of a virtual view no recorded camera ever saw, and Gaussians to start there.
 
-A generated view is the best there is behind a parked bus, and worse than the photographs wherever they look. So each of its
-pixels is asked: is the surface you show seen by any recorded view? The pixel's point (at the depth the virtual view itself
-claims) is carried to a number of recorded views, with its moving object if it lies in one's box, and compared with the depth
-the model renders there: if the recorded view looks at or through that point, the pixel is *seen*. Points that are hidden in
-every recorded view, or in none's image, are *unseen*, and there the virtual view keeps its full weight. Since nothing was
-measured there, nothing could start there either: ``unseen_rows`` makes Gaussians from what the virtual views show.
+Behind a parked bus a generated view is the best there is; nothing was measured there, so no Gaussian could start there. For every
+pixel of a virtual view, its point (at the depth of the virtual view itself) is carried to a number of recorded views, with its
+dynamic object if it lies in one's box, and compared with the depth that the model renders there. If a recorded view shows that point, or
+something behind it, the pixel is *seen*. Points that are hidden in every recorded view, or outside all their images, are *unseen*:
+``unseen_rows`` makes Gaussians of them.
 """
 
 from __future__ import annotations
@@ -21,11 +20,13 @@ from mudg.base import geometry, log, seeds
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.models.scene.nodes import RigidNode, SceneModel, columns_from_points, compose, voxel_filter
+from mudg.models.scene.initial import columns_from_points, voxel_filter
+from mudg.models.scene.model import SceneModel, compose
+from mudg.models.scene.nodes import RigidNode
 from mudg.stages.fitting.views import StoredView
 
 WITNESSES = 36
-"""Recorded views asked, spread evenly over cameras and time."""
+"""Number of recorded views that are compared, spread evenly over cameras and time."""
 STRIDE_PX = 2
 TOLERANCE = 0.15
 SKY_AT_M = 1000.0
@@ -68,7 +69,7 @@ def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
 
 
 def block_centres(size_px: int) -> NDArray[np.intp]:
-    """Pixel asked about for each block of ``STRIDE_PX``; the last block may be cut, so that any size is covered."""
+    """The pixel that stands for each block of ``STRIDE_PX``; the last block may be cut, so that any size is covered."""
     return np.minimum(np.arange(0, size_px, STRIDE_PX) + STRIDE_PX // 2, size_px - 1)
 
 
@@ -86,7 +87,7 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
         moved = points.copy()
         exists = np.ones(len(points), bool)
         for node, (inside, local) in carried:
-            pose = _pose(node, witness.view.time_s)
+            pose = node.pose_matrix(witness.view.time_s)
             exists[inside] = pose is not None
             if pose is not None:
                 moved[inside] = geometry.transform_points(pose, local)
@@ -110,7 +111,7 @@ def unseen_rows(
 ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
     """Table rows (columns, labels) at the surfaces that only virtual views show, thinned to one per place, at most ``most``.
 
-    A point in the box of a moving object belongs to that object.
+    A point in the box of a dynamic object belongs to that object.
     """
     objects = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
     found: dict[int, list[_Seeds]] = {index: [] for index in range(len(model.nodes))}
@@ -152,7 +153,7 @@ def _seeds_of(
         kept &= stored.confidence[row, column] >= SEED_CONFIDENCE * 255
     row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
-    channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channel is None else stored.channel[row, column]
+    channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channels is None else stored.channels[row, column]
     train_id = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))[np.minimum(channel, len(classes))]
     scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
     rgb = stored.rgb[row, column]
@@ -180,13 +181,9 @@ def _looks_at_or_through(witness: _Witness, points: NDArray[np.float64]) -> NDAr
 
 def _in_box(node: RigidNode, points: NDArray[np.float64], time_s: float) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
     """Indices of points in the node's box (grown by a tenth) and their coordinates in it; None if there are none."""
-    pose = _pose(node, time_s)
+    pose = node.pose_matrix(time_s)
     if pose is None:
         return None
     local = geometry.transform_points(geometry.invert(pose), points)
     inside = np.flatnonzero((np.abs(local) < np.array(node.size_m) * 0.55 + 0.1).all(1))
     return (inside, local[inside]) if len(inside) else None
-
-
-def _pose(node: RigidNode, time_s: float) -> NDArray[np.float64] | None:
-    return node.pose_matrix(time_s)

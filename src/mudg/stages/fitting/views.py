@@ -6,32 +6,29 @@ gets is a function of (run seed, step) alone.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import Frame, FusedCloud, Observation, Scene, Sweep, Track, View
+from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
+from mudg.core.pictures import resize_area, resize_nearest
 from mudg.data import scene as scenefile
 from mudg.data.clips.condition import ConditionRules, project_sparse
-from mudg.data.observations import list_observation_sets, read_observations
+from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 
 MAX_LIDAR_M = 100.0
 NEAREST_SWEEP_S = 0.1
 OCCLUSION_CELL_PX = (8, 3)
 """Columns and rows of the neighbourhood in which a nearer point hides a farther one (rows: about one beam apart)."""
 OCCLUSION_MARGIN = 0.15
-NEXT_TO_M = 0.05
-"""Distances from the recorded path that differ by less are the same distance."""
 
 
 @dataclass(frozen=True)
@@ -43,96 +40,92 @@ class LidarPixels:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """One view to learn from.
+class TrainView:
+    """One view as tensors, ready for a step.
 
     Args:
         name: e.g. ``front/000012`` or ``front_shift+2.0/000003``, for messages.
-        observation: semantics hold *channel numbers* of the model's classes here (255 = unlabelled).
+        kind: recorded or virtual.
+        rgb: f32[3, H, W] in [0, 1].
+        channels: i64[H, W], numbers of the model's class channels (255 = unlabelled), or None.
+        confidence: f32[1, H, W] in [0, 1]: of all that a virtual view shows, of the labels alone for a recorded one.
+        mask: bool[1, H, W], pixels that may be used at all.
         sky: bool[1, H, W] or None if unknown.
+        depth: f32[1, H, W] metres of a virtual view (NaN = none), or None.
         lidar: or None.
-        unseen: bool[1, H, W] of a virtual view: no recorded view saw what it shows here.
     """
 
     name: str
-    observation: Observation
+    view: View
+    kind: ObservationKind
+    rgb: Tensor
+    channels: Tensor | None
+    confidence: Tensor
+    mask: Tensor
     sky: Tensor | None
+    depth: Tensor | None
     lidar: LidarPixels | None
-    unseen: Tensor
 
 
 @dataclass(frozen=True)
 class StoredView:
-    """One view in bytes: rgb u8[H, W, 3]; channel u8[H, W] or None; sky, mask bool[H, W] or None; depth f16 m (NaN = none)
-    of virtual views; confidence u8 of all a virtual view shows, of the labels alone for a recorded one (None = 1)."""
+    """A ``TrainView`` in bytes: rgb u8[H, W, 3]; channels u8[H, W]; sky, mask bool[H, W]; depth f32[H, W]; confidence u8[H, W] (255 =
+    1). None where there is none; no mask: all pixels, no confidence: 1."""
 
     name: str
     view: View
-    kind: str
-    source: str
+    kind: ObservationKind
     rgb: NDArray[np.uint8]
-    channel: NDArray[np.uint8] | None
-    sky: NDArray[np.bool_] | None
-    mask: NDArray[np.bool_] | None
+    channels: NDArray[np.uint8] | None = None
+    sky: NDArray[np.bool_] | None = None
+    mask: NDArray[np.bool_] | None = None
     lidar: LidarPixels | None = None
     depth: NDArray[np.float32] | None = None
     confidence: NDArray[np.uint8] | None = None
 
-    def sample(self, unseen: Tensor | None = None) -> Sample:
-        """The view as tensors; ``unseen`` u8, at least [H, W] (None: all of it)."""
-        height, width = self.rgb.shape[:2]
-        everywhere = torch.ones(1, height, width)
-        observation = Observation(
+    def as_tensors(self) -> TrainView:
+        """The view for a step."""
+        everywhere = torch.ones(1, *self.rgb.shape[:2])
+        return TrainView(
+            name=self.name,
             view=self.view,
-            rgb=torch.from_numpy(self.rgb).permute(2, 0, 1).float().div_(255),
-            depth=None if self.depth is None else torch.from_numpy(self.depth)[None],
-            semantics=None if self.channel is None else torch.from_numpy(self.channel).long(),
+            kind=self.kind,
+            rgb=torch.from_numpy(self.rgb).permute(2, 0, 1).contiguous().float().div_(255),
+            channels=None if self.channels is None else torch.from_numpy(self.channels).long(),
             confidence=everywhere if self.confidence is None else torch.from_numpy(self.confidence)[None].float().div_(255),
             mask=everywhere.bool() if self.mask is None else torch.from_numpy(self.mask)[None],
-            kind="recorded" if self.kind == "recorded" else "virtual",
-            source=self.source,
+            sky=None if self.sky is None else torch.from_numpy(self.sky)[None],
+            depth=None if self.depth is None else torch.from_numpy(self.depth)[None],
+            lidar=self.lidar,
         )
-        sky = None if self.sky is None else torch.from_numpy(self.sky)[None]
-        unseen = everywhere.bool() if unseen is None else unseen[None, :height, :width].bool()
-        return Sample(self.name, observation, sky, self.lidar, unseen)
 
 
 @dataclass(frozen=True)
 class ViewSet:
-    """All views of a fit. ``virtual`` may be empty; ``offsets_m``: how far each of them is from the recorded path."""
+    """All views of a fit. ``virtual`` may be empty."""
 
     recorded: tuple[StoredView, ...]
     virtual: tuple[StoredView, ...]
-    offsets_m: tuple[float, ...] = ()
 
-    def choose(
-        self, run_seed: int, step: int, virtual_probability: float, unseen: Tensor | None = None, reach_m: float = math.inf,
-        beside: bool = False,
-    ) -> tuple[Sample, ...]:  # fmt: skip
+    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[TrainView, ...]:
         """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
 
         Recorded views come in a fresh random order per round, so that every one is seen equally often.
 
         Args:
-            unseen: u8[V, H, W], what only the virtual views see (see ``fit_trust``).
-            reach_m: virtual views farther than this from the recorded path are not taken yet.
             beside: the virtual view comes after the recorded one, not in its place.
         """
         generator = seeds.numpy_rng(run_seed, step, "view")
         if self.virtual and generator.random() < virtual_probability:
-            within = range(len(self.virtual))
-            if math.isfinite(reach_m):
-                within = [i for i, offset in enumerate(self.offsets_m) if offset <= reach_m + NEXT_TO_M]
-            index = within[int(generator.integers(len(within)))]
-            drawn = self.virtual[index].sample(None if unseen is None else unseen[index])
+            drawn = self.virtual[int(generator.integers(len(self.virtual)))].as_tensors()
             return (self._recorded_of(run_seed, step), drawn) if beside else (drawn,)
         return (self._recorded_of(run_seed, step),)
 
-    def _recorded_of(self, run_seed: int, step: int) -> Sample:
+    def _recorded_of(self, run_seed: int, step: int) -> TrainView:
         """The recorded view of a step."""
         turn, place = divmod(step, len(self.recorded))
         order = seeds.numpy_rng(run_seed, turn, "recorded order").permutation(len(self.recorded))
-        return self.recorded[int(order[place])].sample()
+        return self.recorded[int(order[place])].as_tensors()
 
 
 # ---- recorded ----------------------------------------------------------------------------------------------------
@@ -153,8 +146,8 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
     return frames
 
 
-def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Path | None) -> tuple[int, ...]:
-    """Train ids that occur in the labels of the frames (a sample of them) and in virtual views; sky always included.
+def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, ObservationSet]) -> tuple[int, ...]:
+    """Train ids that occur in the labels of the frames and in virtual views (a sample of both); sky always included.
 
     Empty when nothing is labelled.
     """
@@ -162,12 +155,9 @@ def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Path | None) -> t
     labelled = [frame for frame in frames if "semantics" in frame.labels]
     for frame in labelled[:: max(1, len(labelled) // 24)]:
         found |= set(np.unique(scenefile.read_label(scene, frame, "semantics")).tolist())
-    if virtual is not None:
-        for path in list_observation_sets(virtual).values():
-            observations = read_observations(path)
-            for index in range(0, len(observations), 6):
-                semantics = observations[index].semantics
-                found |= set() if semantics is None else set(torch.unique(semantics).tolist())
+    for observations in virtual.values():
+        for index in range(0, len(observations), 6):
+            found |= set(np.unique(observations.arrays(index).get("semantics", UNLABELLED)).tolist())
     found -= {UNLABELLED}
     return tuple(sorted(found | {ID["sky"]})) if found else ()
 
@@ -184,9 +174,9 @@ def load_recorded(
     points = _SweepCache(scene)
     for frame in log.progress(frames, len(frames), "reading frames"):
         view = resized_view(frame.view, width_px)
-        size = (view.camera.width, view.camera.height)
+        size = (view.camera.height, view.camera.width)
         labels = {
-            name: resized_labels(scenefile.read_label(scene, frame, name), size) if name in frame.labels else None
+            name: resize_nearest(scenefile.read_label(scene, frame, name), *size) if name in frame.labels else None
             for name in ("semantics", "sky", "ego", "semantics_confidence")
         }
         confidence = labels["semantics_confidence"]
@@ -196,7 +186,7 @@ def load_recorded(
         without_lidar += lidar is None
         stored.append(
             StoredView(
-                frame.id, view, "recorded", "camera", resized_rgb(scenefile.read_image(scene, frame), size),
+                frame.id, view, "recorded", resize_area(scenefile.read_image(scene, frame), *size[::-1]),
                 None if semantics is None or not classes else to_channels(semantics, classes), sky,
                 None if labels["ego"] is None else ~labels["ego"].astype(bool), lidar,
                 confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
@@ -207,39 +197,42 @@ def load_recorded(
     return tuple(stored)
 
 
-def load_virtual(
-    path: Path, classes: Sequence[int], measured: Callable[[View], LidarPixels] | None = None
-) -> tuple[StoredView, ...]:
-    """All observations below ``path``, with the sparse depth that ``measured`` gives for a view.
+def virtual_sets(path: Path) -> dict[str, ObservationSet]:
+    """The sets of virtual observations below ``path``, by name; only their indices are read.
 
     Raises:
-        InputError: no observation folder there, or a recorded one among them.
+        InputError: there is none, or one of them holds recorded views.
     """
-    sets = list_observation_sets(path)
+    sets = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
     if not sets:
         raise InputError("no finished folders of observations here", where=str(path), remedy="run `mudg synthesize` first")
+    for found in sets.values():
+        if found.kind == "recorded":
+            raise InputError("recorded views among the virtual ones: held-out truth must not be learnt from", where=str(found.path),
+                             expected="views of kind virtual", got=f"kind recorded, source {found.source}",
+                             remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
+    return sets
+
+
+def load_virtual(
+    sets: Mapping[str, ObservationSet], classes: Sequence[int], measured: Callable[[View], LidarPixels] | None = None
+) -> tuple[StoredView, ...]:
+    """All observations of these sets, with the sparse depth that ``measured`` gives for a view."""
     stored = []
-    for name, folder in sets.items():
-        observations = read_observations(folder)
-        for index in range(len(observations)):
-            seen = observations[index]
-            lidar = None if measured is None else measured(seen.view)
-            stored.append(replace(stored_observation(f"{name}/{index:06d}", seen, classes), lidar=lidar))
+    for name, observations in sets.items():
+        for index, view in enumerate(observations.views):
+            arrays = observations.arrays(index)
+            semantics, confidence = arrays.get("semantics"), arrays["confidence"].astype(np.float32).clip(0, 1)
+            stored.append(
+                StoredView(
+                    f"{name}/{index:06d}", view, "virtual", observations.rgb_u8(index).copy(),
+                    None if semantics is None or not classes else to_channels(semantics, classes),
+                    None if semantics is None else semantics == ID["sky"], arrays["mask"].astype(bool),
+                    None if measured is None else measured(view), arrays["depth"].copy() if "depth" in arrays else None,
+                    (confidence * 255).round().astype(np.uint8),
+                )
+            )  # fmt: skip
     return tuple(stored)
-
-
-def offsets_from_path_m(recorded: Sequence[StoredView], virtual: Sequence[StoredView]) -> tuple[float, ...]:
-    """Distance of each virtual view from the nearest recorded one of the same camera (of any, if it recorded nothing)."""
-    if not virtual:
-        return ()
-    every = np.stack([view.view.center_world for view in recorded])
-    names = [view.view.camera.name for view in recorded]
-    found = []
-    for view in virtual:
-        own = [name == view.view.camera.name for name in names]
-        centres = every[own] if any(own) else every
-        found.append(float(np.linalg.norm(centres - view.view.center_world, axis=1).min()))
-    return tuple(found)
 
 
 def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
@@ -248,27 +241,13 @@ def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], 
     Points behind others are left out as in the diffusion model's condition (``data.clips.project_sparse``).
     """
 
-    def at(view: View) -> LidarPixels:
+    def measured(view: View) -> LidarPixels:
         camera = view.camera
         seen = project_sparse(cloud, tracks, view, ConditionRules(camera.width, camera.height, far_m=MAX_LIDAR_M))
         pixel = seen.valid.reshape(-1).nonzero()[:, 0]
         return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
 
-    return at
-
-
-def stored_observation(name: str, observation: Observation, classes: Sequence[int]) -> StoredView:
-    """One virtual observation in bytes."""
-    semantics = None if observation.semantics is None else observation.semantics.numpy().astype(np.uint8)
-    return StoredView(
-        name, observation.view, observation.kind, observation.source,
-        (observation.rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy(),
-        None if semantics is None or not classes else to_channels(semantics, classes),
-        None if semantics is None else semantics == ID["sky"],
-        observation.mask[0].numpy(), None,
-        None if observation.depth is None else observation.depth[0].numpy().astype(np.float32),
-        (observation.confidence[0].clamp(0, 1) * 255).round().byte().numpy(),
-    )  # fmt: skip
+    return measured
 
 
 def to_channels(train_ids: NDArray[np.integer], classes: Sequence[int]) -> NDArray[np.uint8]:
@@ -284,23 +263,6 @@ def resized_view(view: View, width_px: int) -> View:
     if width_px in (0, camera.width):
         return view
     return view.resized(width_px, max(1, round(camera.height * width_px / camera.width)))
-
-
-def resized_rgb(rgb: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Area-averaged resize of u8[H, W, 3] to (width, height)."""
-    if (rgb.shape[1], rgb.shape[0]) == size:
-        return np.ascontiguousarray(rgb)
-    return np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BOX)).copy()
-
-
-def resized_labels(labels: NDArray, size: tuple[int, int]) -> NDArray:
-    """Nearest-pixel resize of a label map (classes are never mixed)."""
-    height, width = labels.shape
-    if (width, height) == size:
-        return np.ascontiguousarray(labels)
-    rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
-    columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
-    return np.ascontiguousarray(labels[rows][:, columns])
 
 
 # ---- LiDAR depth of a recorded view ---------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ a small file beside its labels, warned of, and counted in the notes.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from mudg.base import log, store
-from mudg.base.errors import UsageError
+from mudg.base.errors import ResourceError, UsageError
 from mudg.core.complete import visible_depth
 from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions
 from mudg.models.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
@@ -30,6 +31,15 @@ _FILLED: Final = ".filled.json"
 def place(config: AnnotateConfig) -> Place:
     """Where the networks of a configuration compute."""
     return Place(config.device, config.precision == "bfloat16")
+
+
+def folders(config: AnnotateConfig) -> dict[str, Path]:
+    """Flag that names a network's folder -> that folder, where one is named and lies on this machine."""
+    found: dict[str, Path] = {}
+    for name, text in (("weights", config.weights), ("depth-network", config.depth_network)):
+        with contextlib.suppress(ResourceError):  # said when it is read, if it is
+            found |= {name: find(text)} if text else {}
+    return found
 
 
 def digests(config: AnnotateConfig) -> dict[str, str]:

@@ -14,40 +14,42 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.errors import InputError, ResourceError
+from mudg.base.processes import run_in_processes
+from mudg.base.types import Clip
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_log import LogClipRules, LogSource, LogWindow
-from mudg.data.clips.shards import Batch
 from mudg.data.scene import read_scene
-from mudg.models.mdm import model as mdm
+from mudg.models.diffusion import sized_to_area
+from mudg.models.mdm.codec import CLASSES
 from mudg.stages.config import LearnConfig
-from mudg.stages.synthesize import model_size
 
 
 def held_out(config: LearnConfig) -> list[int]:
     """Numbers of the shards used for scoring only."""
-    return [from_city.HELD_OUT + n for n in range(config.held_out)]
+    return [from_city.HELD_OUT + n for n in range(config.data.held_out)]
 
 
-def cities_at(config: LearnConfig, step: int) -> int:
-    """How many cities training may draw from at `step`: `first_cities`, then linearly up to `cities` at half time.
+def cities_in_use(config: LearnConfig, step: int) -> int:
+    """How many cities training may draw from at `step`: `first_cities`, then linearly up to `cities` at `all_cities_at`.
 
     A function of the step alone, so that clips can still be in the making while training runs and the draw stays the
     same in every run.
     """
-    share = min(1.0, step / max(1.0, config.all_cities_at * config.steps))
-    return min(config.cities, config.first_cities + int((config.cities - config.first_cities) * share))
+    data = config.data
+    share = min(1.0, step / max(1.0, data.all_cities_at * config.steps))
+    return min(data.cities, data.first_cities + int((data.cities - data.first_cities) * share))
 
 
 # cities ---------------------------------------------------------------------------------------------------------------
 
 
 def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.CityClipRules:
-    """What the generator is asked for; `points_alone`: the published system's condition."""
+    """Rules for the generator; `points_alone`: the published system's condition."""
+    data = config.data
     return from_city.CityClipRules(
-        width=config.width, height=config.height, window=config.window, seed=config.seed, clips=config.clips_per_city,
-        published=points_alone,
-    )  # fmt: skip
+        data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone
+    )
 
 
 class MakingClips:
@@ -55,9 +57,9 @@ class MakingClips:
 
     def __init__(self, config: LearnConfig, folder: Path, points_alone: bool = False) -> None:
         self._rules, self._folder = clip_rules(config, points_alone), folder
-        wanted = [*held_out(config), *range(config.cities)]
+        wanted = [*held_out(config), *range(config.data.cities)]
         self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
-        self._workers = config.workers
+        self._workers = config.compute.workers
         self._pool: concurrent.futures.ProcessPoolExecutor | None = None
         self._futures: list[concurrent.futures.Future[int]] = []
 
@@ -108,107 +110,101 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
     `points_alone`: with the published system's condition, and of the configuration's very size, whatever the aspect.
     """
     scene = read_scene(sources[0].scene)
-    names = config.scene_cameras or tuple(scene.cameras)
+    names = config.data.cameras or tuple(scene.cameras)
     if names[0] not in scene.cameras:
-        raise InputError("the scene has no such camera", where=f"--scene-cameras, {scene.root}",
+        raise InputError("the scene has no such camera", where=f"--data.cameras, {scene.root}",
                          expected=", ".join(scene.cameras), got=names[0])  # fmt: skip
     camera = scene.cameras[names[0]]
-    width, height = model_size(camera.width, camera.height, multiple, config.width * config.height)
+    width, height = sized_to_area(config.data.width * config.data.height, camera.width / camera.height, multiple)
     if points_alone:
-        width, height = config.width, config.height
+        width, height = config.data.width, config.data.height
     return LogClipRules(
-        width=width, height=height, window=config.window, stride=config.stride, frame_step=config.frame_step,
-        cameras=config.scene_cameras, held_out_every=config.held_out_every, label_confidence=config.label_confidence,
+        width=width, height=height, window=config.data.window, stride=config.data.stride, frame_step=config.data.frame_step,
+        cameras=config.data.cameras, held_out_every=config.data.held_out_every, label_confidence=config.data.label_confidence,
         seed=config.seed, published=points_alone,
     )  # fmt: skip
 
 
 def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tuple[int, int]:
     """Make the missing clips of all logs; returns how many there are to train on and to score."""
-    sources = [from_log.log_source(text) for text in config.scenes]
-    rows, counts = from_log.plan(sources, rules, from_city.HELD_OUT)
-    from_log.claim(folder, rules, sources)
+    sources = [from_log.log_source(text) for text in config.data.scenes]
+    rows = from_log.plan_shards(sources, rules, from_city.HELD_OUT)
+    from_log.claim_folder(folder, rules, sources)
     jobs: list[tuple[LogSource, LogClipRules, list[tuple[int, LogWindow]], Path]] = []
     for source in dict.fromkeys(sources):
-        windows = [(n, w) for n, of, w in rows if of == source]
+        windows = [(number, window) for number, owner, window in rows if owner == source]
         jobs.append((source, rules, windows, folder))
     with log.task("clips of logs", len(jobs)) as bar:
-        if config.workers < 2 or len(jobs) == 1:
+        if config.compute.workers < 2 or len(jobs) == 1:
             for job in jobs:
                 from_log.write_log(*job)
                 bar.advance()
         else:
-            context = multiprocessing.get_context("spawn")
-            with concurrent.futures.ProcessPoolExecutor(config.workers, mp_context=context) as pool:
-                for future in [pool.submit(from_log.write_log, *job) for job in jobs]:
-                    future.result()
-                    bar.advance()
-    return counts.train, counts.held_out
+            for _ in run_in_processes(from_log.write_log, jobs, config.compute.workers):
+                bar.advance()
+    scored = sum(window.held_out for _, _, window in rows)
+    return len(rows) - scored, scored
 
 
 def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) -> LearnConfig:
     """The configuration in terms of shards: clips of logs lie as those of cities do, one clip per shard."""
     if not scored:
         log.warn("learn: nothing is held out; scores are of a clip that was trained on")
-    return replace(
-        config, cities=train, first_cities=train, clips_per_city=1, width=rules.width, height=rules.height,
-        held_out=max(1, scored), watched=min(config.watched, max(1, scored)),
+    data = replace(
+        config.data, cities=train, first_cities=train, clips_per_city=1, width=rules.width, height=rules.height,
+        held_out=max(1, scored),
     )  # fmt: skip
+    return replace(config, data=data, score=replace(config.score, watched=min(config.score.watched, max(1, scored))))
 
 
 def scored_shards(config: LearnConfig) -> list[int]:
     """Numbers of the shards to score: the held-out ones, or the first one trained on where nothing was held out."""
-    return [0] if config.scenes and not config.held_out_every else held_out(config)
+    return [0] if config.data.scenes and not config.data.held_out_every else held_out(config)
 
 
-def data_words(config: LearnConfig, rules: LogClipRules | None) -> str:
-    """A sentence on the training data for the model card; empty for cities, which the card describes itself."""
-    if rules is None:
-        return ""
+def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
+    """A sentence on the training data for the model card."""
     given = "the projected points and the first image" if rules.published else "images taken at other times"
     return (
-        f"{config.cities} clips of {config.window} frames of {len(config.scenes)} recorded "
-        f"{'log' if len(config.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, looked at from where they were\n"
+        f"{config.data.cities} clips of {config.data.window} frames of {len(config.data.scenes)} recorded "
+        f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where they were\n"
         f"recorded, with {given} as condition. Depth was learned where a sweep measured it. The model this\n"
-        f"one continues from has training data of its own. `held-out` below means every {config.held_out_every}. window of these logs."
+        f"one continues from has training data of its own. `held-out` below means every {config.data.held_out_every}. window of these logs."
     )
 
 
-# a step's batch -------------------------------------------------------------------------------------------------------
+# a step's clips -------------------------------------------------------------------------------------------------------
 
 
-def draw_batch(
+def draw_clips(
     config: LearnConfig, folder: Path, step: int, count: int, frames: int, purpose: str, part: slice | None = None
-) -> Batch:
-    """The batch of a step: random shards, clips and runs of consecutive frames, varied (see `clip_shards.vary`).
+) -> list[Clip]:
+    """The clips of a step: random shards, clips and runs of consecutive frames, varied (see `clip_shards.vary`).
 
     What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of `count`, and not on which
-    `part` of that batch is asked for.
+    `part` of that batch is drawn here.
     """
     rng = seeds.numpy_rng(config.seed, step, purpose)
     picks = []
     for _ in range(count):
-        city = int(rng.integers(cities_at(config, step)))
+        city = int(rng.integers(cities_in_use(config, step)))
         await_shard(folder, city)
-        clip = int(rng.integers(clip_shards.clips_in(folder, city)))
-        start = int(rng.integers(config.window - frames + 1))
-        picks.append((city, clip, range(start, start + frames)))
+        number = int(rng.integers(clip_shards.clips_in(folder, city)))
+        start = int(rng.integers(config.data.window - frames + 1))
+        picks.append((city, number, range(start, start + frames)))
     clips = []
     for place in range(count)[part or slice(None)]:
-        batch = clip_shards.read_batch(folder, [picks[place]])
-        if batch.rgb.shape[-2:] != (config.height, config.width):
+        clip = clip_shards.read_clip(folder, *picks[place])
+        if clip.rgb.shape[-2:] != (config.data.height, config.data.width):
             raise InputError(
                 "training clips are of another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
-                expected=f"{config.width}x{config.height}", got=f"{batch.rgb.shape[-1]}x{batch.rgb.shape[-2]}",
-                remedy="give another --clips",
+                expected=f"{config.data.width}x{config.data.height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
+                remedy="give another --data.clips",
             )  # fmt: skip
-        own = seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}")
-        if config.augment:
-            batch = clip_shards.vary(batch, own)
-        if own.random() < config.reference_dropout:  # the sparse view itself stands in for the image
-            batch = replace(batch, reference=batch.color[:, 0])
-        clips.append(batch)
-    return clip_shards.joined(clips)
+        if config.data.augment:
+            clip = clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))
+        clips.append(clip)
+    return clips
 
 
 def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
@@ -219,11 +215,11 @@ def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
     counts = torch.zeros(256, dtype=torch.float64)
     for city in range(cities):
         await_shard(folder, city)
-        ids = clip_shards.read_batch(folder, [(city, 0, range(1))]).semantics
+        ids = clip_shards.read_clip(folder, city, 0, range(1)).semantics
         counts += torch.bincount(ids.flatten(), minlength=256)
-    if not bool(counts[: mdm.CLASSES].any()):  # logs without labels
-        return torch.ones(mdm.CLASSES)
-    share = counts[: mdm.CLASSES] / counts[: mdm.CLASSES].sum().clamp(min=1)
+    if not bool(counts[:CLASSES].any()):  # logs without labels
+        return torch.ones(CLASSES)
+    share = counts[:CLASSES] / counts[:CLASSES].sum().clamp(min=1)
     floor = max(float(share[share > 0].min()) if bool((share > 0).any()) else 1.0, 1e-3)
     weight = share.clamp(min=floor) ** -balance
     return (weight / (weight * share).sum().clamp(min=1e-9)).float()

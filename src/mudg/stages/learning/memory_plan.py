@@ -22,7 +22,7 @@ from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from mudg.models.published.clip import TEXT_TOKENS
-from mudg.models.published.model import PublishedConfig, PublishedMDM
+from mudg.models.published.model import PublishedConfig, PublishedMDM, WorkSplit
 
 RESERVE_BYTES = 1_000_000_000
 WIDEST_FUSED_HEAD = 256
@@ -30,25 +30,6 @@ MODALITIES = 3
 CUTS = ((True, True), (True, False), (False, True), (False, False))
 """(modalities together, guidance together), fastest first."""
 FRAMES_AT_ONCE = (16, 8, 4, 2, 1)
-
-
-@dataclass(frozen=True)
-class MemoryPlan:
-    """A way to cut the work, and what it takes, in bytes."""
-
-    modalities_together: bool
-    guidance_together: bool
-    frames_at_once: int
-    parameter_bytes: int
-    denoise_bytes: int
-    """Activations of the denoising network at their worst moment."""
-    autoencoder_bytes: int
-    """Activations of encoding or decoding, whichever is worse."""
-
-    @property
-    def peak_bytes(self) -> int:
-        """Parameters, the worst moment of all, and the reserve."""
-        return self.parameter_bytes + max(self.denoise_bytes, self.autoencoder_bytes) + RESERVE_BYTES
 
 
 class _Live(TorchDispatchMode):
@@ -159,12 +140,14 @@ def needs_of(config: PublishedConfig, bytes_per_value: int) -> Needs:
     return Needs(parameter_bytes(model), denoise_bytes(model, *size, 1), autoencoder_bytes(model, *size, 1))
 
 
-def choose(needs: Needs, budget_bytes: int, *, guidance: bool = True) -> MemoryPlan:
-    """The fastest way to cut the work of one clip that fits the budget, or the thriftiest if none does."""
+def choose(needs: Needs, budget_bytes: int, *, guidance: bool = True) -> tuple[WorkSplit, int]:
+    """The fastest way to cut the work of one clip that fits the budget, or the thriftiest if none does, and its peak in bytes.
+
+    The peak is parameters, the worst moment of all, and the reserve.
+    """
     room = budget_bytes - needs.parameters - RESERVE_BYTES
     batches = [(MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1) for cut in CUTS]
     chosen = next((n for n, batch in enumerate(batches) if needs.one_video * batch <= room), len(CUTS) - 1)
     frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= room), 1)
-    return MemoryPlan(
-        *CUTS[chosen], frames, needs.parameters, needs.one_video * batches[chosen], needs.one_frame * frames
-    )
+    activations = max(needs.one_video * batches[chosen], needs.one_frame * frames)
+    return WorkSplit(*CUTS[chosen], frames), needs.parameters + activations + RESERVE_BYTES

@@ -1,103 +1,46 @@
-"""What `learn` asks of a model, and the table of the models it can train.
+"""The models that `learn` can train, what is particular to each, and with which weights a training starts.
 
-The loop itself (draws, layouts, checkpoints, averages) knows nothing of a model but this: `loss` gives the loss of some
-clips of a batch, `trained_part` names the modules that change, `temporal_parameters` those that a later stage may freeze.
-A new kind of model is a class with these methods and a row in `KINDS`. The published-type one is in `learn_published`.
+The loop (draws, layouts, checkpoints, averages) uses three methods that both models have: `loss(clips, part, settings)`,
+also as `forward`; `trained_part()`, the modules that change; `temporal_parameters(which)`, those that a later stage may freeze.
+All else is a row of `KINDS`. A new kind of model is a class with these methods and a row here.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from mudg.base import seeds
+from mudg.base import log, seeds
 from mudg.base.errors import UsageError
-from mudg.models.mdm import model as mdm
-from mudg.models.mdm.model import MDM, Losses
+from mudg.models.mdm import files as mdm_files
+from mudg.models.mdm.model import MDM, MDMConfig, extended, same_denoiser
+from mudg.models.published.files import is_published
 from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import published as learn_published
 from mudg.stages.learning import score as learn_score
-from mudg.stages.learning.published import Objective, Part
 
 Model = MDM | PublishedMDM
 
 
-class Trainable(Protocol):
-    """The methods of a model that the training loop uses; `MDM` and `PublishedMDM` have them."""
-
-    def trained_part(self) -> nn.ModuleDict:
-        """The modules that training changes, by the names of the attributes that hold them."""
-        ...
-
-    def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
-        """Names in `trained_part` of the parameters that mix frames."""
-        ...
-
-    def loss(self, truth: Any, encoded: Any, generator: torch.Generator, *, first: int, whole: int) -> Losses:
-        """Loss of clips `first` and following of a batch of `whole` clips.
-
-        The generator is in the same state for every part of the batch. Draws are made for the whole batch, or for each clip
-        from a seed of its own, and the loss is a mean over clips: then it does not matter how the batch is divided. The
-        terms have the same names for every part.
-        """
-        ...
-
-
 @dataclass(frozen=True)
-class Kind:
-    """How one class of models is trained and saved.
+class ModelKind:
+    """How one class of models is saved, described and rebuilt.
 
-    loss    (objective, model, settings, part, class weights f32[19]) -> losses; encodes the clips and calls `objective`, which
-            stands for `model.loss`
     save    (model, folder, card, facts)
-    card    (model, settings, scores, words on the training data) -> text of the model card
+    card    (model, settings, scores, sentence on the training data) -> text of the model card
     rebuilt (model, weights of its trained part) -> a model with these, ready for use
-    drops_reference  the model's own loss leaves references out: clips come with theirs
-    points_alone     the condition is the published system's: points, and 0 where nothing was seen
     """
 
-    loss: Callable[[Objective, Any, LearnConfig, Part, Tensor], Losses]
     save: Callable[[Any, Path, str, Mapping[str, Any]], None]
     card: Callable[[Any, LearnConfig, Mapping[str, Any], str], str]
     rebuilt: Callable[[Any, Mapping[str, Tensor]], Any]
-    drops_reference: bool = False
-    points_alone: bool = False
-
-
-def mdm_loss(objective: Objective, model: MDM, config: LearnConfig, part: Part, weights: Tensor) -> Losses:
-    """Loss of the small model: denoiser on whole frames, refiner on a rectangle of them."""
-    batch, known = part.batch, part.batch.depth_known
-    with torch.no_grad():
-        truth = model.encode_truth(batch.rgb, batch.depth, batch.semantics)
-        encoded = model.encode_planes(batch.color, batch.sparse_depth, batch.valid, batch.warped, batch.backdrop,
-                                      batch.reference, batch.ids, batch.backdrop_ids)  # fmt: skip
-        cells = functional.avg_pool2d(known.float().flatten(0, 1), model.codec.factor).unflatten(0, known.shape[:2])
-        pixels = model.pixel_truth(batch.rgb, batch.depth, batch.semantics, known)
-        shares = mdm.truth_shares(batch.semantics)
-    return objective(
-        truth, encoded, seeds.torch_generator(config.seed, part.step, "noise"), shares=shares, class_weights=weights,
-        depth_known=cells, pixels=pixels, window=refined_window(config, model, part.step), first=part.first,
-        whole=part.count,
-    )  # fmt: skip
-
-
-def refined_window(config: LearnConfig, model: MDM, step: int) -> tuple[slice, slice]:
-    """Rectangle of latent cells on which the refiner is trained at `step`: a share of each side, anywhere."""
-    rng = seeds.numpy_rng(config.seed, step, "refined window")
-    spans = []
-    for side in (config.height, config.width):
-        cells = side // model.codec.factor
-        size = min(cells, max(8, round(cells * config.refined_share / 8) * 8))
-        start = 2 * int(rng.integers((cells - size) // 2 + 1))
-        spans.append(slice(start, start + size))
-    return spans[0], spans[1]
 
 
 def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
@@ -108,18 +51,103 @@ def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
     return made.eval()
 
 
-KINDS: dict[type[nn.Module], Kind] = {
-    MDM: Kind(mdm_loss, mdm.save, learn_score.model_card, mdm_rebuilt),
-    PublishedMDM: Kind(
-        learn_published.loss, learn_published.save, learn_published.card, learn_published.rebuilt, drops_reference=True,
-        points_alone=True,
-    ),
-}  # fmt: skip
+KINDS: dict[type[nn.Module], ModelKind] = {
+    MDM: ModelKind(mdm_files.save, learn_score.model_card, mdm_rebuilt),
+    PublishedMDM: ModelKind(learn_published.save, learn_published.card, learn_published.rebuilt),
+}
 
 
-def kind_of(model: nn.Module) -> Kind:
+def kind_of(model: nn.Module) -> ModelKind:
     """The row of a model; UsageError if it cannot be trained."""
     if type(model) not in KINDS:
         raise UsageError("this kind of model cannot be trained here", got=type(model).__name__,
                          expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
     return KINDS[type(model)]
+
+
+# start ----------------------------------------------------------------------------------------------------------------
+
+
+def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
+    """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
+
+    With `start` the network is that of the earlier model, extended by a refiner where the settings ask for one. If the settings do
+    not describe that network but are the defaults, it is taken as it is. Clips may be of another size and length than before.
+
+    Raises:
+        UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
+    """
+    wanted = model_config(config)
+    if not config.start:
+        return MDM(wanted), {"codec", "refiner"}
+    if is_published(config.start):
+        if not _network_is_default(config):
+            raise UsageError("the network of a published-type model cannot be described", where="--start",
+                             remedy="leave out widths, blocks, attention, patch and refiner")  # fmt: skip
+        return learn_published.starting(config), set()
+    before = mdm_files.load(config.start)
+    if before.config.window != config.data.window:
+        log.info(f"learn: clips of {config.data.window} frames; the model to continue from had {before.config.window}")
+    now = {"window": config.data.window, "area_px": wanted.area_px}
+    resized = MDM(replace(before.config, **now))
+    resized.load_state_dict(before.state_dict())
+    if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
+        log.info("learn: the network is that of the model to continue from")
+        wanted = resized.config
+    if wanted == resized.config:
+        return resized, set()
+    grows_refiner = bool(wanted.refine_widths) and before.refiner is None
+    return extended(resized, wanted), {"refiner"} if grows_refiner else set()
+
+
+def _network_is_default(config: LearnConfig) -> bool:
+    """Whether the settings leave the network as it is by default."""
+    default = LearnConfig(data=config.data)
+    return model_config(config) == model_config(default)
+
+
+def model_config(config: LearnConfig) -> MDMConfig:
+    """The network that a learn configuration asks for."""
+    shape = asdict(config.network)
+    shape["refine_blocks"] = shape["refine_blocks"] if shape["refine_widths"] else ()
+    return MDMConfig(**shape, window=config.data.window, area_px=config.data.width * config.data.height)
+
+
+def freeze(model: Model, what: str) -> int:
+    """Let a part of the network keep its weights (see `LearnConfig.frozen`); returns the number of parameters it has.
+
+    Raises:
+        UsageError: nothing would be frozen: the network has no such layers.
+    """
+    if what == "nothing":
+        return 0
+    if what == "denoiser":
+        names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
+        if not isinstance(model, MDM) or model.refiner is None:
+            raise UsageError("without a refiner nothing would be left to train", where="--frozen", got=what)
+    else:
+        names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
+    count = 0
+    for name, parameter in model.trained_part().named_parameters():
+        if name in names:
+            parameter.requires_grad_(False)
+            count += parameter.numel()
+    if not count:
+        raise UsageError(
+            "there is nothing to freeze", where="--frozen", got=what, expected="a network with such layers"
+        )
+    log.info(f"learn: {what.replace('_', ' ')} keep their weights ({count:,} parameters)")
+    return count
+
+
+def draw_weights(net: nn.Module, seed: int, purpose: str) -> None:
+    """Draw all weights that are not zero at the start from the run's seed (the constructor's own draw is not used)."""
+    generator = seeds.torch_generator(seed, 0, purpose)
+    with torch.no_grad():
+        for name, value in net.named_parameters():
+            if value.ndim >= 2 and bool(value.any()):
+                fan_in = math.prod(value.shape[1:])
+                gain = 2.0 if "conv1" in name else 1.0
+                value.copy_(torch.randn(value.shape, generator=generator) * math.sqrt(gain / fan_in))
+            elif value.ndim == 1 and name.endswith("bias"):
+                value.zero_()

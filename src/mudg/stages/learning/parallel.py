@@ -17,10 +17,7 @@ import functools
 import json
 import math
 import os
-import signal
-import threading
 import time
-import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -30,11 +27,14 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as recomputed
 
-from mudg.base import errors, log
+from mudg.base import log
 from mudg.base.errors import MudgError, NumericsError, ResourceError, UsageError
+from mudg.base.processes import error_from_record, error_record
 
 PATIENCE = datetime.timedelta(hours=6)
 """How long processes wait for each other: as long as the leader may need to make clips or to score."""
+SAME_SIGNAL_S = 2.0
+"""The terminal sends Ctrl-C to all processes, and launchers pass it on: within this time a second one is the same one."""
 PARTING_S = 0.5
 """Rest after the last message. Threads of gloo let go of its tensors a moment later, and need the interpreter for that; one that comes
 when the interpreter is already shutting down aborts the process, after all the work is done and saved."""
@@ -43,7 +43,7 @@ Layout = Literal["ddp", "fsdp"]
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among its like: number `rank` of `size`, computing on `device`."""
+    """This process among those of the run: number `rank` of `size`, computing on `device`."""
 
     rank: int
     size: int
@@ -66,7 +66,7 @@ class Ranks:
         dist.all_reduce(kept)
         return kept.tolist()
 
-    def told(self, value: Any) -> Any:
+    def broadcast(self, value: Any) -> Any:
         """The leader's `value` (anything JSON can say), in every process."""
         if self.size == 1:
             return value
@@ -91,13 +91,11 @@ class Ranks:
             try:
                 answer = {"value": work()}
             except MudgError as error:
-                fields = (error.what, error.where, error.expected, error.got, error.remedy)
-                self.told({"error": type(error).__name__, "fields": fields})
+                self.broadcast({"failed": error_record(error)})
                 raise
-        answer = self.told(answer)
-        if "error" in answer:
-            what, where, expected, got, remedy = answer["fields"]
-            raise _ERRORS.get(answer["error"], MudgError)(what, where=where, expected=expected, got=got, remedy=remedy)
+        answer = self.broadcast(answer)
+        if "failed" in answer:
+            raise error_from_record(answer["failed"])
         return answer["value"]
 
     def all_do(self, work: Callable[[], None]) -> None:
@@ -127,33 +125,26 @@ class Ranks:
         size, rest = divmod(clips, self.size * parts)
         if rest or not size:
             raise UsageError(
-                "a step's clips cannot be divided evenly", where="--batch-frames, --accumulate",
+                "a step's clips cannot be divided evenly", where="--optimizer.batch-frames, --compute.accumulate",
                 expected=f"a multiple of {self.size} processes x {parts} portions", got=f"{clips} clips",
-                remedy="make --batch-frames a multiple of window x processes x accumulate",
+                remedy="make --optimizer.batch-frames a multiple of window x processes x accumulate",
             )  # fmt: skip
         first = self.rank * parts * size
         return [slice(first + n * size, first + (n + 1) * size) for n in range(parts)]
 
 
-_ERRORS: dict[str, type[MudgError]] = {
-    kind.__name__: kind
-    for kind in vars(errors).values()
-    if isinstance(kind, type) and issubclass(kind, MudgError)
-}  # fmt: skip
-
-
 @contextlib.contextmanager
-def joined(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
+def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
     """This process's place among those that `torchrun` started; alone if it was not started by it.
 
     A process group that exists already is used and left open. Only the leader's messages are shown.
 
     Raises:
-        ResourceError: a CUDA device is asked for and there is none.
+        ResourceError: `device` is cuda and there is none.
         UsageError: the launcher's variables are not numbers.
     """
     if device == "cuda" and not torch.cuda.is_available():
-        raise ResourceError("no CUDA device here", where="--device cuda", remedy="leave the flag out")
+        raise ResourceError("no CUDA device here", where="--compute.device cuda", remedy="leave the flag out")
     if dist.is_available() and dist.is_initialized():
         yield _place(dist.get_rank(), dist.get_world_size(), device)
         return
@@ -189,28 +180,16 @@ def _place(rank: int, size: int, device: str) -> Ranks:
 # the network over the processes ---------------------------------------------------------------------------------------
 
 
-class Objective(nn.Module):
-    """A model's loss as a module's forward, which is what gradient synchronisation hangs on."""
-
-    def __init__(self, model: nn.Module) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, *args: Any, **options: Any) -> Any:
-        """Whatever the model's `loss` takes and returns."""
-        return self.model.loss(*args, **options)  # type: ignore[operator]
-
-
 class Spread:
-    """A model in one of the layouts: call it as `model.loss`, in `portion` for each portion of a step."""
+    """A model in one of the layouts: call `network` as the model itself, in `portion` for each portion of a step."""
 
     def __init__(self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout) -> None:
-        self._objective: nn.Module = Objective(model)
+        self.network = model
         self._sharded: list[nn.Module] = []
         if ranks.size == 1:
             return
         if layout == "ddp":
-            self._objective = nn.parallel.DistributedDataParallel(self._objective, broadcast_buffers=False)
+            self.network = nn.parallel.DistributedDataParallel(model, broadcast_buffers=False)
             return
         from torch.distributed.device_mesh import init_device_mesh
         from torch.distributed.fsdp import fully_shard
@@ -223,17 +202,13 @@ class Spread:
             fully_shard(part, mesh=mesh)
             self._sharded.append(part)
 
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        """`model.loss` of the arguments."""
-        return self._objective(*args, **options)
-
     @contextlib.contextmanager
     def portion(self, last: bool) -> Iterator[None]:
         """Around loss and backward of one portion: gradients are exchanged after the last one only."""
         for part in self._sharded:
             part.set_requires_gradient_sync(last)  # type: ignore[operator]
-        holds = isinstance(self._objective, nn.parallel.DistributedDataParallel) and not last
-        with self._objective.no_sync() if holds else contextlib.nullcontext():  # type: ignore[operator]
+        holds = isinstance(self.network, nn.parallel.DistributedDataParallel) and not last
+        with self.network.no_sync() if holds else contextlib.nullcontext():  # type: ignore[operator]
             yield
 
 
@@ -270,12 +245,8 @@ def _stored_plainly(part: nn.Module) -> None:
             value.data = value.data.contiguous()
 
 
-def local(value: Tensor) -> Tensor:
-    """This process's piece of a sharded tensor; any other tensor as it is. Shares memory."""
-    return value.to_local() if _is_sharded(value) else value  # type: ignore[attr-defined]
-
-
-def _is_sharded(value: Tensor) -> bool:
+def is_sharded(value: Tensor) -> bool:
+    """Whether this process holds a piece of the tensor only."""
     if not dist.is_available() or not dist.is_initialized():
         return False
     from torch.distributed.tensor import DTensor
@@ -283,18 +254,20 @@ def _is_sharded(value: Tensor) -> bool:
     return isinstance(value, DTensor)
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Which rows of a whole tensor a piece holds: `start` to `start + len(piece)` of `shape`."""
-
-    shape: tuple[int, ...]
-    start: int
+def local(value: Tensor) -> Tensor:
+    """This process's piece of a sharded tensor; any other tensor as it is. Shares memory."""
+    return value.to_local() if is_sharded(value) else value  # type: ignore[attr-defined]
 
 
-def rows_of(value: Tensor) -> Rows:
-    """The rows that this process holds of `value`."""
-    if not _is_sharded(value):
-        return Rows(tuple(value.shape), 0)
+def gathered(value: Tensor) -> Tensor:
+    """The whole of a tensor, sharded or not, on the CPU of every process. All processes must call this together."""
+    return (value.full_tensor() if is_sharded(value) else value).detach().cpu()  # type: ignore[attr-defined]
+
+
+def first_row(value: Tensor) -> int:
+    """Which row of the whole tensor `local(value)` begins with."""
+    if not is_sharded(value):
+        return 0
     from torch.distributed.tensor.placement_types import Shard
 
     (placement,) = value.placements  # type: ignore[attr-defined]
@@ -303,76 +276,22 @@ def rows_of(value: Tensor) -> Rows:
             "a tensor is cut in a way that checkpoints do not know", expected="Shard(0)", got=str(placement)
         )
     per_rank = -(-value.shape[0] // value.device_mesh.size())  # type: ignore[attr-defined]
-    start = min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]
-    return Rows(tuple(value.shape), start)
-
-
-def whole(piece: Tensor, like: Tensor) -> Tensor:
-    """The whole tensor on the CPU, in every process, of which `piece` is this process's part, cut as `like` is."""
-    if not _is_sharded(like):
-        return piece.detach().cpu()
-    from torch.distributed.tensor import DTensor
-
-    mesh, cut = like.device_mesh, like.placements  # type: ignore[attr-defined]
-    shape, stride = like.shape, like.stride()
-    return DTensor.from_local(piece, mesh, cut, run_check=False, shape=shape, stride=stride).full_tensor().cpu()
+    return min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]
 
 
 def clip_gradients(part: nn.Module, limit: float) -> float:
     """Norm of all gradients over all processes; they are scaled down to `limit` if that is not 0."""
     norm = torch.nn.utils.clip_grad_norm_(part.parameters(), limit or float("inf"))
-    return float(norm.full_tensor() if _is_sharded(norm) else norm)  # type: ignore[attr-defined]
+    return float(gathered(norm))
 
 
 # a step's end ---------------------------------------------------------------------------------------------------------
 
 
-class Interruption:
-    """Ctrl-C and SIGTERM wait for the end of the step, so that a checkpoint can be written; a second one does not wait.
-
-    Launchers pass on a signal that the terminal has sent already: a repetition within two seconds is the same one.
-    """
-
-    def __init__(self) -> None:
-        self._number = 0
-        self._since = 0.0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Interruption:
-        if threading.current_thread() is threading.main_thread():
-            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, before in self._before.items():
-            signal.signal(number, before)
-        self._before = {}
-
-    def _note(self, number: int, frame: types.FrameType | None) -> None:
-        now = time.monotonic()
-        if self._number and now - self._since > 2.0:
-            self.end(number, frame)
-        if not self._number:
-            self._number, self._since = number, now
-            log.info("stopping after this step; once more to stop at once")
-
-    @property
-    def asked(self) -> bool:
-        """Whether this process was asked to stop."""
-        return self._number != 0
-
-    def end(self, number: int = 0, frame: types.FrameType | None = None) -> None:
-        """Do what the signal would have done at once: raise KeyboardInterrupt, or what the program has set."""
-        before = self._before.get(number or self._number)
-        if callable(before):
-            before(number or self._number, frame)
-        raise KeyboardInterrupt
-
-
-def agreed(
+def agreed_terms(
     ranks: Ranks, terms: Mapping[str, float], portions: int, step: int, what: str, *, stop: bool = False
 ) -> tuple[dict[str, float], bool]:
-    """Mean of the loss terms over processes and portions, and whether anyone was asked to stop.
+    """Mean of the loss terms over processes and portions, and whether any process is to stop.
 
     Raises:
         NumericsError: in every process, if a term is not finite in any; names the terms, the step and the processes.

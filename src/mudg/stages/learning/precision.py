@@ -20,6 +20,8 @@ def choose_bf16(precision: Precision) -> bool:
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()
     has_tiles = bool(capabilities.get("amx_bf16", False))
     bf16 = has_tiles if precision == "auto" else precision == "bfloat16"
-    reason = f"asked for {precision}" if precision != "auto" else ("the CPU has" if has_tiles else "the CPU lacks") + " AMX"
+    reason = (
+        f"asked for {precision}" if precision != "auto" else ("the CPU has" if has_tiles else "the CPU lacks") + " AMX"
+    )
     log.info_once(f"diffusion model: {'bfloat16' if bf16 else 'float32'} ({reason})")
     return bf16

@@ -1,42 +1,25 @@
-"""Training the published-type model with `learn`: where it starts, its loss, and the folder it is written to.
+"""Training the published-type model with `learn`: where it starts, and the folder it is written to.
 
 Everything else (clips, layouts, checkpoints, averages) is as for the small model. What differs is listed in its row of
-`learn_models.KINDS`: clips show points alone, as the published network was trained, and the reference image is left out by
+`models.KINDS`: clips show points alone, as the published network was trained, and the reference image is left out by
 the model's own loss.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from mudg.base import palette, seeds
-from mudg.base.errors import InputError, UsageError
-from mudg.data.clips.shards import Batch
-from mudg.models.mdm.codec import MODALITIES, Modality
-from mudg.models.mdm.model import Losses
-from mudg.models.published.model import ContextDropout, Encoded, PublishedMDM, Sampling
+from mudg.base.errors import UsageError
+from mudg.models.published import files as published_files
+from mudg.models.published.model import PublishedMDM, WorkSplit
 from mudg.stages.config import LearnConfig
-from mudg.stages.learning import published_model
 from mudg.stages.learning import score as learn_score
-
-Objective = Callable[..., Losses]
-
-
-@dataclass(frozen=True)
-class Part:
-    """Some clips of a step's batch: `batch` holds clips `first` and following of `count`."""
-
-    batch: Batch
-    step: int
-    first: int
-    count: int
 
 
 def starting(config: LearnConfig) -> PublishedMDM:
@@ -46,71 +29,22 @@ def starting(config: LearnConfig) -> PublishedMDM:
         UsageError: clips of another length than the image tokens are made for, or of a size that does not fit the strides; a
             setting that does not apply to this model.
     """
-    model = published_model.read(Path(config.start), dtype=torch.float32)
+    model = published_files.load(Path(config.start), dtype=torch.float32)
     frames = model.config.window
-    if config.window != frames or config.full_window_share < 1:
+    if config.data.window != frames or config.optimizer.full_window_share < 1:
         raise UsageError(
             "a published-type model is trained on clips of exactly the length that its image tokens are made for",
-            where="--window, --full-window-share", expected=f"{frames} frames in all steps",
-            got=f"{config.window} frames in {config.full_window_share:.0%} of the steps",
-            remedy=f"--window {frames} --full-window-share 1",
+            where="--data.window, --optimizer.full-window-share", expected=f"{frames} frames in all steps",
+            got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
+            remedy=f"--data.window {frames} --optimizer.full-window-share 1",
         )  # fmt: skip
-    model.check_size(config.height, config.width)
-    if config.cache_latents and model.config.codec.posterior == "sample":
-        raise UsageError("latents of this model are drawn anew at every step, so they cannot be kept",
-                         where="--cache-latents", remedy="leave the flag out")  # fmt: skip
+    model.check_size(config.data.height, config.data.width)
     with torch.no_grad():  # out of the mapped files: training writes in place
         for value in (*model.parameters(), *model.buffers()):
             value.data = value.data.clone()
-    model.config = replace(model.config, width=config.width, height=config.height)
-    model.sampling = replace(Sampling(), frames_at_once=1)
+    model.config = replace(model.config, width=config.data.width, height=config.data.height)
+    model.split = WorkSplit(frames_at_once=1)
     return model
-
-
-def loss(objective: Objective, model: PublishedMDM, config: LearnConfig, part: Part, weights: Tensor) -> Losses:
-    """Loss of some clips of a step; `weights` of classes have no part in it (classes are learned as colours).
-
-    The autoencoder's posterior is drawn clip by clip from seeds of their own.
-
-    Raises:
-        InputError: the clips' condition is not the published one.
-    """
-    del weights
-    batch = part.batch
-    if bool(batch.warped.any()):
-        raise InputError(
-            "the training clips show warped images in their condition", where=f"--clips, step {part.step}",
-            expected="points alone, as the published-type model is given", remedy="give another --clips; they are made anew",
-        )  # fmt: skip
-    encoded, truths = [], []
-    with torch.no_grad():
-        for n in range(len(batch.rgb)):
-            one, draws = (
-                slice(n, n + 1),
-                seeds.torch_generator(config.seed, part.step, f"posterior, clip {part.first + n}"),
-            )
-            given = (batch.color[one], batch.sparse_depth[one], batch.valid[one], batch.reference[one])
-            encoded.append(model.encode_planes(*given, draws))
-            truths.append(model.encode_truth(batch.rgb[one], batch.depth[one], batch.semantics[one], draws))
-        whole: dict[Modality, Tensor] = {m: torch.cat([truth[m] for truth in truths]) for m in MODALITIES}
-        known: dict[Modality, Tensor] = {
-            "depth": _cells(batch.depth_known, model.codec.factor),
-            "semantics": _cells((batch.semantics != palette.UNLABELLED).unsqueeze(2), model.codec.factor),
-        }
-    return objective(
-        whole, _joined(encoded), seeds.torch_generator(config.seed, part.step, "noise"),
-        dropout=ContextDropout.of(config.reference_dropout), known=known, first=part.first, whole=part.count,
-    )  # fmt: skip
-
-
-def _cells(mask: Tensor, factor: int) -> Tensor:
-    """Share f32[B,T,1,h,w] of each latent cell in which bool[B,T,1,H,W] is set."""
-    return functional.avg_pool2d(mask.float().flatten(0, 1), factor).unflatten(0, mask.shape[:2])
-
-
-def _joined(clips: list[Encoded]) -> Encoded:
-    planes, features, seen = (torch.cat([getattr(c, name) for c in clips]) for name in ("planes", "features", "seen"))
-    return Encoded(planes, features, clips[0].grey, seen)
 
 
 def rebuilt(model: PublishedMDM, weights: Mapping[str, Tensor]) -> PublishedMDM:
@@ -123,7 +57,7 @@ def rebuilt(model: PublishedMDM, weights: Mapping[str, Tensor]) -> PublishedMDM:
     made.load_state_dict({**fixed, **trained}, assign=True)
     made.requires_grad_(False)
     made.adopt_scale()
-    made.sampling = model.sampling
+    made.split = model.split
     return made.eval()
 
 
@@ -136,26 +70,27 @@ def save(model: PublishedMDM, folder: Path, text: str, facts: Mapping[str, Any])
     handed_on = {name: before[name] for name in ("licence", "caption", "base_scale") if name in before}
     licence = f"\n## Licence\n\n{handed_on['licence']}\n" if "licence" in handed_on else ""
     tensors = {name: value.cpu() for name, value in model.state_dict().items()}
-    published_model.write(folder, model.config, tensors, {**facts, **handed_on}, text + licence)
+    published_files.save(folder, model.config, tensors, {**facts, **handed_on}, text + licence)
 
 
 def card(model: PublishedMDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
     """Text of the model card; `data` says what it was trained on (empty = generated cities)."""
+    clips, rules = config.data, config.optimizer
     data = data or (
-        f"generated cities (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of\n"
-        f"{config.window} frames each, most of them beside the recorded path."
+        f"generated cities (numbers 0 to {clips.cities - 1} of run seed {config.seed}), {clips.clips_per_city} clips of\n"
+        f"{clips.window} frames each, most of them beside the recorded path."
     )
     frozen = "all layers" if config.frozen == "nothing" else f"all layers but the {config.frozen.replace('_', ' ')}"
     return f"""# Published-type multi-modal diffusion model, trained further
 
 Continued from {config.start}, which has training data of its own. {model.config.window} frames at
-{config.width}x{config.height} pixels.
+{clips.width}x{clips.height} pixels.
 
 **Training data**: {data}
 
 **Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`: {config.steps} steps of
-{config.batch_frames // config.window} clips, {frozen} of the denoising network and the image-token resampler, AdamW, rate
-{config.lr:g}, moving average {config.average_decay}, v prediction, reference left out in {config.reference_dropout:.0%} of the clips.
+{rules.batch_frames // clips.window} clips, {frozen} of the denoising network and the image-token resampler, AdamW, rate
+{rules.lr:g}, moving average {rules.average_decay}, v prediction, reference left out in {clips.reference_dropout:.0%} of the clips.
 
 **Held-out score** ({scores["clips"]} clips, {scores["steps"]} denoising steps):
 

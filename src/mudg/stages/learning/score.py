@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from torch import Tensor
 
 from mudg.base import palette, store
-from mudg.base.types import Camera, Condition, View
+from mudg.base.types import Clip
 from mudg.core import metrics
 from mudg.core.flicker import flicker
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.shards import Batch
-from mudg.models.mdm.model import MDM, Sample
+from mudg.models.diffusion import GeneratedClip, SampleRequest
+from mudg.models.mdm.model import MDM
 from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import LearnConfig
 
@@ -40,95 +40,70 @@ def score(
     model: MDM | PublishedMDM,
     cities: Sequence[int],
     folder: Path,
+    request: SampleRequest,
     *,
-    steps: int,
-    seed: int,
-    bf16: bool,
-    eta: float = 1.0,
-    sampler: str = "ddim",
-    prepare: Callable[[Batch], Batch] | None = None,
+    prepare: Callable[[Clip], Clip] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
 
-    `prepare` changes each batch of one clip before it is used, for example `without_classes`.
+    Args:
+        request: how clips are sampled; the index is put in for each.
+        prepare: changes each clip before it is used, for example `without_classes`.
 
-    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": steps}. Keys as in
+    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}. Keys as in
     `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
     """
     rows: dict[str, list[dict[str, float]]] = {}
     counts: dict[str, Tensor] = {}
-    shown: list[tuple[Batch, Sample]] = []
+    pairs: list[tuple[Clip, GeneratedClip]] = []
     for city in cities:
-        for clip in range(clip_shards.clips_in(folder, city)):
+        for number in range(clip_shards.clips_in(folder, city)):
             frames = range(model.config.window)
-            batch = clip_shards.read_batch(folder, [(city, clip, frames)])
-            batch = batch if prepare is None else prepare(batch)
-            sample = model.sample(
-                condition_of(batch), steps=steps, seed=seed, index=city * 16 + clip, sampler=sampler, eta=eta, bf16=bf16
-            )
-            shift = batch.shift_m[0]
-            name = "recorded" if shift == 0 else f"{abs(shift):.0f} m"
-            row, matrix = score_clip(batch, sample)
+            clip = clip_shards.read_clip(folder, city, number, frames)
+            clip = clip if prepare is None else prepare(clip)
+            sample = model.sample(clip.condition, replace(request, index=city * 16 + number))
+            name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
+            row, matrix = score_clip(clip, sample)
             rows.setdefault(name, []).append(row)
             counts[name] = counts.get(name, torch.zeros_like(matrix)) + matrix
-            if len(shown) < 6 and (shift != 0 or clip == 0):
-                shown.append((batch, sample))
-    if picture is not None and shown:
-        save_grid(picture, shown)
+            if len(pairs) < 6 and (clip.shift_m != 0 or number == 0):
+                pairs.append((clip, sample))
+    if picture is not None and pairs:
+        save_grid(picture, pairs)
     by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
     shifted = [n for n in rows if n != "recorded"] or list(rows)
     pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))  # type: ignore[arg-type]
-    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": steps}
+    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": request.steps}
 
 
-def without_classes(batch: Batch) -> Batch:
-    """The batch as of a log without labels: no class comes with the condition."""
-    unknown = torch.full_like(batch.ids, palette.UNLABELLED)
-    return dataclasses.replace(batch, ids=unknown, backdrop_ids=unknown)
+def without_classes(clip: Clip) -> Clip:
+    """The clip as of a log without labels: no class comes with the condition."""
+    return replace(clip, condition=replace(clip.condition, semantics=None, backdrop_semantics=None))
 
 
-def condition_of(batch: Batch, index: int = 0) -> Condition:
-    """The condition of one clip of a batch; its views are stand-ins (the model does not read poses)."""
-    frames, _, height, width = batch.color.shape[1:]
-    camera = Camera("clip", width, height, float(width), float(width), width / 2, height / 2)
-    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
-    return Condition(
-        views,
-        batch.color[index],
-        batch.sparse_depth[index],
-        batch.valid[index],
-        batch.reference[index],
-        batch.warped[index],
-        batch.backdrop[index],
-        batch.ids[index],
-        batch.backdrop_ids[index],
-    )
-
-
-def score_clip(batch: Batch, sample: Sample) -> tuple[dict[str, float], Tensor]:
-    """Scores of one clip (batch of one) and its class confusion i64[19,20]."""
-    rgb, depth, ids = batch.rgb[0], batch.depth[0], batch.semantics[0]
-    depth = torch.where(
-        batch.depth_known[0], depth, torch.full_like(depth, clip_shards.FAR_M)
-    )  # far depth does not count
-    if sample.rgb is None or sample.depth is None or sample.semantics is None:
-        raise ValueError("scoring needs all three modalities")
-    seen = batch.valid[0] | batch.warped[0]
+def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
+    """Scores of one clip and its class confusion i64[19,20]."""
+    rgb, ids, given, points = clip.rgb, clip.semantics, clip.condition, clip.point_color
+    depth = torch.where(clip.depth_valid, clip.depth, clip_shards.FAR_M)  # far depth does not count
+    seen = given.valid if given.warped is None else given.valid | given.warped
+    backdrop = given.color if given.backdrop is None else given.backdrop
+    poses = torch.from_numpy(np.stack([view.world_from_cam for view in given.views]))
+    cameras = [view.camera for view in given.views]
+    lens = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
-    nearest = metrics.depth_errors(flat(batch.sparse_depth[0]), flat(depth), flat(solid))
+    nearest = metrics.depth_errors(flat(given.depth), flat(depth), flat(solid))
     matrix = metrics.confusion(sample.semantics.flatten(0, 1), ids.flatten(0, 1))
     sky = (ids == SKY).unsqueeze(1)
     wrong = (sample.rgb - rgb).abs().mean(1, keepdim=True)
-    points = None if batch.point_color is None else batch.point_color[0]
-    one_image = rgb if points is None else torch.where(batch.valid[0], points, batch.backdrop[0])
+    one_image = rgb if points is None else torch.where(given.valid, points, backdrop)
     row = {
         "psnr": metrics.psnr(flat(sample.rgb), flat(rgb)),
         "psnr_seen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(seen)),
         "psnr_unseen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(~seen)),
-        "psnr_condition": metrics.psnr(flat(batch.color[0]), flat(rgb)),
+        "psnr_condition": metrics.psnr(flat(given.color), flat(rgb)),
         "psnr_points": math.nan if points is None else metrics.psnr(flat(points), flat(rgb)),
         "psnr_reference": math.nan if points is None else metrics.psnr(flat(one_image), flat(rgb)),
         "ssim": float(np.mean([metrics.ssim(a, b) for a, b in zip(sample.rgb, rgb)])),
@@ -137,7 +112,7 @@ def score_clip(batch: Batch, sample: Sample) -> tuple[dict[str, float], Tensor]:
         "delta1": error.delta1,
         "abs_rel_nearest": nearest.abs_rel,
         "delta1_nearest": nearest.delta1,
-        "flicker": flicker(sample.rgb, rgb, depth, ids, batch.world_from_cam[0], batch.intrinsics[0]),
+        "flicker": flicker(sample.rgb, rgb, depth, ids, poses, lens),
         "sky_near": float((sample.depth[sky] < 80).float().mean()) if bool(sky.any()) else math.nan,
         "edges_agree": edges_agree(sample.depth, sample.semantics),
         "confidence_gap": _auc(sample.confidence.flatten(), wrong.flatten()),
@@ -199,44 +174,18 @@ def table(scores: Mapping[str, Any]) -> str:
 # pictures -------------------------------------------------------------------------------------------------------------
 
 
-def depth_image(depth: Tensor, far_m: float = 100.0) -> NDArray[np.uint8]:
-    """Depth f32[1,H,W] metres as a grey-free picture u8[H,W,3]: near red, far blue, logarithmic."""
-    d = depth[0].clamp(2.0, far_m).numpy()
-    share = np.log(d / 2.0) / np.log(far_m / 2.0)
-    anchors = np.array(
-        [[122, 4, 3], [230, 90, 14], [225, 220, 55], [72, 230, 120], [40, 130, 235], [48, 18, 59]], float
-    )
-    x = share * (len(anchors) - 1)
-    low = np.clip(x.astype(int), 0, len(anchors) - 2)
-    f = (x - low)[..., None]
-    return (anchors[low] * (1 - f) + anchors[low + 1] * f).astype(np.uint8)
-
-
-def class_image(ids: Tensor) -> NDArray[np.uint8]:
-    """Class ids i64[H,W] in display colours u8[H,W,3]."""
-    return palette.encode(ids.numpy(), palette.DISPLAY_COLORS)
-
-
-def rgb_image(rgb: Tensor) -> NDArray[np.uint8]:
-    """Colour f32[3,H,W] in [0,1] as u8[H,W,3]."""
-    return (rgb.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-
-
-def save_grid(path: Path, shown: Sequence[tuple[Batch, Sample]], frame: int = 4) -> None:
+def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
     """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes; confidence."""
     rows = []
-    for batch, sample in shown:
+    for clip, sample in pairs:
         t = min(frame, len(sample.confidence) - 1)
-        if sample.rgb is None or sample.depth is None or sample.semantics is None:
-            continue
-        measured = torch.where(
-            batch.valid[0, t], batch.sparse_depth[0, t], torch.full_like(batch.sparse_depth[0, t], 100.0)
-        )
-        trust = (sample.confidence[t, 0].clamp(0, 1) * 255).byte().numpy()
+        given = clip.condition
+        measured = torch.where(given.valid[t], given.depth[t], 100.0)
         cells = [
-            rgb_image(batch.color[0, t]), rgb_image(sample.rgb[t]), rgb_image(batch.rgb[0, t]), depth_image(measured),
-            depth_image(sample.depth[t]), depth_image(batch.depth[0, t]), class_image(sample.semantics[t]),
-            class_image(batch.semantics[0, t]), np.repeat(trust[..., None], 3, 2),
+            *(to_bytes(rgb) for rgb in (given.color[t], sample.rgb[t], clip.rgb[t])),
+            *(depth_colors(depth[0].numpy()) for depth in (measured, sample.depth[t], clip.depth[t])),
+            *(class_colors(ids.numpy()) for ids in (sample.semantics[t], clip.semantics[t])),
+            gray(sample.confidence[t, 0].numpy()),
         ]  # fmt: skip
         rows.append(np.concatenate(cells, 1))
     with store.atomic_path(path) as temporary:
@@ -272,9 +221,9 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
             y = place(50, 10**power)[1]
             draw.line([(50, y), (width - 20, y)], fill="#dddddd")
             draw.text((4, y - 6), f"{10**power:.3f}", fill="black")
-    for (name, line), colour in zip(series.items(), ("black", "#c03030", "#2050c0", "#209050"), strict=False):
-        draw.line([place(s, v) for s, v in line], fill=colour, width=2)
-        draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=colour)
+    for (name, line), color in zip(series.items(), ("black", "#c03030", "#2050c0", "#209050"), strict=False):
+        draw.line([place(s, v) for s, v in line], fill=color, width=2)
+        draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=color)
     draw.text((50, height - 18), f"steps, logarithmic, 50 to {last}", fill="black")
     with store.atomic_path(path) as temporary:
         image.save(temporary)
@@ -288,9 +237,10 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
 
     `data` says what it was trained on; empty = generated cities.
     """
+    clips, rules = config.data, config.optimizer
     data = data or (
-        f"generated cities only (numbers 0 to {config.cities - 1} of run seed {config.seed}), {config.clips_per_city} clips of\n"
-        f"{config.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
+        f"generated cities only (numbers 0 to {clips.cities - 1} of run seed {config.seed}), {clips.clips_per_city} clips of\n"
+        f"{clips.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
         "other model, was used."
     )
     confidence = (
@@ -299,18 +249,18 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
         else "falls with the error of the colour that the refiner expects, and where depth contradicts measurements nearby."
     )
     count = sum(p.numel() for p in model.parameters()) / 1e6
-    samples = config.steps * config.batch_frames
+    samples = config.steps * rules.batch_frames
     continued = f", continued from an earlier model ({config.start})" if config.start else ""
     return f"""# Small multi-modal diffusion model
 
 Turns a projected, coloured LiDAR cloud (with recorded images and, where there are any, classes warped along) into dense
-colour, depth and semantic frames, {config.window} at a time, at {config.width}x{config.height} pixels. {count:.1f} million
+colour, depth and semantic frames, {clips.window} at a time, at {clips.width}x{clips.height} pixels. {count:.1f} million
 parameters, stored in float16. All three modalities come from one pass.
 
 **Training data**: {data}
 
 **Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`{continued}: {config.steps}
-steps of {config.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {config.average_decay}, x0
+steps of {rules.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {rules.average_decay}, x0
 prediction with the loss weight 1 + SNR clipped to [1, 5].
 
 **Held-out score** ({scores["clips"]} clips of cities from number 1000000 on, {scores["steps"]} denoising steps, against exact

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import InputError, IntegrityError
-from mudg.stages.learning.parallel import Ranks, local, rows_of, whole
+from mudg.stages.learning.parallel import Ranks, first_row, gathered, is_sharded, local
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -36,7 +36,7 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 class TrainingState:
     """The trained part of a model, its optimiser, and the moving average of its weights (None = off).
 
-    `average` holds this process's rows, by the names of the trained part's `state_dict`.
+    `average` is by the names of the trained part's `state_dict`, and sharded as that is.
     """
 
     trained: nn.ModuleDict
@@ -51,20 +51,20 @@ class TrainingState:
         keep = min(decay, self.step / (self.step + 9))
         current = self.trained.state_dict()
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.values()), [local(current[k]) for k in self.average], 1.0 - keep)
+            torch._foreach_lerp_(
+                [local(a) for a in self.average.values()], [local(current[k]) for k in self.average], 1.0 - keep
+            )
 
-    def shown(self, ranks: Ranks) -> dict[str, Tensor]:
+    def export_weights(self, ranks: Ranks) -> dict[str, Tensor]:
         """The weights to use: the average, or the weights themselves; whole, on the CPU, in the leader (others get none).
 
-        All processes must ask together.
+        All processes must call this together.
         """
-        current = self.trained.state_dict()
-        pieces = self.average or {name: local(value) for name, value in current.items()}
         found = {}
-        for name, value in current.items():
-            put_together = whole(pieces[name], value)
+        for name, value in (self.average or self.trained.state_dict()).items():
+            tensor = gathered(value)
             if ranks.leads:
-                found[name] = put_together
+                found[name] = tensor
         return found
 
     def _moments(self) -> dict[str, dict[str, Tensor]]:
@@ -77,10 +77,9 @@ class TrainingState:
         weights = self.trained.state_dict()
         groups = {"net": weights, **self._moments()}
         if self.average is not None:
-            groups["average"] = {n: _cut_like(a, weights[n]) for n, a in self.average.items()}
+            groups["average"] = self.average
         partial = checkpoint.partial_path(folder, self.step)
-        sharded = any(rows_of(v).shape != tuple(local(v).shape) for v in weights.values())
-        sharded = ranks.total([float(sharded)])[0] > 0
+        sharded = any(map(is_sharded, weights.values()))
 
         def write_own() -> None:
             if ranks.leads or sharded:
@@ -97,65 +96,50 @@ class TrainingState:
             ranks.all_do(write_own)
         ranks.wait()
 
+    def resume(self, folder: Path, ranks: Ranks) -> bool:
+        """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this together."""
+        saved = newest(folder, ranks)
+        if saved is None:
+            return False
+        ranks.all_do(lambda: self.load(saved.path))
+        self.step = saved.step
+        return True
+
     def load(self, saved: Path) -> None:
         """Take weights, moments and average from a checkpoint written by `save` under any layout. Does not set `step`.
 
         Raises:
             IntegrityError: tensors or rows are missing, or of another shape.
         """
-        weights = self.trained.state_dict()
-        files = RowFiles(saved, "net")
-        with torch.no_grad():
-            for name, value in weights.items():
-                files.read_into(name, value)
+        read_rows(saved, "net", self.trained.state_dict())
         if self.average is not None:
-            files = RowFiles(saved, "average")
-            for name, value in self.average.items():
-                value.copy_(files.read(name, _cut_like(value, weights[name])))
+            read_rows(saved, "average", self.average)
+        taken = float(store.read_json(saved / "state.json")["step"])
+        moving = {name: p for name, p in self.trained.named_parameters() if p.requires_grad}
         for kind in MOMENTS:
-            files = RowFiles(saved, kind)
-            for name, parameter in self.trained.named_parameters():
-                if parameter.requires_grad:
-                    held = self.optimizer.state[parameter]
-                    held[kind] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-                    held["step"] = torch.tensor(float(self._steps_taken(saved)), device=parameter.device)
-                    files.read_into(name, held[kind])
-
-    @staticmethod
-    def _steps_taken(saved: Path) -> int:
-        return int(store.read_json(saved / "state.json")["step"])
+            for parameter in moving.values():
+                held = self.optimizer.state[parameter]
+                held[kind] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+                held["step"] = torch.tensor(taken, device=parameter.device)
+            read_rows(saved, kind, {name: self.optimizer.state[p][kind] for name, p in moving.items()})
 
 
-@dataclass(frozen=True)
-class _Cut:
-    """A piece in memory with the rows it stands for."""
-
-    piece: Tensor
-    like: Tensor
-
-
-def _cut_like(piece: Tensor, like: Tensor) -> _Cut:
-    return _Cut(piece, like)
-
-
-def _piece_and_rows(value: Tensor | _Cut) -> tuple[Tensor, tuple[int, ...], int]:
-    """This process's piece, the shape of the whole, and the piece's first row."""
-    piece, like = (value.piece, value.like) if isinstance(value, _Cut) else (local(value), value)
-    rows = rows_of(like)
-    return piece.detach(), rows.shape, rows.start
-
-
-def write_rows(folder: Path, group: str, rank: int, tensors: Mapping[str, Tensor | _Cut]) -> None:
+def write_rows(folder: Path, group: str, rank: int, tensors: Mapping[str, Tensor]) -> None:
     """Write this process's rows of named tensors as GROUP.RANK.safetensors with an index GROUP.RANK.json."""
     from safetensors.torch import save
 
-    held, index = {}, {}
-    for name, value in tensors.items():
-        piece, shape, start = _piece_and_rows(value)
-        held[name] = piece.cpu().contiguous()
-        index[name] = {"shape": list(shape), "start": start}
+    held = {name: local(value).detach().cpu().contiguous() for name, value in tensors.items()}
+    index = {name: {"shape": list(value.shape), "start": first_row(value)} for name, value in tensors.items()}
     store.atomic_write(folder / f"{group}.{rank:04d}.safetensors", save(held))
     store.write_json(folder / f"{group}.{rank:04d}.json", index)
+
+
+def read_rows(folder: Path, group: str, tensors: Mapping[str, Tensor]) -> None:
+    """Fill this process's rows of named tensors in place; the inverse of `write_rows` under any layout."""
+    files = RowFiles(folder, group)
+    with torch.no_grad():
+        for name, value in tensors.items():
+            local(value).copy_(files.read(name, value))
 
 
 class RowFiles:
@@ -174,17 +158,13 @@ class RowFiles:
         except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
             raise IntegrityError("the index of a checkpoint is damaged", where=self._where, got=str(error)) from error
 
-    def read_into(self, name: str, value: Tensor) -> None:
-        """Fill this process's piece of `value` in place."""
-        local(value).copy_(self.read(name, value))
-
-    def read(self, name: str, value: Tensor | _Cut) -> Tensor:
-        """The rows of tensor `name` that `value` holds.
+    def read(self, name: str, value: Tensor) -> Tensor:
+        """The rows of tensor `name` that this process holds of `value`.
 
         Raises:
             IntegrityError: there is no such tensor, it has another shape, or rows are missing.
         """
-        piece, shape, start = _piece_and_rows(value)
+        piece, shape, start = local(value), tuple(value.shape), first_row(value)
         if self._shapes.get(name) != shape:
             raise IntegrityError("a checkpoint does not fit the model", where=f"{self._where}.{name}",
                                  expected=str(shape), got=str(self._shapes.get(name, "no such tensor")))  # fmt: skip
@@ -214,11 +194,11 @@ class RowFiles:
 def newest(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
     """The newest checkpoint that verifies, the same for all; only the leader hashes the files."""
 
-    def look() -> dict[str, Any] | None:
+    def find() -> dict[str, Any] | None:
         found = checkpoint.latest(folder)
         return None if found is None else {"step": found.step, "path": str(found.path), "state": dict(found.state)}
 
-    found = ranks.leader_does(look)
+    found = ranks.leader_does(find)
     return None if found is None else checkpoint.Checkpoint(int(found["step"]), Path(found["path"]), found["state"])
 
 

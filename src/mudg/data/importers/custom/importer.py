@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,20 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.types import EgoPath, Frame, Scene, Sweep, SweepPoints, View
 from mudg.data.importers.clouds import Cloud, read_cloud
-from mudg.data.importers.common import deskew, for_each, moments, pose_near
-from mudg.data.importers.custom.schema import INDEX, CustomLog, LogImage, LogLidar, LogSweep, read_log
-from mudg.data.importers.images import fit_images
+from mudg.data.importers.common import UNITS_PER_SECOND, deskew, nearest_index, pose_near
+from mudg.data.importers.custom.schema import INDEX, CustomLog, LogItem, LogLidar, read_log
+from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.data.importers.images import fit_images, image_notes
 from mudg.data.importers.layout import chosen_cameras, refuse_options
 from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.scene import Finding, SceneWriter, decode_image
+from mudg.data.scene import Finding, decode_image
 from mudg.data.scene import check as scene_check
 
-MAX_ALIKE = 5
-"""Findings with the same words that are listed one by one."""
-MAX_DELAY_S = 1.0
-Timed = TypeVar("Timed", LogImage, LogSweep)
+MAX_ALIKE: Final = 5
+"""Findings with the same text that are listed one by one."""
+MAX_DELAY_S: Final = 1.0
+Numbered = tuple[int, LogItem]
+"""A record and its number, counted per sensor in time order."""
 
 
 def looks_like_custom(source: Path) -> bool:
@@ -50,72 +52,72 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     content = _chosen(read_log(source), options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
     images, sweeps = _numbered(content.images), _numbered(content.sweeps)
-    notes = (*content.source.notes, *(fit.words for fit in fits.values() if fit.words))
-    for note in notes:
-        log.info(f"custom: {note}")
-
+    moments = _moments(content.images)
     as_scene(content, _raise)  # records without a pose are refused before anything is read
 
-    def add_image(item: tuple[str, LogImage]) -> None:
-        frame_id, image = item
-        path = _file(content, image.file.path)
-        view = View(fits[image.camera].camera, image_pose(content, image), image.time_s)
-        refuse_grey(path)
-        writer.add_frame(frame_id, view, fits[image.camera].image(path))
+    def convert(item: Numbered) -> Iterator[SceneImage | SceneSweep]:
+        number, record = item
+        if record.kind == "image":
+            path = _file(content, record)
+            refuse_grey(path)
+            pose = pose_of(content.ego, record)
+            yield SceneImage(record.sensor, number, record.time_s, pose, path, moment=moments[record])
+        else:
+            points = read_sweep(content, record, options)
+            yield SceneSweep(record.sensor, number, record.time_s, pose_of(content.ego, record), points)
 
-    def add_sweep(item: tuple[str, LogSweep]) -> None:
-        sweep_id, sweep = item
-        points = read_sweep(content, sweep, options)
-        writer.add_sweep(sweep_id, sweep.lidar, sweep.time_s, sweep_pose(content, sweep), points)
-
-    with SceneWriter(out, content.name, replace(content.source, notes=notes)) as writer:
-        for fit in fits.values():
-            writer.add_camera(fit.camera)
-        for_each(images, add_image, workers=options.workers, title="importing images", name=lambda item: item[0])
-        for_each(sweeps, add_sweep, workers=options.workers, title="importing sweeps", name=lambda item: item[0])
-        for track in content.tracks:
-            writer.add_track(track)
-        writer.set_ego(content.ego)
-        times = {name: [image.time_s for _, image in images if image.camera == name] for name in fits}
-        writer.set_split(holdout_split(moments(times), options.test_every))
-        return writer.finish()
+    source = replace(content.source, notes=(*content.source.notes, *image_notes(fits)))
+    scene = SceneContent(
+        content.name, source, fits, [*images, *sweeps], convert, _id_of, content.ego, lambda: (content.tracks, ())
+    )
+    return write_scene(scene, out, options)
 
 
 def _raise(problem: MudgError) -> None:
     raise problem
 
 
+def _id_of(item: Numbered) -> str:
+    return f"{item[1].sensor}/{item[0]:06d}"
+
+
+def _moments(images: Sequence[LogItem]) -> dict[LogItem, int]:
+    """Image -> number of the image of the first camera that is nearest in time."""
+    if not images:
+        return {}
+    clock = np.array([image.time_s for image in images if image.sensor == images[0].sensor])
+    numbers = nearest_index(clock, np.array([image.time_s for image in images]))
+    return dict(zip(images, numbers.tolist(), strict=True))
+
+
 def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
     """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the rest goes by time."""
     there = {name: name for name in content.cameras}
     names = chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
-    images = [image for image in content.images if image.camera in names]
+    images = [image for image in content.images if image.sensor in names]
     sweeps = list(content.sweeps)
     if options.frames is not None:
-        clock = [image.time_s for image in images if image.camera == names[0]]
+        clock = [image.time_s for image in images if image.sensor == names[0]]
         window = clock[options.frames[0] : options.frames[1]]
         if not window:
-            raise UsageError(
-                "no frames in this range", where="--frames", expected=f"0:{len(clock)}", got=str(options.frames)
-            )
+            expected, got = f"0:{len(clock)}", str(options.frames)
+            raise UsageError("no frames in this range", where="--frames", expected=expected, got=got)
         slack = float(np.median(np.diff(clock))) / 2 if len(clock) > 1 else 0.0
         inside = (window[0] - slack - 1e-9, window[-1] + slack + 1e-9)
         images = [image for image in images if inside[0] <= image.time_s <= inside[1]]
         sweeps = [sweep for sweep in sweeps if inside[0] <= sweep.time_s <= inside[1]]
     if options.skip_missing:
-        images, sweeps = _present(content, images, "image"), _present(content, sweeps, "cloud")
-        images = [i for i in images if i.world_from_camera is not None or _covered(content.ego, i.time_s)]
-        sweeps = [s for s in sweeps if _covered(content.ego, s.time_s)]
-    return replace(
-        content, cameras={name: content.cameras[name] for name in names}, images=tuple(images), sweeps=tuple(sweeps)
-    )
+        images, sweeps = _usable(content, images), _usable(content, sweeps)
+    cameras = {name: content.cameras[name] for name in names}
+    return replace(content, cameras=cameras, images=tuple(images), sweeps=tuple(sweeps))
 
 
-def _present(content: CustomLog, records: list[Timed], what: str) -> list[Timed]:
+def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
+    """Records whose file is there and whose pose is known."""
     found = [record for record in records if (content.root / record.file.path).is_file()]
     if len(found) < len(records):
-        log.warn(f"custom: left out {len(records) - len(found)} records whose {what} is missing")
-    return found
+        log.warn(f"custom: left out {len(records) - len(found)} records whose {records[0].kind} is missing")
+    return [r for r in found if r.world_from_sensor is not None or _covered(content.ego, r.time_s)]
 
 
 def _covered(ego: EgoPath, time_s: float) -> bool:
@@ -126,37 +128,30 @@ def _covered(ego: EgoPath, time_s: float) -> bool:
     return True
 
 
-def _numbered(records: Sequence[Timed]) -> list[tuple[str, Timed]]:
-    """Records with their ids: sensor and number in time order."""
+def _numbered(records: Sequence[LogItem]) -> list[Numbered]:
     counts: Counter[str] = Counter()
     numbered = []
     for record in records:
-        sensor = record.camera if isinstance(record, LogImage) else record.lidar
-        numbered.append((f"{sensor}/{counts[sensor]:06d}", record))
-        counts[sensor] += 1
+        numbered.append((counts[record.sensor], record))
+        counts[record.sensor] += 1
     return numbered
 
 
 # --- one record -------------------------------------------------------------------------------------------------------
 
 
-def _file(content: CustomLog, ref: str) -> Path:
-    path = content.root / ref
+def _file(content: CustomLog, record: LogItem) -> Path:
+    path = content.root / record.file.path
     if not path.resolve().is_relative_to(content.root.resolve()):
         raise InputError("a link leads out of the log", where=str(path), expected="a file inside the log")
     return path
 
 
-def image_pose(content: CustomLog, image: LogImage) -> NDArray[np.float64]:
-    """World-from-camera f64[4, 4]: the image's own, else by the vehicle's path."""
-    if image.world_from_camera is not None:
-        return image.world_from_camera
-    return pose_near(content.ego, image.time_s) @ content.cameras[image.camera].ego_from_camera
-
-
-def sweep_pose(content: CustomLog, sweep: LogSweep) -> NDArray[np.float64]:
-    """World-from-LiDAR f64[4, 4] at the sweep's time."""
-    return pose_near(content.ego, sweep.time_s) @ content.lidars[sweep.lidar].ego_from_lidar
+def pose_of(ego: EgoPath, record: LogItem) -> NDArray[np.float64]:
+    """World-from-sensor f64[4, 4] of an image or cloud: its own, else by the vehicle's path."""
+    if record.world_from_sensor is not None:
+        return record.world_from_sensor
+    return pose_near(ego, record.time_s) @ record.ego_from_sensor
 
 
 def refuse_grey(path: Path) -> None:
@@ -167,90 +162,82 @@ def refuse_grey(path: Path) -> None:
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return  # decode_image says better what is wrong
     if mode in ("1", "L", "LA"):
-        raise InputError(
-            "image is grey", where=str(path), expected="8-bit RGB", got=f"mode {mode}",
-            remedy="repeat the channel three times, if grey is meant",
-        )  # fmt: skip
+        got, remedy = f"mode {mode}", "repeat the channel three times, if grey is meant"
+        raise InputError("image is grey", where=str(path), expected="8-bit RGB", got=got, remedy=remedy)
 
 
-def read_sweep(content: CustomLog, sweep: LogSweep, options: ImportOptions) -> SweepPoints:
+def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> SweepPoints:
     """The points of a sweep, motion-compensated to its time.
 
     Raises:
         InputError: no points, a field that was declared is not there, intensities above the declared largest one, points
             that need their times and have none.
     """
-    lidar = content.lidars[sweep.lidar]
-    path = _file(content, sweep.file.path)
+    lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
     cloud = read_cloud(path)
     if len(cloud.xyz) == 0:
-        raise InputError(
-            "cloud has no points", where=str(path), expected="at least one return",
-            remedy="export it again, or take the sweep out of log.json",
-        )  # fmt: skip
+        remedy = "export it again, or take the sweep out of log.json"
+        raise InputError("cloud has no points", where=str(path), expected="at least one return", remedy=remedy)
     dt_s = _delays(cloud, sweep, content, path)
-    points = SweepPoints(cloud.xyz.astype(np.float32), _intensity(cloud, lidar, path), dt_s)
-    if options.untwist == "no" or (options.untwist == "auto" and lidar.compensated):
+    points = SweepPoints(cloud.xyz.astype(np.float32), _intensity(cloud, lidar, sweep.sensor, path), dt_s)
+    if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
         return points
     if not lidar.time_field:
         raise InputError(
-            "sweeps are not motion-compensated, and their points have no times", where=f"{content.root / INDEX}: lidars.{lidar.name}",
-            expected="time_field and time_unit", remedy="name the field with the time of each point, or add --untwist no",
+            "sweeps are not motion-compensated, and their points have no times",
+            where=f"{content.root / INDEX}: lidars.{sweep.sensor}", expected="time_field and time_unit",
+            remedy="name the field with the time of each point, or add --untwist no",
         )  # fmt: skip
 
     def world_from_lidar(time_s: float) -> NDArray[np.float64]:
-        return pose_near(content.ego, time_s) @ lidar.ego_from_lidar
+        return pose_near(content.ego, time_s) @ sweep.ego_from_sensor
 
     return SweepPoints(deskew(points.xyz, points.dt_s, world_from_lidar, sweep.time_s), points.intensity, points.dt_s)
 
 
-def _intensity(cloud: Cloud, lidar: LogLidar, path: Path) -> NDArray[np.float32]:
+def _field(cloud: Cloud, name: str, what: str, path: Path, remedy: str = "") -> NDArray[Any]:
+    """A declared field of a cloud, else InputError."""
+    values = cloud.fields.get(name)
+    if values is None:
+        got = ", ".join(cloud.fields) or "coordinates only"
+        raise InputError(f"cloud has no {what}", where=str(path), expected=f"a field {name!r}", got=got, remedy=remedy)
+    return values
+
+
+def _intensity(cloud: Cloud, lidar: LogLidar, name: str, path: Path) -> NDArray[np.float32]:
     if not lidar.intensity_field:
         return np.zeros(len(cloud.xyz), np.float32)
-    values = cloud.fields.get(lidar.intensity_field)
-    if values is None:
-        raise InputError(
-            "cloud has no intensity", where=str(path), expected=f"a field {lidar.intensity_field!r}",
-            got=", ".join(cloud.fields) or "coordinates only",
-            remedy=f"name the field in log.json: lidars.{lidar.name}.intensity_field; an empty text if there is none",
-        )  # fmt: skip
+    remedy = f"name the field in log.json: lidars.{name}.intensity_field; an empty text if there is none"
+    values = _field(cloud, lidar.intensity_field, "intensity", path, remedy)
     scaled = np.nan_to_num(values.astype(np.float64) / lidar.intensity_max, nan=0.0)
     if scaled.min() < 0 or scaled.max() > 1 + 1e-6:
-        worst = values[np.abs(scaled - 0.5).argmax()]
-        raise InputError(
-            "intensity is out of range", where=str(path), expected=f"0 to {lidar.intensity_max:g}", got=f"{worst:g}",
-            remedy=f"give the largest possible value in log.json: lidars.{lidar.name}.intensity_max (often 255)",
-        )  # fmt: skip
+        expected, got = f"0 to {lidar.intensity_max:g}", f"{values[np.abs(scaled - 0.5).argmax()]:g}"
+        remedy = f"give the largest possible value in log.json: lidars.{name}.intensity_max (often 255)"
+        raise InputError("intensity is out of range", where=str(path), expected=expected, got=got, remedy=remedy)
     return scaled.clip(0, 1).astype(np.float32)
 
 
-def _delays(cloud: Cloud, sweep: LogSweep, content: CustomLog, path: Path) -> NDArray[np.float32]:
+def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDArray[np.float32]:
     """Seconds of each point relative to the sweep's time; 0 where clouds have no times."""
-    lidar = content.lidars[sweep.lidar]
-    if not lidar.time_field:
+    lidar, clock = content.lidars[sweep.sensor], content.clock
+    if not lidar.time_field or lidar.time_unit is None:
         return np.zeros(len(cloud.xyz), np.float32)
-    values = cloud.fields.get(lidar.time_field)
-    if values is None:
-        raise InputError(
-            "cloud has no times",
-            where=str(path),
-            expected=f"a field {lidar.time_field!r}",
-            got=", ".join(cloud.fields) or "nothing",
-        )
-    if (
-        lidar.absolute
-    ):  # whole numbers are subtracted before they are scaled: nanoseconds of the epoch keep their digits
+    values, per_second = _field(cloud, lidar.time_field, "times", path), UNITS_PER_SECOND[lidar.time_unit]
+    if lidar.time_from == "log":
+        # whole numbers are subtracted before they are scaled: nanoseconds of the epoch keep their digits
         values = values.astype(np.int64) if values.dtype.kind == "u" else values
-        start = content.start * lidar.times_per_s
-        start = start // content.units_per_s if isinstance(start, int) else start / content.units_per_s
-        dt_s = (values - np.asarray(start, values.dtype)).astype(np.float64) / lidar.times_per_s - sweep.time_s
+        start = clock.start * per_second
+        start = start // clock.units_per_s if isinstance(start, int) else start / clock.units_per_s
+        dt_s = (values - np.asarray(start, values.dtype)).astype(np.float64) / per_second - sweep.time_s
     else:
-        dt_s = values.astype(np.float64) / lidar.times_per_s
+        dt_s = values.astype(np.float64) / per_second
     if not np.isfinite(dt_s).all() or np.abs(dt_s).max() > MAX_DELAY_S:
-        raise InputError(
-            "times of points are far from their sweep's", where=str(path), expected=f"within {MAX_DELAY_S:g} s",
-            got=f"up to {np.abs(dt_s).max():.3g} s", remedy="check time_unit and time_from of the LiDAR in log.json",
-        )  # fmt: skip
+        expected, got = f"within {MAX_DELAY_S:g} s", f"up to {np.abs(dt_s).max():.3g} s"
+        what, remedy = (
+            "times of points are far from their sweep's",
+            "check time_unit and time_from of the LiDAR in log.json",
+        )
+        raise InputError(what, where=str(path), expected=expected, got=got, remedy=remedy)
     return dt_s.astype(np.float32)
 
 
@@ -260,15 +247,12 @@ def _delays(cloud: Cloud, sweep: LogSweep, content: CustomLog, path: Path) -> ND
 def check_log(source: Path) -> list[Finding]:
     """Everything that is wrong or odd about a log in the neutral layout, worst first; every file is read.
 
-    Problems with the same words are listed five times, the rest counted.
+    Problems with the same text are listed five times, the rest counted.
     """
     findings: list[Finding] = []
 
     def complain(problem: MudgError) -> None:
         findings.append(scene_check.finding_of(problem, str(source)))
-
-    def say(level: scene_check.Level, where: str, words: str) -> None:
-        findings.append(Finding(level, where, words))
 
     try:
         content = read_log(source, complain)
@@ -276,78 +260,72 @@ def check_log(source: Path) -> list[Finding]:
         complain(problem)
         return scene_check.worst_first(findings)
     scene, images, sweeps = as_scene(content, complain)
-    scene_check.check_records(scene, say)
+    findings.extend(scene_check.check_records(scene))
 
-    def check_image(item: tuple[Frame, LogImage]) -> None:
-        frame, image = item
-        try:
-            path = _file(content, image.file.path)
-            refuse_grey(path)
-            pixels = decode_image(store.read_bytes(path), str(path), content.cameras[image.camera].camera)
-            scene_check.check_image(frame, pixels, say)
-        except MudgError as problem:
-            complain(problem)
+    def check_image(frame: Frame, image: LogItem) -> Iterator[Finding]:
+        path = _file(content, image)
+        refuse_grey(path)
+        pixels = decode_image(store.read_bytes(path), str(path), frame.view.camera)
+        yield from scene_check.check_image(frame, pixels)
 
-    def check_sweep(item: tuple[Sweep, LogSweep]) -> None:
-        try:
-            points = read_sweep(content, item[1], ImportOptions())
-            scene_check.check_points(scene, item[0], points, say)
-        except MudgError as problem:
-            complain(problem)
+    def check_sweep(sweep: Sweep, cloud: LogItem) -> Iterator[Finding]:
+        yield from scene_check.check_points(scene, sweep, read_sweep(content, cloud, ImportOptions()))
 
-    for_each(list(zip(scene.frames, images, strict=True)), check_image, title="checking images")
-    for_each(list(zip(scene.sweeps, sweeps, strict=True)), check_sweep, title="checking sweeps")
+    with log.task("checking images and sweeps", len(images) + len(sweeps)) as bar:
+        checks = [
+            *map(check_image, scene.frames, images),
+            *map(check_sweep, scene.sweeps, sweeps),
+        ]  # nothing is read yet
+        for check in checks:
+            findings.extend(scene_check.collected(check, str(source)))
+            bar.advance()
     return scene_check.worst_first(_collapsed(findings))
 
 
-def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple[Scene, list[LogImage], list[LogSweep]]:
+def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple[Scene, list[LogItem], list[LogItem]]:
     """The log as a scene whose references are files of the log: nothing is copied; and the records of its frames and sweeps.
 
     Records without a pose are complained about and left out. Cameras are as recorded.
     """
-    frames: list[tuple[Frame, LogImage]] = []
-    for frame_id, image in _numbered(content.images):
-        camera = content.cameras[image.camera].camera
+    frames: dict[LogItem, Frame] = {}
+    sweeps: dict[LogItem, Sweep] = {}
+    for item in (*_numbered(content.images), *_numbered(content.sweeps)):
+        record, name = item[1], _id_of(item)
         try:
-            frames.append((Frame(frame_id, View(camera, image_pose(content, image), image.time_s), image.file), image))
+            pose = pose_of(content.ego, record)
+            if record.kind == "image":
+                view = View(content.cameras[record.sensor].camera, pose, record.time_s)
+                frames[record] = Frame(name, view, record.file)
+            else:
+                sweeps[record] = Sweep(name, record.sensor, record.time_s, pose, record.file)
         except InputError as problem:
-            complain(_placed(problem, f"image {image.file.path}"))
-    sweeps: list[tuple[Sweep, LogSweep]] = []
-    for sweep_id, sweep in _numbered(content.sweeps):
-        try:
-            sweeps.append((Sweep(sweep_id, sweep.lidar, sweep.time_s, sweep_pose(content, sweep), sweep.file), sweep))
-        except InputError as problem:
-            complain(_placed(problem, f"cloud {sweep.file.path}"))
-    times = {name: [f.view.time_s for f, i in frames if i.camera == name] for name in content.cameras}
-    split = holdout_split(moments({n: t for n, t in times.items() if t}), ImportOptions().test_every) if frames else {}
-    known = {frame.id for frame, _ in frames}
+            remedy = "are the clocks the same? --skip-missing leaves such records out"
+            where = f"{record.kind} {record.file.path}"
+            complain(InputError(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=remedy))
+    groups: dict[int, list[str]] = {}
+    for record, moment in _moments(list(frames)).items():
+        groups.setdefault(moment, []).append(frames[record].id)
+    split = holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
+    cameras = {name: camera.camera for name, camera in content.cameras.items()}
     scene = Scene(
-        content.name, str(content.root), {name: c.camera for name, c in content.cameras.items()},
-        tuple(frame for frame, _ in frames), tuple(sweep for sweep, _ in sweeps), content.tracks, content.ego,
-        {frame_id: part for frame_id, part in split.items() if frame_id in known}, content.source,
+        content.name, str(content.root), cameras, tuple(frames.values()), tuple(sweeps.values()), content.tracks,
+        content.ego, split, content.source,
     )  # fmt: skip
-    return scene, [image for _, image in frames], [sweep for _, sweep in sweeps]
-
-
-def _placed(problem: InputError, where: str) -> InputError:
-    return InputError(
-        problem.what, where=where, expected=problem.expected, got=problem.got,
-        remedy="are the clocks the same? --skip-missing leaves such records out",
-    )  # fmt: skip
+    return scene, list(frames), list(sweeps)
 
 
 def _collapsed(findings: Iterable[Finding]) -> list[Finding]:
-    """At most ``MAX_ALIKE`` findings of one kind (the words before the first ``;``), and how many more there are."""
-    counts: Counter[tuple[str, str]] = Counter()
+    """At most ``MAX_ALIKE`` findings of one kind (the same text before the first ``;``), and how many more there are."""
+    counts: Counter[tuple[scene_check.Level, str]] = Counter()
     kept = []
     for finding in findings:
-        kind = (finding.level, finding.words.split(";")[0])
+        kind = (finding.level, finding.message.split(";")[0])
         counts[kind] += 1
         if counts[kind] <= MAX_ALIKE:
             kept.append(finding)
     more = [
-        Finding(level, "and others", f"{words}: {count - MAX_ALIKE} more")  # type: ignore[arg-type]
-        for (level, words), count in counts.items()
+        Finding(level, "and others", f"{message}: {count - MAX_ALIKE} more")
+        for (level, message), count in counts.items()
         if count > MAX_ALIKE
     ]
     return kept + more

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,18 +14,16 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix
 from mudg.base.types import Track
-from mudg.data.importers.box_tracks import check_sides, unknown_words
+from mudg.data.importers.box_tracks import BoxTracks, box_size
 from mudg.data.importers.kitti.poses import read_lines
+from mudg.data.importers.kitti.scans import azimuth_delay_s
 
 Matrix = NDArray[np.float64]
 MAX_TRACKLET_BYTES = 256 * 1024 * 1024
-TURN_PERIOD_S = 0.1
 LABELS = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
 )
 """Classes of the benchmarks, in lower case."""
-MAX_GAP_S = 0.55
-"""A track that is not seen for longer than this is split: interpolating across would invent its path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,45 +60,34 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
 
     Args:
         path: label text. ``DontCare`` regions are left out.
-        rect0_from_velo: boxes are given in rectified camera 0 and returned in the velodyne frame.
+        rect0_from_velo: boxes are given in rectified camera 0 and returned in the velodyne frame, f64[4, 4].
         frame: frame number for an object label file (15 columns and optionally a score); None for a tracking file.
+
+    Raises:
+        InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
     """
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
     skip = 2 if frame is None else 0
     for index, line in enumerate(read_lines(path)):
-        words, where = line.split(), f"{path}: line {index + 1}"
-        if len(words) - skip not in (15, 16):
-            raise InputError(
-                "label line has the wrong number of columns",
-                where=where,
-                got=str(len(words)),
+        columns, where = line.split(), f"{path}: line {index + 1}"
+        if len(columns) - skip not in (15, 16):
+            raise InputError("label line has the wrong number of columns", where=where, got=str(len(columns)),
                 expected=f"{15 + skip} (or {16 + skip} with a score)",
-                remedy="is this a tracking or an object label file?",
-            )
-        if words[skip] == "DontCare":
+                remedy="is this a tracking or an object label file?")  # fmt: skip
+        if columns[skip] == "DontCare":
             continue
         try:
-            number = frame if frame is not None else int(words[0])
-            track = int(words[1]) if frame is None else index
-            values = [float(word) for word in words[skip + 1 :]]
+            number, track = (frame, index) if frame is not None else (int(columns[0]), int(columns[1]))
+            values = [float(text) for text in columns[skip + 1 :]]
         except ValueError as error:
             raise InputError("label value is not a number", where=where, got=str(error)) from error
         if not np.isfinite(values).all():
             raise InputError("label value is not finite", where=where, got=line.strip()[:100])
-        height, width, length = values[7:10]
-        if min(height, width, length) <= 0:
-            raise InputError(
-                "box size is not positive",
-                where=where,
-                expected="height, width, length in metres",
-                got=str(values[7:10]),
-            )
-        pose = velo_from_rect0 @ rect0_from_box(values[10:13], height, values[13])
-        left, top, right, bottom = values[3:7]
-        boxes.append(
-            KittiBox(number, track, words[skip].lower(), (length, width, height), pose, (left, top, right, bottom))
-        )
+        left, top, right, bottom, height, width, length, x, y, z, turn = values[3:14]
+        size_m = box_size(length, width, height, where)
+        pose = velo_from_rect0 @ rect0_from_box((x, y, z), height, turn)
+        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose, (left, top, right, bottom)))
     return boxes
 
 
@@ -111,11 +97,8 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     if len(content) > MAX_TRACKLET_BYTES:
         raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
     if b"<!ENTITY" in content:
-        raise InputError(
-            "tracklet file declares XML entities, which no KITTI file does",
-            where=str(path),
-            remedy="use the file from the data set",
-        )
+        raise InputError("tracklet file declares XML entities, which no KITTI file does", where=str(path),
+            remedy="use the file from the data set")  # fmt: skip
     try:
         root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
     except ElementTree.ParseError as error:
@@ -123,17 +106,14 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     boxes = []
     for track, item in enumerate(root.findall("./tracklets/item")):
         where = f"{path}: tracklet {track}"
-        height, width, length = (_xml_number(item, key, where) for key in ("h", "w", "l"))
-        if min(height, width, length) <= 0:
-            raise InputError("box size is not positive", where=where, got=f"h={height} w={width} l={length}")
+        length, width, height = (_xml_number(item, key, where) for key in ("l", "w", "h"))
+        size_m = box_size(length, width, height, where)
         first = int(_xml_number(item, "first_frame", where))
         label = (item.findtext("objectType") or "").strip().lower()
         for step, pose in enumerate(item.findall("./poses/item")):
             here = f"{where} pose {step}"
             tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
-            boxes.append(
-                KittiBox(first + step, track, label, (length, width, height), yaw_matrix(rz, (tx, ty, tz + height / 2)))
-            )
+            boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + height / 2))))
     return boxes
 
 
@@ -155,14 +135,15 @@ def build_tracks(
     where: str,
     velo_at: Callable[[float], Matrix] | None = None,
 ) -> tuple[list[Track], list[str]]:
-    """Tracks in the world from boxes per frame.
+    """Tracks in the world from boxes per frame, in the order of their numbers.
 
-    Boxes of frames that are not imported are left out. A track with a gap longer than ``MAX_GAP_S`` is split into
-    ``7``, ``7.1``, ... The size is the median over the track.
+    Boxes of frames that are not imported are left out. A track that is not seen for longer than ``box_tracks.MAX_GAP_S``
+    is split into ``7``, ``7.1``, ... The size is the median over the track.
 
     Args:
-        world_from_velo: pose of the velodyne by frame number.
-        times_s: time of the scan by frame number.
+        boxes: in any order.
+        world_from_velo: pose of the velodyne f64[4, 4] by frame number.
+        times_s: time of the scan by frame number, seconds.
         where: the file the boxes come from, for messages.
         velo_at: pose of the velodyne at any time, when boxes were drawn into scans that were still twisted: each box then
             belongs to the moment its azimuth was measured, and is moved to the scan's time with the track's velocity.
@@ -170,58 +151,33 @@ def build_tracks(
     Returns:
         The tracks, and notes for people (splits, boxes left out).
     """
-    by_track: dict[int, dict[int, KittiBox]] = {}
+    collected = BoxTracks(where, {label: label for label in LABELS})
+    delays_s: dict[tuple[str, float], float] = {}
     outside = 0
     for box in boxes:
         if box.frame not in world_from_velo:
             outside += 1
             continue
-        if box.frame in by_track.setdefault(box.track, {}):
-            raise InputError(
-                "a track has two boxes in one frame", where=where, got=f"track {box.track}, frame {box.frame}"
-            )
-        by_track[box.track][box.frame] = box
-    notes = [f"{outside} boxes lie in frames that were not imported and were left out"] if outside else []
-    tracks = []
-    for number, members in sorted(by_track.items()):
-        frames = sorted(members, key=lambda n: times_s[n])
-        times = np.array([times_s[n] for n in frames])
-        pieces = np.split(np.arange(len(frames)), np.flatnonzero(np.diff(times) > MAX_GAP_S) + 1)
-        size = np.median([members[n].size_m for n in frames], axis=0)
-        if len(pieces) > 1:
-            notes.append(
-                f"track {number} is not seen for more than {MAX_GAP_S} s and was split into {len(pieces)} tracks"
-            )
-        for part, piece in enumerate(pieces):
-            chosen = [frames[i] for i in piece]
-            if velo_at is None:
-                poses = np.stack([world_from_velo[n] @ members[n].sensor_from_box for n in chosen])
-            else:
-                poses = _at_scan_times([members[n].sensor_from_box for n in chosen], times[piece], velo_at)
-            tracks.append(
-                Track(f"{number}.{part}" if part else str(number), members[chosen[0]].label, size, times[piece], poses)
-            )
-    check_sides(tracks, where)
-    unknown = Counter(box.label for box in boxes if box.frame in world_from_velo and box.label not in LABELS)
-    if unknown:
-        notes.append(unknown_words(unknown))
-    return tracks, notes
+        name, time_s, pose = str(box.track), times_s[box.frame], world_from_velo[box.frame]
+        if velo_at is not None:
+            x, y = box.sensor_from_box[:2, 3]
+            delay_s = delays_s[name, time_s] = float(azimuth_delay_s(float(np.arctan2(y, x))))
+            pose = velo_at(time_s + delay_s)
+        record = f"{where}: track {name}, frame {box.frame}"
+        collected.add(name, collected.label_of(box.label), time_s, box.size_m, pose @ box.sensor_from_box, where=record)
+    found, notes = collected.tracks()
+    if velo_at is not None:
+        found = [_at_scan_times(track, delays_s) for track in found]
+    if outside:
+        notes.insert(0, f"{outside} boxes lie in frames that were not imported and were left out")
+    return sorted(found, key=lambda track: [int(part) for part in track.id.split(".")]), notes
 
 
-def _at_scan_times(
-    sensor_from_box: Sequence[Matrix], times_s: NDArray[np.float64], velo_at: Callable[[float], Matrix]
-) -> Matrix:
-    """World-from-box at the scans' times from boxes in twisted scans, f64[n, 4, 4]."""
-    late_s = np.array([azimuth_delay_s(float(np.arctan2(pose[1, 3], pose[0, 3]))) for pose in sensor_from_box])
-    poses = np.stack(
-        [velo_at(float(t + late)) @ pose for t, late, pose in zip(times_s, late_s, sensor_from_box, strict=True)]
-    )
-    if len(poses) > 1:
-        velocity = np.gradient(poses[:, :3, 3], times_s + late_s, axis=0)
-        poses[:, :3, 3] -= velocity * late_s[:, None]
-    return poses
-
-
-def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
-    """When a turning sensor looks to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi), seconds after looking forward."""
-    return azimuth_rad / (2 * np.pi) * TURN_PERIOD_S
+def _at_scan_times(track: Track, delays_s: Mapping[tuple[str, float], float]) -> Track:
+    """The track moved from the moments at which its boxes were measured to the times of the scans."""
+    late_s = np.array([delays_s[track.id.split(".")[0], time_s] for time_s in track.times_s])
+    if len(late_s) == 1:
+        return track
+    poses = track.world_from_object.copy()
+    poses[:, :3, 3] -= np.gradient(poses[:, :3, 3], track.times_s + late_s, axis=0) * late_s[:, None]
+    return replace(track, world_from_object=poses)

@@ -12,41 +12,39 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.geometry import from_rotation_translation, rigid_problem, yaw_matrix, yaw_of
+from mudg.base.geometry import from_rotation_translation, yaw_matrix, yaw_of
+from mudg.data.importers.common import rigid_pose
 
 Matrix = NDArray[np.float64]
 EARTH_RADIUS_M = 6378137.0
-_POSE_TOLERANCE = 1e-3
 _OXTS_VALUES = 30
 
 
-def read_lines(path: Path) -> list[str]:
-    """Non-empty lines of a text file."""
+def read_text(path: Path) -> str:
+    """A UTF-8 text file."""
     try:
-        return [line for line in store.read_bytes(path).decode("utf-8").splitlines() if line.strip()]
+        return store.read_bytes(path).decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError("file is not text", where=str(path), got=str(error)) from error
 
 
+def read_lines(path: Path) -> list[str]:
+    """Non-empty lines of a text file."""
+    return [line for line in read_text(path).splitlines() if line.strip()]
+
+
 def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDArray[np.float64]:
     """The numbers of one line; their count must be one of ``counts``."""
-    words = line.split()
     try:
-        numbers = np.array([float(word) for word in words])
+        numbers = np.array([float(text) for text in line.split()])
     except ValueError as error:
         raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
     if len(numbers) not in counts:
-        raise InputError(
-            f"{what}: wrong number of values",
-            where=where,
-            expected=" or ".join(str(c) for c in counts),
-            got=str(len(numbers)),
-            remedy="is the file cut off, or of another format?",
-        )
+        raise InputError(f"{what}: wrong number of values", where=where, expected=" or ".join(str(c) for c in counts),
+            got=str(len(numbers)), remedy="is the file cut off, or of another format?")  # fmt: skip
     if not np.isfinite(numbers).all():
-        raise InputError(
-            f"{what}: a value is not finite", where=where, got=line.strip()[:80], expected="finite numbers"
-        )
+        raise InputError(f"{what}: a value is not finite", where=where, got=line.strip()[:80],
+            expected="finite numbers")  # fmt: skip
     return numbers
 
 
@@ -68,42 +66,19 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     if len(widths) != 1:
         raise InputError("pose file mixes two forms", where=str(path), expected="12 or 13 numbers in every line")
     if widths == {13}:
-        numbers = [int(row[0]) for row in rows]
-        if any(number != row[0] for number, row in zip(numbers, rows, strict=True)) or len(set(numbers)) != len(
-            numbers
-        ):
+        poses = {int(row[0]): row[1:] for row in rows}
+        if len(poses) != len(rows) or any(number != row[0] for number, row in zip(poses, rows, strict=True)):
             raise InputError("first column is not a list of distinct frame numbers", where=str(path))
-        poses = {n: row[1:] for n, row in zip(numbers, rows, strict=True)}
-        sensor = "velo"
+    elif len(rows) == len(frame_numbers):
+        poses = dict(zip(frame_numbers, rows, strict=True))
+    elif len(rows) > max(frame_numbers):
+        poses = dict(enumerate(rows))
     else:
-        sensor = "cam0"
-        if len(rows) == len(frame_numbers):
-            poses = dict(zip(frame_numbers, rows, strict=True))
-        elif len(rows) > max(frame_numbers):
-            poses = dict(enumerate(rows))
-        else:
-            raise InputError(
-                "pose file does not cover the frames",
-                where=str(path),
-                got=f"{len(rows)} lines",
-                expected=f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)",
-            )
-    return {number: _pose(row, f"{path}: pose of frame {number}") for number, row in poses.items()}, sensor
-
-
-def _pose(row: NDArray[np.float64], where: str) -> Matrix:
-    matrix = np.vstack([row.reshape(3, 4), [0, 0, 0, 1]])
-    problem = rigid_problem(matrix, _POSE_TOLERANCE)
-    if problem is not None:
-        raise InputError(
-            "pose is not a rigid motion",
-            where=where,
-            got=problem,
-            expected="a rotation and a translation in metres",
-            remedy="check that the file is row-major 3x4, metres, not scaled or mirrored",
-        )
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
-    return from_rotation_translation(u @ vt, matrix[:3, 3])
+        expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
+        raise InputError("pose file does not cover the frames", where=str(path), got=f"{len(rows)} lines",
+            expected=expected)  # fmt: skip
+    sensor = "velo" if widths == {13} else "cam0"
+    return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
 
 
 def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
@@ -123,12 +98,9 @@ def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.floa
         wheres = {n: f"{path}: line {n + 1}" for n in lines}
     missing = [n for n in frames if n not in lines]
     if missing:
-        raise InputError(
-            "GPS/IMU packets are missing",
-            where=str(path),
+        raise InputError("GPS/IMU packets are missing", where=str(path),
             got=f"no packet for frames {', '.join(str(n) for n in missing[:8])} ({len(missing)} in all)",
-            remedy="copy them, or choose frames with --frames FIRST:END",
-        )
+            remedy="copy them, or choose frames with --frames FIRST:END")  # fmt: skip
     return {n: line_numbers(line, (_OXTS_VALUES,), wheres[n], "GPS/IMU packet") for n, line in lines.items()}
 
 
@@ -172,8 +144,8 @@ def read_timestamps(path: Path) -> list[float]:
             times.append(float(line_numbers(line, (1,), where, "timestamp")[0]))
             continue
         try:
-            whole = datetime.datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S").replace(tzinfo=datetime.UTC)
+            second = datetime.datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S").replace(tzinfo=datetime.UTC)
         except ValueError as error:
             raise InputError("timestamp is no date", where=where, got=line.strip()) from error
-        times.append(whole.timestamp() + float(match[2] or 0))
+        times.append(second.timestamp() + float(match[2] or 0))
     return times

@@ -3,11 +3,12 @@
 An object's ``transform`` maps its ``vertices`` (a unit cube for the classes read here) to the world and holds the size as scale.
 Static objects have ``timestamp`` -1 and a window of frames; objects that move have one entry per frame.
 
-The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``WORDS`` are kept.
+The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``LABEL_OF`` are kept.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,12 +27,12 @@ LABEL_OF_ID: Final = {
     19: "person", 20: "rider", 36: "unknown vehicle",
 }  # fmt: skip
 """The annotation tool's class numbers (``semanticId``) of what can move. Source: the data set's label table (kittiId)."""
-WORDS: Final = {
+LABEL_OF: Final = {
     "car": "car", "truck": "truck", "bus": "bus", "caravan": "caravan", "trailer": "trailer", "train": "train",
     "motorcycle": "motorcycle", "bicycle": "bicycle", "person": "pedestrian", "pedestrian": "pedestrian",
     "rider": "cyclist", "unknown vehicle": "vehicle",
 }  # fmt: skip
-"""Classes that become tracks -> words of the product. Buildings, poles, vegetation and ground are no tracks."""
+"""Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
 MAX_FILE_BYTES: Final = 8 * 1024**3
 _CHUNK: Final = 1 << 20
@@ -45,7 +46,7 @@ class Kitti360Box:
 
     Args:
         object_id: the same for all boxes of an object.
-        label: class as in ``WORDS``.
+        label: class as in ``LABEL_OF``.
         frame: frame number of a box that moves; -1 for an object that stands.
         window: first and last frame of the part of the drive the box was drawn in.
         size_m: length, width, height.
@@ -60,12 +61,12 @@ class Kitti360Box:
     world_from_box: Matrix
 
 
-def read_boxes(path: Path, left_out: dict[str, int]) -> Iterator[Kitti360Box]:
-    """Boxes of the classes in ``WORDS``, one by one.
+def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
+    """Boxes of the classes in ``LABEL_OF``, one by one.
 
     Args:
         path: the XML file.
-        left_out: filled with words and counts of what is not read.
+        left_out: filled with what is not read (``that are not cuboids``) and how often.
 
     Raises:
         InputError: missing, cut off, malformed, or it declares XML entities.
@@ -75,17 +76,17 @@ def read_boxes(path: Path, left_out: dict[str, int]) -> Iterator[Kitti360Box]:
         if item.find("transform") is None:
             continue
         label = _label(item, where)
-        if label not in WORDS:
-            left_out["of classes that do not move"] = left_out.get("of classes that do not move", 0) + 1
+        if label not in LABEL_OF:
+            left_out["of classes that do not move"] += 1
             continue
-        frame = _whole(item, "timestamp", where)
+        frame = _integer(item, "timestamp", where)
         shape = _shape(_matrix(item, "transform", where), _matrix(item, "vertices", where), label, where)
         if shape is None:
-            left_out["that are not cuboids"] = left_out.get("that are not cuboids", 0) + 1
+            left_out["that are not cuboids"] += 1
             continue
         size_m, pose = shape
         if item.find("start_frame") is not None:
-            window = (_whole(item, "start_frame", where), _whole(item, "end_frame", where))
+            window = (_integer(item, "start_frame", where), _integer(item, "end_frame", where))
         else:
             window = (0, 2**31) if frame < 0 else (frame, frame)
         yield Kitti360Box(_object_id(item, frame, where), label, frame, window, size_m, pose)
@@ -133,26 +134,25 @@ def _refuse_entities(content: bytes, where: str, first: bool) -> None:
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content or b"\0" in content or other:
         raise InputError(
             "box file declares a document type, entities or another encoding, which the data set's files do not",
-            where=where, remedy="use the file from the data set",
-        )  # fmt: skip
+            where=where, remedy="use the file from the data set")  # fmt: skip
 
 
 def _label(item: ElementTree.Element, where: str) -> str:
     if item.find("semanticId") is not None:
-        return LABEL_OF_ID.get(_whole(item, "semanticId", where), "")
+        return LABEL_OF_ID.get(_integer(item, "semanticId", where), "")
     text = (item.findtext("label") or "").strip()
     return "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in text).strip()
 
 
 def _object_id(item: ElementTree.Element, frame: int, where: str) -> str:
     if item.find("instanceId") is not None and item.find("semanticId") is not None:
-        return f"{_whole(item, 'semanticId', where)}-{_whole(item, 'instanceId', where)}"
+        return f"{_integer(item, 'semanticId', where)}-{_integer(item, 'instanceId', where)}"
     if frame >= 0 and item.find("dynamicSeq") is not None:
-        return f"d-{_whole(item, 'dynamicSeq', where)}"
-    return f"i-{_whole(item, 'index', where)}"
+        return f"d-{_integer(item, 'dynamicSeq', where)}"
+    return f"i-{_integer(item, 'index', where)}"
 
 
-def _whole(item: ElementTree.Element, key: str, where: str) -> int:
+def _integer(item: ElementTree.Element, key: str, where: str) -> int:
     text = item.findtext(key)
     try:
         return int(text) if text is not None else int("")
@@ -164,15 +164,13 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     node = item.find(key)
     if node is None:
         raise InputError(f"box has no {key}", where=where)
-    rows, columns = _whole(node, "rows", f"{where}.{key}"), _whole(node, "cols", f"{where}.{key}")
-    words = (node.findtext("data") or "").split()
-    if rows * columns != len(words) or not 0 < rows * columns <= _MAX_VALUES:
-        raise InputError(
-            "matrix does not have the size it declares", where=f"{where}.{key}", expected=f"{rows} x {columns} numbers",
-            got=f"{len(words)} values",
-        )  # fmt: skip
+    rows, columns = _integer(node, "rows", f"{where}.{key}"), _integer(node, "cols", f"{where}.{key}")
+    texts = (node.findtext("data") or "").split()
+    if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
+        raise InputError("matrix does not have the size it declares", where=f"{where}.{key}",
+            expected=f"{rows} x {columns} numbers", got=f"{len(texts)} values")  # fmt: skip
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([float(text) for text in texts])
     except ValueError as error:
         raise InputError("matrix holds no number", where=f"{where}.{key}", got=str(error)) from error
     if not np.isfinite(values).all():
@@ -189,10 +187,8 @@ def _shape(
     the annotation tool called x does not matter for the box.
     """
     if transform.shape != (4, 4) or vertices.shape[1] != 3 or np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(
-            "box is not a 4x4 transform of 3-D vertices", where=where,
-            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}",
-        )  # fmt: skip
+        raise InputError("box is not a 4x4 transform of 3-D vertices", where=where,
+            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}")  # fmt: skip
     low, high = vertices.min(0), vertices.max(0)
     scale = np.linalg.norm(transform[:3, :3], axis=0)
     sizes = scale * (high - low)

@@ -20,7 +20,7 @@ from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import Camera
 from mudg.data.importers.common import rigid_pose, rigid_rotation
 from mudg.data.importers.images import ImageFit, brown_conrady, fit_images
-from mudg.data.importers.kitti.calib import read_number_table
+from mudg.data.importers.kitti.calib import pinhole_camera, read_number_table, table_entry
 from mudg.data.importers.kitti.poses import line_numbers, read_lines
 from mudg.data.importers.options import ImportOptions
 
@@ -57,17 +57,10 @@ class Kitti360Calibration:
             return self._fit_fisheye(camera, name, size, options)
         path = self.folder / "perspective.txt"
         table = read_number_table(path)
-        projection = _entry(table, f"P_rect_{camera[-2:]}", 12, path).reshape(3, 4)
-        declared = _entry(table, f"S_rect_{camera[-2:]}", 2, path)
+        projection = table_entry(table, (f"P_rect_{camera[-2:]}",), (3, 4), path)
+        declared = table_entry(table, (f"S_rect_{camera[-2:]}",), (2,), path)
         _check_size(size, (int(declared[0]), int(declared[1])), f"{path}: S_rect_{camera[-2:]}")
-        if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
-            raise InputError(
-                "projection matrix is not of a rectified pinhole camera", where=f"{path}: P_rect_{camera[-2:]}",
-                expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()),
-            )  # fmt: skip
-        fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2]
-        # KITTI counts pixels from the centre of the top-left one
-        return fit_images(Camera(name, *size, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5), options)
+        return fit_images(pinhole_camera(projection, name, size, f"{path}: P_rect_{camera[-2:]}"), options)
 
     def _fit_fisheye(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
         path = self.folder / f"{camera}.yaml"
@@ -100,7 +93,7 @@ def read_calibration(folder: Path) -> Kitti360Calibration:
     path = folder / "calib_cam_to_pose.txt"
     table = read_number_table(path)
     imu_from_camera = {
-        name: rigid_pose(_entry(table, name, 12, path).reshape(3, 4), f"{path}: {name}")
+        name: rigid_pose(table_entry(table, (name,), (3, 4), path), f"{path}: {name}")
         for name in ("image_00", "image_01", "image_02", "image_03")
         if name == "image_00" or name in table
     }
@@ -110,7 +103,7 @@ def read_calibration(folder: Path) -> Kitti360Calibration:
     for name in ("image_00", "image_01"):
         if name in imu_from_camera:
             where = f"{perspective}: R_rect_{name[-2:]}"
-            rectify = rigid_rotation(_entry(numbers, f"R_rect_{name[-2:]}", 9, perspective).reshape(3, 3), where)
+            rectify = rigid_rotation(table_entry(numbers, (f"R_rect_{name[-2:]}",), (3, 3), perspective), where)
             imu_from_camera[name] = imu_from_camera[name] @ from_rotation_translation(rectify.T, np.zeros(3))
     sick = folder / "calib_sick_to_velo.txt"
     ego_from_imu = invert(IMU_FROM_EGO)
@@ -128,24 +121,11 @@ def _rigid_file(path: Path) -> Matrix:
     return rigid_pose(numbers.reshape(3, 4), str(path))
 
 
-def _entry(table: dict[str, NDArray[np.float64]], key: str, count: int, path: Path) -> NDArray[np.float64]:
-    if key not in table:
-        raise InputError(f"calibration lacks {key}", where=str(path), got=", ".join(table) or "no entries")
-    if table[key].size != count:
-        raise InputError(
-            "calibration entry has the wrong number of values", where=f"{path}: {key}", expected=f"{count} numbers",
-            got=str(table[key].size), remedy="is the file cut off?",
-        )  # fmt: skip
-    return table[key]
-
-
 def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
     if size != declared:
-        raise InputError(
-            "images do not have the size that the calibration is for", where=where,
+        raise InputError("images do not have the size that the calibration is for", where=where,
             expected=f"{declared[0]}x{declared[1]}", got=f"{size[0]}x{size[1]}",
-            remedy="use the images as the data set ships them",
-        )  # fmt: skip
+            remedy="use the images as the data set ships them")  # fmt: skip
 
 
 def _read_fisheye(path: Path) -> dict[str, float]:
@@ -153,10 +133,8 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     text = store.read_bytes(path).decode("utf-8", "replace")
     model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
     if model is None or model[1] != "MEI":
-        raise InputError(
-            "fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
-            got=model[1] if model else "no model_type",
-        )  # fmt: skip
+        raise InputError("fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
+            got=model[1] if model else "no model_type")  # fmt: skip
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
         try:
@@ -166,7 +144,7 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     missing = [key for key in _FISHEYE_VALUES if key not in found]
     if missing:
         raise InputError("fisheye calibration is incomplete", where=str(path), expected=", ".join(_FISHEYE_VALUES),
-                         got=f"no {', '.join(missing)}", remedy="is the file cut off?")  # fmt: skip
+            got=f"no {', '.join(missing)}", remedy="is the file cut off?")  # fmt: skip
     if found["xi"] < 0 or found["gamma1"] <= 0 or found["gamma2"] <= 0:
         raise InputError("fisheye calibration makes no sense", where=str(path), expected="xi >= 0, gamma1 and gamma2 > 0",
                          got=f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}")  # fmt: skip

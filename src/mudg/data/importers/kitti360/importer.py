@@ -1,11 +1,11 @@
 """KITTI-360 importer: one drive of the data set's folder.
 
 ========================== =========================================================================================
-``calibration/``           cameras, velodyne, SICK (``kitti360_calib``)
+``calibration/``           cameras, velodyne, SICK (``calib``)
 ``data_2d_raw/<drive>/``   ``image_00|01/data_rect`` (rectified stereo), ``image_02|03/data_rgb`` (fisheyes)
 ``data_3d_raw/<drive>/``   ``velodyne_points/data``, ``sick_points/data``, each with ``timestamps.txt``
 ``data_poses/<drive>/``    ``poses.txt`` (vehicle) or ``cam0_to_world.txt`` (rectified camera 0), for part of the frames
-``data_3d_bboxes/``        ``train_full/<drive>.xml``, else ``train/<drive>.xml`` (``kitti360_boxes``)
+``data_3d_bboxes/``        ``train_full/<drive>.xml``, else ``train/<drive>.xml`` (``boxes``)
 ``data_2d_semantics/``     ``train/<drive>/image_00|01/semantic`` and ``confidence``, where there are any
 ========================== =========================================================================================
 
@@ -25,7 +25,8 @@ looks along the lens' axis and is 90 degrees wide and high, with the lens' own r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -35,27 +36,27 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.errors import InputError
+from mudg.base.geometry import invert, transform_points
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track, View
+from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track
+from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
-from mudg.data.importers.common import deskew, for_each, pose_near, rigid_pose, seconds
-from mudg.data.importers.images import ImageFit
+from mudg.data.importers.common import deskew, pose_near, rigid_pose, seconds, world_from_first
+from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.data.importers.images import ImageFit, image_notes, image_size
 from mudg.data.importers.kitti import poses as kitti_poses
-from mudg.data.importers.kitti.importer import read_scan
-from mudg.data.importers.kitti360.boxes import WORDS, read_boxes
+from mudg.data.importers.kitti.scans import SENSOR, read_scan
+from mudg.data.importers.kitti360.boxes import LABEL_OF, Kitti360Box, read_boxes
 from mudg.data.importers.kitti360.calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
-from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, some_numbers, whole_frames
-from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.scene import SceneWriter, decode_image
+from mudg.data.importers.layout import LogFiles
+from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
 CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "side_left", "image_03": "side_right"}
 USUAL: Final = ("image_00", "image_01")
-SENSOR: Final = "velodyne"
 SICK: Final = "sick"
 FRAME_PERIOD_S: Final = 0.1
 MAX_GAP_M: Final = 3.0
@@ -85,6 +86,11 @@ class _Folders:
     def semantics(self, camera: str, kind: str, number: int) -> Path:
         return self.root / "data_2d_semantics" / "train" / self.drive / camera / kind / f"{number:010d}.png"
 
+    def boxes(self) -> tuple[Path, Path]:
+        """Where boxes may be, the better first."""
+        folder = self.root / "data_3d_bboxes"
+        return folder / "train_full" / f"{self.drive}.xml", folder / "train" / f"{self.drive}.xml"
+
 
 def looks_like_kitti360(source: Path) -> bool:
     """Whether ``source`` is the data set's folder (``data_2d_raw`` and ``calibration`` in it), or a drive's in ``data_2d_raw``."""
@@ -109,64 +115,57 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     folders = _find(source, options)
     calibration = read_calibration(folders.root / "calibration")
-    images = {name: numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
+    images = {name: layout.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
     available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
-    chosen = chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
-    scans = numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
+    chosen = layout.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
+    scans = layout.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
     streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
     notes: list[str] = []
     clock = _clock(folders, streams, notes)
-    motion = _Motion.read(folders, calibration, clock, options, notes)
-    placed = {name: [n for n in found if motion.known(clock[n])] for name, found in streams.items()}
-    frames = whole_frames(placed, options, str(folders.root), "kitti360")
-    _say_left_out(streams, placed, options, notes)
-    start_s, world_from_source = float(clock[frames[0]]), motion.level_at(clock[frames[0]])
+    poses = _find_poses(folders, options)
+    notes.append(f"poses from {poses.name}")
+    ego = _read_motion(poses, calibration, clock)
+    placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
+    frames = layout.complete_frames(placed, options, str(folders.root), "kitti360")
+    notes += _without_pose(streams.values(), placed.values(), options)
+    start_s = float(clock[frames[0]])
+    world_from_source = world_from_first(pose_near(ego, clock[frames[0]]))
     scene_s = seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
-    motion = motion.moved(start_s, world_from_source)
-    fits = {name: _fit(calibration, name, images[name][frames[0]], options) for name in chosen}
+    ego = EgoPath(ego.times_s - start_s, world_from_source @ ego.world_from_ego)
+    fits = {CAMERAS[n]: calibration.fit(n, CAMERAS[n], image_size(images[n][frames[0]]), options) for n in chosen}
     untwist = bool(scans) and options.untwist != "no"
     if not scans:
         log.warn("kitti360: no scans found: the scene has images only, and there is nothing to fuse")
     elif untwist:
         notes.append("scans untwisted: clockwise turn of 0.1 s, forward at the frame's moment")
-    notes += [fit.words for fit in fits.values() if fit.words]
+    notes += image_notes(fits)
     notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
-    sick = _Sick.find(folders, calibration, motion, start_s, notes)
+    sick = _SickLines.find(folders, calibration, ego, start_s, notes)
     tracks = _read_tracks(folders, options, dict(zip(frames, scene_s, strict=True)), world_from_source, notes)
-    for note in notes:
-        log.info(f"kitti360: {note}")
 
-    def convert(index: int) -> None:
+    def convert(index: int) -> Iterable[SceneImage | SceneSweep]:
         number, time_s = frames[index], float(scene_s[index])
-        world_from_ego = motion.at(time_s)
+        world_from_ego = pose_near(ego, time_s)
         for name in chosen:
-            view = View(fits[name].camera, world_from_ego @ calibration.ego_from_camera[name], time_s)
-            path, labels = images[name][number], _labels(folders, name, number, fits[name])
-            writer.add_frame(f"{CAMERAS[name]}/{index:06d}", view, fits[name].image(path, str(path)), labels)
-        world_from_velo = world_from_ego @ calibration.ego_from_velo
+            world_from_cam = world_from_ego @ calibration.ego_from_camera[name]
+            path, labels = images[name][number], _labels(folders, name, number, fits[CAMERAS[name]])
+            yield SceneImage(CAMERAS[name], index, time_s, world_from_cam, path, str(path), labels)
         if number in scans:
             points = read_scan(scans[number])
             if untwist:
-                points = _untwisted(points, motion, calibration, time_s)
-            writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, time_s, world_from_velo, points)
+                points = _untwisted(points, ego, calibration, time_s)
+            world_from_velo = world_from_ego @ calibration.ego_from_velo
+            yield SceneSweep(SENSOR, index, time_s, world_from_velo, points, str(scans[number]))
         if sick is not None:
-            pose, lines = sick.sweep(time_s)
-            if len(lines.xyz):
-                writer.add_sweep(f"{SICK}/{index:06d}", SICK, time_s, pose, lines)
+            yield from sick.sweeps(index, time_s)
 
-    with SceneWriter(out, folders.drive, Source("kitti360", LICENCE, None, tuple(notes))) as writer:
-        for fit in fits.values():
-            writer.add_camera(fit.camera)
-        for_each(
-            range(len(frames)), convert, title="importing KITTI-360", workers=options.workers,
-            name=lambda index: f"frame {frames[index]}",
-        )  # fmt: skip
-        for track in tracks:
-            writer.add_track(track)
-        writer.set_ego(motion.path(scene_s))
-        moments = [[f"{CAMERAS[name]}/{index:06d}" for name in chosen] for index in range(len(frames))]
-        writer.set_split(holdout_split(moments, options.test_every))
-        return writer.finish()
+    origin = Source("kitti360", LICENCE, None, tuple(notes))
+    path = EgoPath(scene_s, np.stack([pose_near(ego, float(time_s)) for time_s in scene_s]))
+    content = SceneContent(
+        folders.drive, origin, fits, range(len(frames)), convert, lambda index: f"frame {frames[index]}", path,
+        tracks=lambda: (tracks, ()),
+    )  # fmt: skip
+    return write_scene(content, out, options)
 
 
 def _find(source: Path, options: ImportOptions) -> _Folders:
@@ -176,19 +175,12 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
         return _Folders(source.absolute().parent.parent, source.absolute().name)
     raw = source / "data_2d_raw"
     if not raw.is_dir():
-        raise InputError(
-            "no KITTI-360 recording found", where=str(source), expected="data_2d_raw, data_poses and calibration in it",
-            got=", ".join(sorted(path.name for path in source.iterdir())[:12]) or "an empty folder",
-        )  # fmt: skip
+        raise InputError("no KITTI-360 recording found", where=str(source), got=layout.folder_contents(source),
+            expected="data_2d_raw, data_poses and calibration in it")  # fmt: skip
     drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
-    wanted = options.sequence or (drives[0] if len(drives) == 1 else "")
-    matching = [d for d in drives if wanted and (d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}"))]
-    if len(matching) != 1:
-        raise UsageError(
-            "there is no such drive" if wanted else "the folder holds several drives", where=str(raw),
-            expected="--sequence with one of " + ", ".join(drives[:12]), got=wanted or "none chosen",
-        )  # fmt: skip
-    return _Folders(source, matching[0])
+    wanted = options.sequence
+    matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
+    return _Folders(source, layout.the_only(matching, drives, options, raw, "drive"))
 
 
 def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
@@ -196,28 +188,17 @@ def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
     folders = _find(source, options)
     root, drive = folders.root, folders.drive
     parts = [root / "calibration", *(root / name / drive for name in ("data_2d_raw", "data_3d_raw", "data_poses"))]
-    parts += [root / "data_2d_semantics" / "train" / drive]
-    parts += [root / "data_3d_bboxes" / part / f"{drive}.xml" for part in ("train_full", "train")]
+    parts += [root / "data_2d_semantics" / "train" / drive, *folders.boxes()]
     return LogFiles(tuple(part for part in parts if part.exists()))
 
 
-def _fit(calibration: Kitti360Calibration, camera: str, first: Path, options: ImportOptions) -> ImageFit:
-    height, width = decode_image(store.read_bytes(first), str(first)).shape[:2]
-    return calibration.fit(camera, CAMERAS[camera], (width, height), options)
-
-
-def _say_left_out(
-    streams: Mapping[str, Mapping[int, Path]],
-    placed: Mapping[str, Sequence[int]],
-    options: ImportOptions,
-    notes: list[str],
-) -> None:
-    everything = {n for found in streams.values() for n in found}
-    if options.frames is not None:
-        everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
-    lost = sorted(everything - {n for found in placed.values() for n in found})
-    if lost:
-        notes.append(f"frames without a pose or time stamp were left out: {some_numbers(lost)}")
+def _without_pose(
+    streams: Iterable[Iterable[int]], placed: Iterable[Iterable[int]], options: ImportOptions
+) -> list[str]:
+    """A note about the frames within ``options.frames`` that some stream has and none could place."""
+    first, end = options.frames or (0, 2**63)
+    lost = {n for found in streams for n in found if first <= n < end}.difference(*placed)
+    return [f"frames without a pose or time stamp were left out: {layout.number_ranges(sorted(lost))}"] if lost else []
 
 
 # --- time and motion ------------------------------------------------------------------------------------------------
@@ -249,98 +230,64 @@ def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.floa
     elif len(stamps) == len(files) > 0:
         times[list(files)] = stamps
     else:
-        raise InputError(
-            "timestamps do not cover the frames", where=str(path), got=f"{len(given)} lines, {len(files)} files",
-            expected=f"at least {last + 1} lines (line k = frame k), or one per file", remedy="is the file cut off?",
-        )  # fmt: skip
+        raise InputError("timestamps do not cover the frames", where=str(path),
+            got=f"{len(given)} lines, {len(files)} files",
+            expected=f"at least {last + 1} lines (line k = frame k), or one per file", remedy="is the file cut off?")  # fmt: skip
     return times
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Motion:
-    """The vehicle at the frames that have a pose."""
-
-    ego: EgoPath
-
-    @classmethod
-    def read(
-        cls,
-        folders: _Folders,
-        calibration: Kitti360Calibration,
-        clock: NDArray[np.float64],
-        options: ImportOptions,
-        notes: list[str],
-    ) -> _Motion:
-        here = folders.root / "data_poses" / folders.drive
-        found = [options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]
-        path = next((p for p in found if p is not None and p.is_file()), None)
-        if path is None:
-            raise InputError(
-                "no vehicle poses found", where=str(options.poses or here), expected="poses.txt or cam0_to_world.txt",
-                remedy="download the data set's vehicle poses",
-            )  # fmt: skip
-        notes.append(f"poses from {path.name}")
-        numbers, poses, before = [], [], -1
-        for index, line in enumerate(kitti_poses.read_lines(path)):
-            where = f"{path}: line {index + 1}"
-            row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
-            number = int(row[0])
-            if number != row[0] or number <= before:
-                raise InputError(
-                    "first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
-                    remedy="is the file of another kind?",
-                )  # fmt: skip
-            before = number
-            if number < len(clock) and np.isfinite(clock[number]):
-                pose = rigid_pose(row[1:].reshape(-1, 4), where)
-                numbers.append(number)
-                poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
-        if not poses:
-            raise InputError(
-                "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
-            )
-        times = clock[numbers]
-        if (np.diff(times) <= 0).any():
-            at = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
-            raise InputError("timestamps do not increase", where=f"{folders.root}: {folders.drive}, frame {at}")
-        return cls(EgoPath(times, np.stack(poses) @ IMU_FROM_EGO))
-
-    def known(self, time_s: float) -> bool:
-        """Whether there is a pose at a time, or it can be interpolated. NaN: no."""
-        times = self.ego.times_s
-        if not np.isfinite(time_s):
-            return False
-        after = int(np.searchsorted(times, time_s))
-        if after < len(times) and times[after] - time_s < 1e-9:
-            return True
-        if after in (0, len(times)):
-            return False
-        moved = self.ego.world_from_ego[after, :3, 3] - self.ego.world_from_ego[after - 1, :3, 3]
-        return bool(np.linalg.norm(moved) < MAX_GAP_M)
-
-    def at(self, time_s: float) -> Matrix:
-        """World-from-ego; a little beyond the ends the vehicle goes on as before (half a turn of the sensor needs it)."""
-        return pose_near(self.ego, time_s)
-
-    def level_at(self, time_s: float) -> Matrix:
-        """The scene's world from the data set's: origin and heading of the vehicle at a time, upright."""
-        pose = self.at(time_s)
-        return yaw_matrix(-yaw_of(pose)) @ from_rotation_translation(np.eye(3), -pose[:3, 3])
-
-    def moved(self, start_s: float, world_from_source: Matrix) -> _Motion:
-        """The same motion in another clock and world."""
-        return _Motion(EgoPath(self.ego.times_s - start_s, world_from_source @ self.ego.world_from_ego))
-
-    def path(self, times_s: NDArray[np.float64]) -> EgoPath:
-        """The vehicle at the imported frames."""
-        return EgoPath(times_s, np.stack([self.at(float(time)) for time in times_s]))
+def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
+    here = folders.root / "data_poses" / folders.drive
+    path = layout.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
+    if path is None:
+        raise InputError("no vehicle poses found", where=str(options.poses or here),
+            expected="poses.txt or cam0_to_world.txt", remedy="download the data set's vehicle poses")  # fmt: skip
+    return path
 
 
-def _untwisted(points: SweepPoints, motion: _Motion, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:
+def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np.float64]) -> EgoPath:
+    """The vehicle at the frames that have a pose, in the data set's world and clock."""
+    numbers, poses, before = [], [], -1
+    for index, line in enumerate(kitti_poses.read_lines(path)):
+        where = f"{path}: line {index + 1}"
+        row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
+        number = int(row[0])
+        if number != row[0] or number <= before:
+            raise InputError("first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
+                remedy="is the file of another kind?")  # fmt: skip
+        before = number
+        if number < len(clock) and np.isfinite(clock[number]):
+            pose = rigid_pose(row[1:].reshape(-1, 4), where)
+            numbers.append(number)
+            poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
+    if not poses:
+        raise InputError("no pose belongs to a frame", where=str(path),
+            expected=f"frame numbers up to {len(clock) - 1}")  # fmt: skip
+    times = clock[numbers]
+    if (np.diff(times) <= 0).any():
+        frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
+        raise InputError("timestamps do not increase", where=f"{path}: frame {frame}")
+    return EgoPath(times, np.stack(poses) @ IMU_FROM_EGO)
+
+
+def _has_pose(ego: EgoPath, time_s: float) -> bool:
+    """Whether there is a pose at a time, or it can be interpolated. NaN: no."""
+    if not np.isfinite(time_s):
+        return False
+    after = int(np.searchsorted(ego.times_s, time_s))
+    if after < len(ego.times_s) and ego.times_s[after] - time_s < 1e-9:
+        return True
+    if after in (0, len(ego.times_s)):
+        return False
+    moved = ego.world_from_ego[after, :3, 3] - ego.world_from_ego[after - 1, :3, 3]
+    return bool(np.linalg.norm(moved) < MAX_GAP_M)
+
+
+def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:
     """A scan as seen at its frame's moment: a point at azimuth a was measured a / 2 pi turns before it."""
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
     dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
-    xyz = deskew(points.xyz, dt_s, lambda t: motion.at(t) @ calibration.ego_from_velo, time_s)
+    xyz = deskew(points.xyz, dt_s, lambda t: pose_near(ego, t) @ calibration.ego_from_velo, time_s)
     return SweepPoints(xyz, points.intensity, dt_s)
 
 
@@ -348,19 +295,19 @@ def _untwisted(points: SweepPoints, motion: _Motion, calibration: Kitti360Calibr
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Sick:
+class _SickLines:
     """Line scans beside the frames: files, their times in the scene's clock, and where the scanner sits."""
 
     files: Mapping[int, Path]
     times_s: NDArray[np.float64]
     ego_from_sick: Matrix
-    motion: _Motion
+    ego: EgoPath
 
     @classmethod
     def find(
-        cls, folders: _Folders, calibration: Kitti360Calibration, motion: _Motion, start_s: float, notes: list[str]
-    ) -> _Sick | None:
-        files = numbered_files(folders.raw("sick_points") / "data", (".bin",))
+        cls, folders: _Folders, calibration: Kitti360Calibration, ego: EgoPath, start_s: float, notes: list[str]
+    ) -> _SickLines | None:
+        files = layout.numbered_files(folders.raw("sick_points") / "data", (".bin",))
         stamps = folders.raw("sick_points") / "timestamps.txt"
         if not files:
             return None
@@ -368,23 +315,24 @@ class _Sick:
             notes.append("SICK lines were left out: calib_sick_to_velo.txt or their timestamps.txt is missing")
             return None
         times = _stamps(stamps, files, max(files)) - start_s
-        return cls(files, times, calibration.ego_from_velo @ calibration.velo_from_sick, motion)
+        return cls(files, times, calibration.ego_from_velo @ calibration.velo_from_sick, ego)
 
-    def sweep(self, time_s: float) -> tuple[Matrix, SweepPoints]:
-        """Pose of the scanner at a frame and the lines within half a frame of it, brought to that moment."""
-        pose = self.motion.at(time_s) @ self.ego_from_sick
-        parts, delays = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.float32)]
+    def sweeps(self, index: int, time_s: float) -> Iterable[SceneSweep]:
+        """The lines within half a frame of frame ``index`` as one sweep, brought to that moment; none without lines."""
+        pose = pose_near(self.ego, time_s) @ self.ego_from_sick
+        parts, delays = [], []
         for number in np.flatnonzero(np.abs(self.times_s - time_s) < _SICK_REACH_S):
             late = float(self.times_s[number] - time_s)
             nearer = late >= FRAME_PERIOD_S / 2 or late < -FRAME_PERIOD_S / 2
             if int(number) not in self.files or nearer:
                 continue
             line = _read_line(self.files[int(number)])
-            moved = invert(pose) @ self.motion.at(time_s + late) @ self.ego_from_sick
-            parts.append(transform_points(moved, line))
+            parts.append(transform_points(invert(pose) @ pose_near(self.ego, time_s + late) @ self.ego_from_sick, line))
             delays.append(np.full(len(line), late, np.float32))
-        xyz = np.concatenate(parts)
-        return pose, SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays))
+        xyz = np.concatenate(parts or [np.zeros((0, 3), np.float32)])
+        if len(xyz):
+            points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays))
+            yield SceneSweep(SICK, index, time_s, pose, points)
 
 
 def _read_line(path: Path) -> NDArray[np.float32]:
@@ -404,9 +352,8 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
         return {}
     ids = _grey(path)
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
-        raise InputError(
-            "semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits"
-        )
+        raise InputError("semantic image holds ids that do not exist", where=str(path),
+            expected=f"0..{_LAST_ID}, 8 bits")  # fmt: skip
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
@@ -423,9 +370,8 @@ def _grey(path: Path) -> NDArray[Any]:
     try:
         with Image.open(path, formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
-                raise InputError(
-                    "label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits"
-                )
+                raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}",
+                    expected="8 or 16 bits")  # fmt: skip
             array = np.array(image)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
@@ -440,44 +386,43 @@ def _read_tracks(
     notes: list[str],
 ) -> list[Track]:
     """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn in."""
-    found = [folders.root / "data_3d_bboxes" / part / f"{folders.drive}.xml" for part in ("train_full", "train")]
-    path = options.boxes or next((p for p in found if p.is_file()), None)
+    path = options.boxes or layout.first_file(*folders.boxes())
     if path is None:
         notes.append("no boxes found: everything counts as static")
         return []
     notes.append(f"boxes from {path.parent.name}/{path.name}")
     numbers = np.array(sorted(time_of))
-    tracks, left_out, outside = BoxTracks(str(path), WORDS), {}, 0
-    spans: dict[str, list[Any]] = {}
+    tracks = BoxTracks(str(path), LABEL_OF)
+    left_out: Counter[str] = Counter()
+    outside = 0
+    standing: dict[str, tuple[Kitti360Box, list[int]]] = {}
     moving: dict[str, set[int]] = {}
+
+    def add(name: str, box: Kitti360Box, frame: int) -> None:
+        pose, still = world_from_source @ box.world_from_box, box.frame < 0
+        tracks.add(name, tracks.label_of(box.label), time_of[frame], box.size_m, pose, standing=still)
+
     for box in read_boxes(path, left_out):
-        pose = world_from_source @ box.world_from_box
-        if box.frame >= 0:
-            seen = moving.setdefault(box.object_id, set())
-            if box.frame in seen:  # the parts of a drive overlap; the data set's own reader keeps one box, too
-                left_out["that an object has twice in a frame"] = (
-                    left_out.get("that an object has twice in a frame", 0) + 1
-                )
-            elif box.frame in time_of:
-                seen.add(box.frame)
-                tracks.add(box.object_id, tracks.word(box.label), time_of[box.frame], box.size_m, pose)
-            else:
-                outside += 1
+        if box.frame < 0:
+            inside = numbers[(numbers >= box.window[0]) & (numbers <= box.window[1])]
+            outside += not len(inside)
+            if len(inside):
+                standing.setdefault(box.object_id, (box, []))[1].extend((int(inside[0]), int(inside[-1])))
             continue
-        inside = numbers[(numbers >= box.window[0]) & (numbers <= box.window[1])]
-        if not len(inside):
+        seen = moving.setdefault(box.object_id, set())
+        if box.frame in seen:  # the parts of a drive overlap; the data set's own reader keeps one box, too
+            left_out["that an object has twice in a frame"] += 1
+        elif box.frame in time_of:
+            seen.add(box.frame)
+            add(box.object_id, box, box.frame)
+        else:
             outside += 1
-            continue
-        span = spans.setdefault(box.object_id, [box, pose, int(inside[0]), int(inside[-1])])
-        span[2], span[3] = min(span[2], int(inside[0])), max(span[3], int(inside[-1]))
-    for name, (box, pose, first, last) in spans.items():
-        for number in dict.fromkeys((first, last)):
-            tracks.add(
-                f"s-{name}" if name in moving else name, tracks.word(box.label), time_of[number], box.size_m, pose, standing=True
-            )
+    for name, (box, frames) in standing.items():
+        for frame in dict.fromkeys((min(frames), max(frames))):
+            add(f"s-{name}" if name in moving else name, box, frame)
     if outside:
         notes.append(f"{outside} boxes lie outside the imported frames and were left out")
-    notes += [f"{count} boxes {words} were left out" for words, count in left_out.items()]
+    notes += [f"{count} boxes {what} were left out" for what, count in left_out.items()]
     result, track_notes = tracks.tracks()
     notes += track_notes
     return result

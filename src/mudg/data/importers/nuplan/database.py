@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base.errors import InputError
+from mudg.data.importers.columns import require_columns
 from mudg.data.importers.common import pose_from_quaternion
+from mudg.data.importers.layout import path_inside
 from mudg.data.importers.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
 
 Matrix = NDArray[np.float64]
@@ -57,10 +59,10 @@ class NuplanCamera:
 
 @dataclass(frozen=True, slots=True)
 class NuplanCloud:
-    """One point cloud: its token, file below the sensor blobs, time (us), and world-from-lidar f64[4, 4] in the log's world."""
+    """One point cloud: its token, file, time (us), and world-from-lidar f64[4, 4] in the log's world."""
 
     token: bytes
-    file: str
+    file: Path
     time_us: int
     world_from_lidar: Matrix
 
@@ -79,9 +81,8 @@ class NuplanLog:
             for row in self._connection.execute(question, values):  # noqa: UP028
                 yield row
         except (sqlite3.Error, OverflowError) as error:
-            raise InputError(
-                "log database is damaged", where=str(self.path), got=str(error), remedy="copy the file again"
-            ) from error
+            raise InputError("log database is damaged", where=str(self.path), got=str(error),
+                remedy="copy the file again") from error  # fmt: skip
 
     def check(self) -> None:
         """Refuse a database that is not a nuPlan log."""
@@ -90,17 +91,10 @@ class NuplanLog:
         }
         for table, columns in SCHEMA.items():
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
-                raise InputError(
-                    f"database has no table {table!r}", where=str(self.path), expected=", ".join(SCHEMA),
-                    got=", ".join(sorted(tables)) or "no tables", remedy="is it a nuPlan log (v1.1)?",
-                )  # fmt: skip
-            there = {str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")}
-            missing = [column for column in columns if column not in there]
-            if missing:
-                raise InputError(
-                    f"table {table!r} lacks columns", where=str(self.path), expected=", ".join(columns),
-                    got=f"no {', '.join(missing)}", remedy="is it a nuPlan log of version 1.1?",
-                )  # fmt: skip
+                raise InputError(f"database has no table {table!r}", where=str(self.path), expected=", ".join(SCHEMA),
+                    got=", ".join(sorted(tables)) or "no tables", remedy="is it a nuPlan log (v1.1)?")  # fmt: skip
+            there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
+            require_columns(columns, there, f"{self.path}: {table}")
 
     def name(self) -> str:
         """The log's name, e.g. ``2021.05.12.22.00.38_veh-35_01008_01518``."""
@@ -117,15 +111,10 @@ class NuplanLog:
         ):
             where = f"{self.path}: camera {channel}"
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
-            if (
-                abs(matrix[0, 1]) > 1e-6
-                or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
-                or min(matrix[0, 0], matrix[1, 1]) <= 0
-            ):
-                raise InputError(
-                    "intrinsics are not of a pinhole camera", where=f"{where}.intrinsic", got=str(matrix.tolist()),
-                    expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
-                )  # fmt: skip
+            skewed = abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
+            if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
+                raise InputError("intrinsics are not of a pinhole camera", where=f"{where}.intrinsic",
+                    got=str(matrix.tolist()), expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")  # fmt: skip
             found[bytes(token)] = NuplanCamera(
                 str(channel),
                 self._pose(values[0], values[1], where),
@@ -155,8 +144,8 @@ class NuplanLog:
             )
         )
 
-    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix]) -> NuplanCloud:
-        """One point cloud with its pose."""
+    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix], blobs: Path) -> NuplanCloud:
+        """One point cloud with its pose; its file lies below ``blobs``."""
         for lidar, file, time_us, *pose in self.rows(
             "SELECT p.lidar_token, p.filename, p.timestamp, e.x, e.y, e.z, e.qw, e.qx, e.qy, e.qz "
             "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token = ?",
@@ -165,17 +154,12 @@ class NuplanLog:
             where = f"{self.path}: lidar_pc {token.hex()}"
             if bytes(lidar) not in ego_from_lidar:
                 raise InputError("point cloud is of a LiDAR that is not there", where=where, got=bytes(lidar).hex())
-            world_from_ego = self._ego(pose, where)
+            world_from_lidar = self._ego(pose, where) @ ego_from_lidar[bytes(lidar)]
             return NuplanCloud(
-                token,
-                _blob_name(file, where),
-                self._time(time_us, "lidar_pc"),
-                world_from_ego @ ego_from_lidar[bytes(lidar)],
+                token, path_inside(blobs, file, where), self._time(time_us, "lidar_pc"), world_from_lidar
             )
-        raise InputError(
-            "point cloud has no vehicle pose", where=f"{self.path}: lidar_pc {token.hex()}.ego_pose_token",
-            expected="a token of ego_pose",
-        )  # fmt: skip
+        raise InputError("point cloud has no vehicle pose", where=f"{self.path}: lidar_pc {token.hex()}.ego_pose_token",
+            expected="a token of ego_pose")  # fmt: skip
 
     def ego_poses(self, first_us: int, last_us: int) -> tuple[NDArray[np.int64], Matrix]:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
@@ -189,13 +173,14 @@ class NuplanLog:
                 poses.append(self._ego(pose, f"{self.path}: ego_pose at {time_us}"))
         return np.array(times, np.int64), np.array(poses).reshape(-1, 4, 4)
 
-    def images(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, int]]:
-        """Camera token, file below the sensor blobs, and time (us), in order of time."""
+    def images(self, first_us: int, last_us: int, blobs: Path) -> Iterator[tuple[bytes, Path, int]]:
+        """Camera token, file below ``blobs``, and time (us), in order of time."""
         for camera, file, time_us in self.rows(
             "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
             (first_us, last_us),
         ):
-            yield bytes(camera), _blob_name(file, f"{self.path}: image at {time_us}"), self._time(time_us, "image")
+            path = path_inside(blobs, file, f"{self.path}: image at {time_us}")
+            yield bytes(camera), path, self._time(time_us, "image")
 
     def boxes(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, str, tuple[float, ...]]]:
         """Cloud, track, class, and x y z yaw length width height (metres, radians, the log's world) of all boxes of a span.
@@ -210,10 +195,8 @@ class NuplanLog:
         ):
             where = f"{self.path}: lidar_box of track {bytes(track or b'').hex()}"
             if label is None:
-                raise InputError(
-                    "box names a track or class that is not there", where=where, expected="tokens of track and category",
-                    remedy="copy the file again",
-                )  # fmt: skip
+                raise InputError("box names a track or class that is not there", where=where,
+                    expected="tokens of track and category", remedy="copy the file again")  # fmt: skip
             yield bytes(cloud), bytes(track).hex(), str(label), tuple(_finite(number, where) for number in numbers)
 
     def scenes(self) -> list[str]:
@@ -224,9 +207,8 @@ class NuplanLog:
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if not isinstance(value, int):
-            raise InputError(
-                "timestamp is no whole number", where=f"{self.path}: {table}.timestamp", got=repr(value)[:40]
-            )
+            raise InputError("timestamp is no whole number", where=f"{self.path}: {table}.timestamp",
+                got=repr(value)[:40])  # fmt: skip
         return value
 
     def _ego(self, row: list[Any], where: str) -> Matrix:
@@ -247,9 +229,8 @@ class NuplanLog:
         for item in as_list(read_pickle(blob, where, _MAKERS), where)[:_MAX_NUMBERS]:
             flat += [_finite(value, where) for value in (item if isinstance(item, list | tuple) else [item])]
         if count is not None and len(flat) != count:
-            raise InputError(
-                "calibration has the wrong number of values", where=where, expected=str(count), got=str(len(flat))
-            )
+            raise InputError("calibration has the wrong number of values", where=where, expected=str(count),
+                got=str(len(flat)))  # fmt: skip
         return flat
 
 
@@ -257,17 +238,6 @@ def _finite(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise InputError("value is not a finite number", where=where, got=repr(value)[:40])
     return float(value)
-
-
-def _blob_name(value: Any, where: str) -> str:
-    """A relative path of plain components; anything that leads elsewhere is refused."""
-    parts = value.split("/") if isinstance(value, str) else []
-    if not parts or any(part in ("", ".", "..") or "\\" in part or ":" in part or "\0" in part for part in parts):
-        raise InputError(
-            "file name leads out of the sensor blobs", where=where, got=repr(value)[:80],
-            expected="a relative path, e.g. LOG/CAM_F0/0123456789abcdef.jpg",
-        )  # fmt: skip
-    return str(value)
 
 
 @contextmanager
@@ -290,10 +260,8 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
         opened.check()
         yield opened
     except sqlite3.Error as error:
-        raise InputError(
-            "file is not a readable SQLite database", where=str(path), got=str(error), expected="a nuPlan log (.db)",
-            remedy="is it cut off, or still packed?",
-        ) from error  # fmt: skip
+        raise InputError("file is not a readable SQLite database", where=str(path), got=str(error),
+            expected="a nuPlan log (.db)", remedy="is it cut off, or still packed?") from error  # fmt: skip
     finally:
         if connection is not None:
             connection.close()

@@ -18,7 +18,7 @@ middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offli
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -26,18 +26,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import from_rotation_translation, yaw_matrix, yaw_of
-from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, View
+from mudg.base.geometry import yaw_matrix
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_cloud
-from mudg.data.importers.common import for_each, seconds
-from mudg.data.importers.images import ImageFit, brown_conrady, fit_images
-from mudg.data.importers.layout import LogFiles, chosen_cameras, refuse_options
+from mudg.data.importers.common import nearest_index, seconds, world_from_first
+from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.data.importers.images import ImageFit, brown_conrady, fit_images, image_notes
+from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
 from mudg.data.importers.nuplan.database import NuplanCamera, NuplanCloud, NuplanLog, open_log
-from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.scene import SceneWriter
+from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
@@ -46,7 +45,7 @@ CAMERAS: Final = {
     "CAM_L2": "back_left", "CAM_R2": "back_right", "CAM_B0": "back",
 }  # fmt: skip
 SENSOR: Final = "merged"
-WORDS: Final = {
+LABELS: Final = {
     "vehicle": "vehicle", "bicycle": "bicycle", "pedestrian": "pedestrian", "traffic_cone": "traffic_cone",
     "barrier": "barrier", "czone_sign": "sign", "generic_object": "generic_object",
 }  # fmt: skip
@@ -93,8 +92,7 @@ def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
     refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)
     with open_log(path) as opened:
-        plan = _Plan.make(opened, scene, options)
-        return _write(opened, plan, out, options)
+        return write_scene(_content(opened, _plan(opened, scene, options), options), out, options)
 
 
 def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
@@ -108,39 +106,27 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
         raise InputError("nuPlan log does not exist", where=str(source), expected="a .db file or a folder of them")
     databases = {path.stem: path for path in _databases(source)}
     if not databases:
-        raise InputError(
-            "no nuPlan log found", where=str(source), expected="*.db here or in splits/*",
-            got=", ".join(sorted(entry.name for entry in source.iterdir())[:12]) or "an empty folder",
-        )  # fmt: skip
+        raise InputError("no nuPlan log found", where=str(source), expected="*.db here or in splits/*",
+            got=folder_contents(source))  # fmt: skip
     log_name, _, scene = options.sequence.partition("/")
     if log_name in databases:
         return databases[log_name], scene
     if len(databases) == 1 and not scene:
         return next(iter(databases.values())), log_name
-    raise UsageError(
-        "the folder holds several logs" if not log_name else "there is no such log", where=str(source),
-        expected="--sequence with one of " + ", ".join(list(databases)[:8]), got=log_name or "none chosen",
-    )  # fmt: skip
+    return databases[the_only([] if log_name else list(databases), list(databases), options, source, "log")], scene
 
 
 def files_of_nuplan(source: Path, options: ImportOptions) -> LogFiles:
     """The log's database, and which sensor blobs there are."""
     path, _ = _find(source, options)
-    found = (folder / "sensor_blobs" / path.stem for folder in path.resolve().parents[:5])
-    blobs = next((folder for folder in found if folder.is_dir()), None)
-    return LogFiles((path,), tuple(sorted(blobs.iterdir())) if blobs is not None else ())
+    blobs = _sensor_blobs(path, path.stem)
+    return LogFiles((path,), tuple(sorted((blobs / path.stem).iterdir())) if blobs is not None else ())
 
 
-def _blobs(path: Path, name: str) -> Path:
-    """The folder ``sensor_blobs`` that holds this log."""
-    for folder in path.resolve().parents[:5]:
-        if (folder / "sensor_blobs" / name).is_dir():
-            return folder / "sensor_blobs"
-    raise InputError(
-        "sensor blobs of the log were not found", where=str(path),
-        expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
-        remedy="download the camera and LiDAR blobs of this log; the database alone holds no images",
-    )  # fmt: skip
+def _sensor_blobs(path: Path, name: str) -> Path | None:
+    """The folder ``sensor_blobs`` that holds this log, beside the database or up to four folders above it."""
+    found = (folder / "sensor_blobs" for folder in path.resolve().parents[:5])
+    return next((folder for folder in found if (folder / name).is_dir()), None)
 
 
 # --- what is imported -------------------------------------------------------------------------------------------------
@@ -156,77 +142,76 @@ class _Shot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Plan:
+class _NuplanPlan:
     """Files, times and poses of an import, before anything large is read.
 
     Args:
         name: the scene's id.
         cameras: channel -> camera, the chosen ones.
         clouds: in order of time.
-        files: cloud token -> file.
         moments: images of one moment, in order of time.
         ego_us, world_from_ego: the vehicle over the whole span, in the log's world.
+        notes: for the scene's source.
     """
 
     name: str
     cameras: Mapping[str, NuplanCamera]
     clouds: Sequence[NuplanCloud]
-    files: Mapping[bytes, Path]
     moments: Sequence[Sequence[_Shot]]
     ego_us: NDArray[np.int64]
     world_from_ego: Matrix
-    notes: tuple[str, ...]
-
-    @classmethod
-    def make(cls, opened: NuplanLog, scene: str, options: ImportOptions) -> _Plan:
-        name = opened.name()
-        blobs = _blobs(opened.path, name)
-        if scene and scene not in opened.scenes():
-            raise UsageError(
-                "the log has no such scene", where=str(opened.path), got=scene,
-                expected=", ".join(opened.scenes()[:12]) or "no scenes",
-            )  # fmt: skip
-        every = list(opened.clouds(scene))
-        first, end = options.frames or (0, len(every))
-        chosen = every[first:end]
-        if not chosen:
-            raise InputError("no clouds to import", where=str(opened.path), expected=f"frames 0 to {len(every)}",
-                             got=f"{first}:{end}")  # fmt: skip
-        seconds(np.array([time_us for _, time_us in chosen]), "us", f"{opened.path}: lidar_pc.timestamp", chosen[0][1])
-        lidars = opened.lidars()
-        clouds = [opened.cloud(token, lidars) for token, _ in chosen]
-        lacking = [cloud for cloud in clouds if not (blobs / cloud.file).is_file()]
-        if lacking and not options.skip_missing:
-            _refuse_missing("point cloud", blobs / lacking[0].file, len(lacking), len(clouds))
-        clouds = [cloud for cloud in clouds if (blobs / cloud.file).is_file()] if lacking else clouds
-        notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
-        if lacking:
-            notes.append(f"{len(lacking)} clouds whose files are missing were left out")
-        by_token = opened.cameras()
-        folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
-        available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}
-        names = chosen_cameras(available, options, f"{opened.path}: camera", tuple(CAMERAS))
-        span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
-        shots = [
-            _Shot(by_token[token].channel, blobs / file, time_us)
-            for token, file, time_us in opened.images(*span)
-            if token in by_token and by_token[token].channel in names
-        ]
-        moments, moment_notes = _moments(shots, names, options, str(opened.path))
-        ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
-        cameras = {camera.channel: camera for camera in by_token.values() if camera.channel in names}
-        ordered = {channel: cameras[channel] for channel in names}
-        return cls(
-            f"{name}_{scene}" if scene else name, ordered, clouds, {c.token: blobs / c.file for c in clouds}, moments,
-            ego_us, poses, (*notes, *moment_notes),
-        )  # fmt: skip
+    notes: Sequence[str]
 
 
-def _refuse_missing(what: str, path: Path, count: int, total: int) -> None:
-    raise InputError(
-        f"file of a {what} is missing", where=str(path), got=f"{count} of {total} are missing",
-        remedy="download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing",
+def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
+    name, where = opened.name(), str(opened.path)
+    blobs = _sensor_blobs(opened.path, name)
+    if blobs is None:
+        raise InputError("sensor blobs of the log were not found", where=where,
+            expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
+            remedy="download the camera and LiDAR blobs of this log; the database alone holds no images")  # fmt: skip
+    if scene and scene not in opened.scenes():
+        raise UsageError("the log has no such scene", where=where, got=scene,
+            expected=", ".join(opened.scenes()[:12]) or "no scenes")  # fmt: skip
+    every = list(opened.clouds(scene))
+    first, end = options.frames or (0, len(every))
+    chosen = every[first:end]
+    if not chosen:
+        raise InputError("no clouds to import", where=where, expected=f"frames 0 to {len(every)}", got=f"{first}:{end}")
+    seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
+    notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
+    lidars = opened.lidars()
+    clouds = [opened.cloud(token, lidars, blobs) for token, _ in chosen]
+    lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
+    if lacking:
+        _refuse_missing("point cloud", lacking, len(clouds), options)
+        clouds = [cloud for cloud in clouds if cloud.file.is_file()]
+        notes.append(f"{len(lacking)} clouds whose files are missing were left out")
+    by_token = opened.cameras()
+    folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
+    available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}
+    names = chosen_cameras(available, options, f"{where}: camera", tuple(CAMERAS))
+    cameras = {camera.channel: camera for camera in by_token.values()}
+    span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
+    shots = [
+        _Shot(by_token[token].channel, file, time_us)
+        for token, file, time_us in opened.images(*span, blobs)
+        if token in by_token and by_token[token].channel in names
+    ]
+    moments, moment_notes = _moments(shots, names, options, where)
+    ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
+    return _NuplanPlan(
+        f"{name}_{scene}" if scene else name, {channel: cameras[channel] for channel in names}, clouds, moments,
+        ego_us, poses, (*notes, *moment_notes),
     )  # fmt: skip
+
+
+def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: ImportOptions) -> None:
+    """Refuse a log of which files are missing, unless that is allowed."""
+    if missing and not options.skip_missing:
+        raise InputError(f"file of a {what} is missing", where=str(missing[0]),
+            got=f"{len(missing)} of {total} are missing", remedy="download the log's sensor blobs, "
+            "choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
 
 
 def _moments(
@@ -234,25 +219,21 @@ def _moments(
 ) -> tuple[list[list[_Shot]], list[str]]:
     """The images of each moment at which all cameras fired, and notes; see ``_by_moment``."""
     groups = _by_moment(shots, names)
-    lacking = [shot for group in groups for shot in group if not shot.file.is_file()]
-    if lacking and not options.skip_missing:
-        _refuse_missing("camera image", lacking[0].file, len(lacking), len(shots))
-    whole = [g for g in groups if {s.channel for s in g} == set(names) and all(s.file.is_file() for s in g)]
-    cut = len(groups) - len(whole)
-    inner = [g for g in groups[1:-1] if {s.channel for s in g} != set(names)]
+    missing = [shot.file for group in groups for shot in group if not shot.file.is_file()]
+    _refuse_missing("camera image", missing, len(shots), options)
+    complete = [{shot.channel for shot in group} == set(names) for group in groups]
+    kept = [g for g, full in zip(groups, complete, strict=True) if full and all(s.file.is_file() for s in g)]
+    inner = [group for group, full in zip(groups[1:-1], complete[1:-1], strict=True) if not full]
     if inner and not options.skip_missing:
         absent = sorted(set(names) - {shot.channel for shot in inner[0]})
-        raise InputError(
-            "a moment lacks images of some cameras", where=f"{where}: image at {inner[0][0].time_us}",
+        raise InputError("a moment lacks images of some cameras", where=f"{where}: image at {inner[0][0].time_us}",
             got=f"no {', '.join(absent)}; {len(inner)} such moments", expected="every chosen camera",
-            remedy="choose cameras with --cameras, or add --skip-missing",
-        )  # fmt: skip
-    if not whole:
-        raise InputError(
-            "no moment has images of all cameras", where=where, got=f"{len(shots)} images", expected=", ".join(names),
-            remedy="choose cameras with --cameras, or other frames with --frames",
-        )  # fmt: skip
-    return whole, [f"{cut} moments without images of all cameras were left out"] if cut else []
+            remedy="choose cameras with --cameras, or add --skip-missing")  # fmt: skip
+    if not kept:
+        raise InputError("no moment has images of all cameras", where=where, got=f"{len(shots)} images",
+            expected=", ".join(names), remedy="choose cameras with --cameras, or other frames with --frames")  # fmt: skip
+    cut = len(groups) - len(kept)
+    return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
 
 def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]]:
@@ -271,9 +252,9 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]
     alone = []
     for found in by_camera.values():
         times = np.array([shot.time_us for shot in found], np.int64)
-        late = times - beats[_nearest(beats, times)]
+        late = times - beats[nearest_index(beats, times)]
         usual = float(np.median(late[np.abs(late) <= half_us])) if (np.abs(late) <= half_us).any() else 0.0
-        for shot, index in zip(found, _nearest(beats, times - usual), strict=True):
+        for shot, index in zip(found, nearest_index(beats, times - usual), strict=True):
             taken = any(other.channel == shot.channel for other in groups[int(index)])
             if taken or abs(shot.time_us - usual - beats[index]) >= half_us:
                 alone.append([shot])
@@ -282,84 +263,68 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]
     return sorted([*groups.values(), *alone], key=lambda group: min(shot.time_us for shot in group))
 
 
-def _nearest(beats: NDArray[np.int64], times: NDArray[Any]) -> NDArray[np.intp]:
-    """Index of the nearest of growing ``beats`` for each time."""
-    after = np.searchsorted(beats, times).clip(1, len(beats) - 1) if len(beats) > 1 else np.zeros(len(times), int)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(times - beats[before]) <= np.abs(times - beats[after]), before, after)
-
-
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def _write(opened: NuplanLog, plan: _Plan, out: Path, options: ImportOptions) -> Scene:
+def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
     start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
     ego = _ego_path(plan, start_us, str(opened.path))
     first = ego.pose_at(0.0)
     if first is None:
-        raise InputError(
-            "vehicle poses do not cover the log", where=f"{opened.path}: ego_pose", expected=f"a pose at {start_us} us",
-            got=f"{len(plan.ego_us)} poses near it", remedy="are pose and cloud times both in microseconds?",
-        )  # fmt: skip
-    world_from_source = yaw_matrix(-yaw_of(first)) @ from_rotation_translation(np.eye(3), -first[:3, 3])
+        raise InputError("vehicle poses do not cover the log", where=f"{opened.path}: ego_pose",
+            expected=f"a pose at {start_us} us", got=f"{len(plan.ego_us)} poses near it",
+            remedy="are pose and cloud times both in microseconds?")  # fmt: skip
+    world_from_source = world_from_first(first)
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
-    fits = {channel: _fit(camera, options) for channel, camera in plan.cameras.items()}
-    notes = [*plan.notes, *(fit.words for fit in fits.values() if fit.words)]
+    fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
+    tracks, track_notes = _read_tracks(opened, plan, start_us, world_from_source)
+    notes = [*plan.notes, *image_notes(fits)]
     notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
-    tracks = BoxTracks(f"{opened.path}: lidar_box", WORDS)
-    time_of = {cloud.token: (cloud.time_us - start_us) / 1e6 for cloud in plan.clouds}
-    span = (plan.clouds[0].time_us, plan.clouds[-1].time_us) if plan.clouds else (0, -1)
-    for token, track, label, (x, y, z, yaw, *size) in opened.boxes(*span):
-        if token in time_of:
-            pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
-            tracks.add(track, tracks.word(label), time_of[token], (size[0], size[1], size[2]), pose)
-    found, track_notes = tracks.tracks()
-    notes += track_notes
-    for note in notes:
-        log.info(f"nuplan: {note}")
 
-    def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> None:
+    def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> Iterable[SceneImage | SceneSweep]:
         index, what = item
         if isinstance(what, NuplanCloud):
-            time_s = (what.time_us - start_us) / 1e6
-            pose = world_from_source @ what.world_from_lidar
-            writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, time_s, pose, _read_points(plan.files[what.token]))
+            time_s, path = (what.time_us - start_us) / 1e6, what.file
+            yield SceneSweep(
+                SENSOR, index, time_s, world_from_source @ what.world_from_lidar, _read_points(path), str(path)
+            )
             return
         for shot in what:
             time_s = (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
             world_from_ego = ego.pose_at(time_s)
             if world_from_ego is None:
                 raise InputError("vehicle poses do not cover an image", where=str(shot.file), got=f"{time_s:.3f} s")
-            fit = fits[shot.channel]
-            view = View(fit.camera, world_from_ego @ plan.cameras[shot.channel].ego_from_cam, time_s)
-            writer.add_frame(f"{CAMERAS[shot.channel]}/{index:06d}", view, fit.image(shot.file, str(shot.file)))
+            world_from_cam = world_from_ego @ plan.cameras[shot.channel].ego_from_cam
+            yield SceneImage(CAMERAS[shot.channel], index, time_s, world_from_cam, shot.file, str(shot.file))
 
     items = [*enumerate(plan.clouds), *enumerate(plan.moments)]
-    with SceneWriter(out, plan.name, Source("nuplan", LICENCE, None, tuple(notes))) as writer:
-        for fit in fits.values():
-            writer.add_camera(fit.camera)
-        for_each(items, convert, title="importing nuPlan", workers=options.workers, name=_name)
-        for track in found:
-            writer.add_track(track)
-        writer.set_ego(ego)
-        moments = [
-            [f"{CAMERAS[shot.channel]}/{index:06d}" for shot in group] for index, group in enumerate(plan.moments)
-        ]
-        writer.set_split(holdout_split(moments, options.test_every))
-        return writer.finish()
+    source = Source("nuplan", LICENCE, None, (*notes, *track_notes))
+    return SceneContent(plan.name, source, fits, items, convert, _item_name, ego, tracks=lambda: (tracks, ()))
 
 
-def _name(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> str:
+def _item_name(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> str:
     return f"cloud {item[0]}" if isinstance(item[1], NuplanCloud) else f"moment {item[0]}"
 
 
-def _ego_path(plan: _Plan, start_us: int, where: str) -> EgoPath:
+def _read_tracks(
+    opened: NuplanLog, plan: _NuplanPlan, start_us: int, world_from_source: Matrix
+) -> tuple[list[Track], list[str]]:
+    """Tracks in the scene's world and clock from the boxes of the plan's clouds, and notes."""
+    tracks = BoxTracks(f"{opened.path}: lidar_box", LABELS)
+    time_of = {cloud.token: (cloud.time_us - start_us) / 1e6 for cloud in plan.clouds}
+    span = (plan.clouds[0].time_us, plan.clouds[-1].time_us) if plan.clouds else (0, -1)
+    for token, track, label, (x, y, z, yaw, length, width, height) in opened.boxes(*span):
+        if token in time_of:
+            pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
+            tracks.add(track, tracks.label_of(label), time_of[token], (length, width, height), pose)
+    return tracks.tracks()
+
+
+def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
     """The vehicle in the log's world and the scene's clock."""
     if not len(plan.ego_us):
-        raise InputError(
-            "no vehicle poses at the time of the clouds", where=f"{where}: ego_pose.timestamp",
-            expected="microseconds, as lidar_pc.timestamp", remedy="are the two in different units?",
-        )  # fmt: skip
+        raise InputError("no vehicle poses at the time of the clouds", where=f"{where}: ego_pose.timestamp",
+            expected="microseconds, as lidar_pc.timestamp", remedy="are the two in different units?")  # fmt: skip
     return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
 
 
@@ -373,8 +338,6 @@ def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
 
 def _read_points(path: Path) -> SweepPoints:
     cloud = read_cloud(path)
-    if not len(cloud.xyz):
-        log.warn(f"nuplan: {path} has no points")
     intensity = cloud.fields.get("intensity")
     grey = np.zeros(len(cloud.xyz)) if intensity is None else np.clip(intensity.astype(np.float64) / 255, 0, 1)
     return SweepPoints(cloud.xyz.astype(np.float32), grey.astype(np.float32), np.zeros(len(cloud.xyz), np.float32))

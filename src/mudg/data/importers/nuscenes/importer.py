@@ -24,80 +24,50 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log
-from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
-from mudg.data.importers import common, drive_log
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Scene, Source, Track
+from mudg.data.importers import common, drive_log, layout
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.clouds import read_float_rows
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import LogFiles, chosen_cameras
+from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.nuscenes import tables
+from mudg.data.importers.nuscenes.info import import_info_frame, looks_like_info_frame
+from mudg.data.importers.nuscenes.sensors import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
 
-LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
-CAMERAS: Final[Mapping[str, str]] = {
-    "CAM_FRONT": "front",
-    "CAM_FRONT_LEFT": "front_left",
-    "CAM_FRONT_RIGHT": "front_right",
-    "CAM_BACK": "back",
-    "CAM_BACK_LEFT": "back_left",
-    "CAM_BACK_RIGHT": "back_right",
-}
 LIDAR: Final = "LIDAR_TOP"
-SENSOR: Final = "lidar_top"
 MAX_GAP_S: Final = 1.1
 """Boxes are annotated every 0.5 s; across one that is missing a track goes on, across two it does not."""
 MICROSECONDS: Final = 10**6
-TURN_PERIOD_S: Final = 0.05
-BEAMS: Final = 32
-_FIRST_AZIMUTH_RAD: Final = np.deg2rad(-177.0)
-"""Where a turn begins, in the LiDAR's axes (x right, y forward)."""
-_OWN_VEHICLE_M: Final = ((-1.05, 1.05), (-2.2, 3.1), (-2.2, 0.5))
-"""The recording car in the LiDAR's axes: x right, y forward, z up."""
 _MAX_BEFORE_SCENE_S: Final = 1.0
 
 LABELS: Final[Mapping[str, str]] = {
-    "animal": "animal",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.personal_mobility": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "human.pedestrian.stroller": "stroller",
-    "human.pedestrian.wheelchair": "wheelchair",
-    "movable_object.barrier": "barrier",
-    "movable_object.debris": "debris",
-    "movable_object.pushable_pullable": "pushable",
-    "movable_object.trafficcone": "traffic_cone",
-    "static_object.bicycle_rack": "bicycle_rack",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
+    "animal": "animal", "human.pedestrian.adult": "pedestrian", "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian", "human.pedestrian.personal_mobility": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian", "human.pedestrian.stroller": "stroller",
+    "human.pedestrian.wheelchair": "wheelchair", "movable_object.barrier": "barrier",
+    "movable_object.debris": "debris", "movable_object.pushable_pullable": "pushable",
+    "movable_object.trafficcone": "traffic_cone", "static_object.bicycle_rack": "bicycle_rack",
+    "vehicle.bicycle": "bicycle", "vehicle.bus.bendy": "bus", "vehicle.bus.rigid": "bus", "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle", "vehicle.emergency.ambulance": "van",
+    "vehicle.emergency.police": "car", "vehicle.motorcycle": "motorcycle", "vehicle.trailer": "trailer",
     "vehicle.truck": "truck",
-}
-"""The release's categories in the product's words."""
+}  # fmt: skip
+"""The release's categories -> labels."""
 _RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
 _WITH_RIDER: Final = "cycle.with_rider"
 
 
 def looks_like_nuscenes(source: Path) -> bool:
     """Whether a folder holds nuScenes tables, or is a table folder, or holds one frame's ``info.json``."""
-    from mudg.data.importers.nuscenes.info import looks_like_info_frame
-
     return bool(_releases(source)) or looks_like_info_frame(source)
 
 
@@ -115,11 +85,9 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
-    drive_log.refuse_untwist(options, "nuScenes", str(source))
+    layout.refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
-        from mudg.data.importers.nuscenes.info import import_info_frame
-
         return import_info_frame(source, out, options)
     return drive_log.write_log(read_log(releases, options), out, options)
 
@@ -144,51 +112,40 @@ def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
 # --- one scene ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Release:
-    """A table folder and the root that file names are relative to."""
+def _all_of(folder: Path, name: str) -> tables.TokenTable:
+    """A small table, complete."""
+    path = folder / f"{name}.json"
+    return tables.TokenTable(path, tables.iter_records(path))
 
-    folder: Path
 
-    @property
-    def root(self) -> Path:
-        return self.folder.parent
-
-    def path(self, name: str) -> Path:
-        return self.folder / f"{name}.json"
-
-    def all_of(self, name: str) -> tables.Table:
-        """A small table, whole."""
-        return tables.Table(self.path(name), tables.iter_records(self.path(name)))
-
-    def those(self, name: str, field: str, values: set[str]) -> tables.Table:
-        """The records of a large table whose ``field`` is one of ``values``."""
-        return tables.Table(self.path(name), tables.find_records(self.path(name), field, values))
+def _those(folder: Path, name: str, field: str, values: set[str]) -> tables.TokenTable:
+    """The records of a large table whose ``field`` is one of ``values``."""
+    path = folder / f"{name}.json"
+    return tables.TokenTable(path, tables.find_records(path, field, values))
 
 
 def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
     """What the tables tell about the chosen scene; no image or sweep is opened."""
     folder, scene = _choose_scene(releases, options)
-    release = _Release(folder)
     where = f"{folder}: {scene['name']}"
     log.info(f"nuscenes: {where}")
-    samples = _samples_in_order(release, scene)
-    data = release.those("sample_data", "sample_token", set(samples))
-    sensors, calibrations = release.all_of("sensor"), release.all_of("calibrated_sensor")
+    samples = _samples_in_order(folder, scene)
+    data = _those(folder, "sample_data", "sample_token", set(samples))
+    sensors, calibrations = _all_of(folder, "sensor"), _all_of(folder, "calibrated_sensor")
     channel_of: dict[str, str] = {}
     for row in data.rows.values():
         calibration = calibrations.get(row, "calibrated_sensor_token", data.where)
         sensor = sensors.get(calibration, "sensor_token", calibrations.where)
         channel_of[row["token"]] = tables.text(sensor, "channel", sensors.where)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
-    chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, tuple(CAMERAS))}
-    _check_all_cameras(there, options, where)
+    chosen = {there[raw]: raw for raw in layout.chosen_cameras(there, options, where, tuple(CAMERAS))}
+    layout.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
-    ego_poses = release.those("ego_pose", "token", {tables.text(r, "ego_pose_token", data.where) for r in used})
+    ego_poses = _those(folder, "ego_pose", "token", {tables.text(r, "ego_pose_token", data.where) for r in used})
     zero_us = int(used[0]["timestamp"])
-    reader = _RowReader(release, data.where, calibrations, ego_poses, zero_us)
+    reader = _RowReader(folder.parent, data.where, calibrations, ego_poses, zero_us)
     scene_name_of = {raw: name for name, raw in chosen.items()}
     images, sweeps = [], []
     rows_of: dict[str, tables.Row] = {}
@@ -200,10 +157,10 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
             images.append(reader.image(row, scene_name_of[channel]))
             rows_of.setdefault(channel, row)
     cameras = {name: reader.camera(rows_of[raw], name) for name, raw in chosen.items() if raw in rows_of}
-    tracks, notes = _read_tracks(release, samples, zero_us)
+    tracks, notes = _read_tracks(folder, samples, zero_us)
     if not sweeps:
         notes.append("no LiDAR sweeps in the tables")
-    ego = drive_log.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
+    ego = common.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
     source = Source("nuscenes", LICENCE, None, (f"release {folder.name}, {scene['name']}", *notes))
     return DriveLog(str(scene["name"]), cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
 
@@ -220,78 +177,52 @@ def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Pat
             names.append(f"{folder.name}/{name}" if len(releases) > 1 else name)
             if wanted in ("", name, row.get("token")):
                 found.append((folder, row))
-    if not found or (not wanted and len(found) > 1):
-        several = "the release holds several scenes" if found else "the release has no such scene"
-        listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
-        raise UsageError(
-            several,
-            where=", ".join(str(folder) for folder in releases),
-            expected=f"--sequence with one of {listed}" if names else "a release with scenes",
-            got=options.sequence or "none chosen",
-        )
-    return found[0]  # the same scene may lie in two releases: the smaller one is quicker
+    # the same scene may lie in two releases: the smaller one is quicker
+    return layout.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
 
 
-def _samples_in_order(release: _Release, scene: tables.Row) -> dict[str, int]:
+def _samples_in_order(folder: Path, scene: tables.Row) -> dict[str, int]:
     """Key frames of a scene: token -> time stamp in microseconds, in the order of the chain."""
-    token = tables.text(scene, "token", str(release.path("scene")))
-    samples = release.those("sample", "scene_token", {token})
-    at = tables.text(scene, "first_sample_token", str(release.path("scene")))
+    where = str(folder / "scene.json")
+    token = tables.text(scene, "token", where)
+    samples = _those(folder, "sample", "scene_token", {token})
+    at = tables.text(scene, "first_sample_token", where)
     stamps: dict[str, int] = {}
     while at:
         if at in stamps:
             raise InputError("the chain of key frames runs in a circle", where=samples.where, got=f"back at {at!r}")
-        stamps[at] = tables.whole(samples[at], "timestamp", samples.where)
-        at = tables.text(samples[at], "next", samples.where)
+        stamps[at] = tables.integer(samples.record(at, samples.where), "timestamp", samples.where)
+        at = tables.text(samples.rows[at], "next", samples.where)
     values = np.array(list(stamps.values()), np.int64)
-    drive_log.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
+    common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
         late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
-        raise InputError(
-            "time stamps of key frames do not increase along the scene",
-            where=f"{samples.where}: record {late!r}",
-            got=f"{stamps[late]} after a later one",
-            expected="microseconds, increasing from one key frame to the next",
-            remedy="copy the table again",
-        )
+        raise InputError("time stamps of key frames do not increase along the scene",
+            where=f"{samples.where}: record {late!r}", got=f"{stamps[late]} after a later one",
+            expected="microseconds, increasing from one key frame to the next", remedy="copy the table again")  # fmt: skip
     return stamps
-
-
-def _check_all_cameras(there: Mapping[str, str], options: ImportOptions, where: str) -> None:
-    absent = [name for raw, name in CAMERAS.items() if raw not in there]
-    if absent and not options.cameras and not options.skip_missing:
-        raise InputError(
-            "cameras are missing in the tables",
-            where=where,
-            got=f"no images of {', '.join(absent)}",
-            expected="six cameras",
-            remedy=f"choose those that are there with --cameras {' '.join(there.values())}, or add --skip-missing",
-        )
 
 
 def _check_times(rows: Sequence[tables.Row], samples: Mapping[str, int], where: str) -> None:
     """Stamps of images and sweeps are microseconds near their scene."""
-    stamps = np.array([tables.whole(row, "timestamp", where) for row in rows], np.int64)
-    drive_log.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
+    stamps = np.array([tables.integer(row, "timestamp", where) for row in rows], np.int64)
+    common.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
     if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
-        raise InputError(
-            "an image or sweep lies outside its scene's time",
+        raise InputError("an image or sweep lies outside its scene's time",
             where=f"{where}: record {rows[int(beside.argmax())]['token']!r}",
-            got=f"{beside.max():.3f} s away from the key frames",
-            expected="microseconds since 1970, within the scene",
-        )
+            got=f"{beside.max():.3f} s away from the key frames", expected="microseconds since 1970, within the scene")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RowReader:
     """Records of ``sample_data`` to images and sweeps with their poses."""
 
-    release: _Release
+    root: Path
     where: str
-    calibrations: tables.Table
-    ego_poses: tables.Table
+    calibrations: tables.TokenTable
+    ego_poses: tables.TokenTable
     zero_us: int
 
     def time_s(self, row: tables.Row) -> float:
@@ -305,7 +236,7 @@ class _RowReader:
         return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
 
     def file(self, row: tables.Row) -> Path:
-        return drive_log.path_inside(self.release.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+        return layout.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
 
     def image(self, row: tables.Row, camera: str) -> ImageRecord:
         return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))
@@ -317,25 +248,8 @@ class _RowReader:
     def camera(self, row: tables.Row, name: str) -> Camera:
         calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
         where = f"{self.calibrations.where}: record {calibration['token']!r}"
-        width, height = tables.whole(row, "width", self.where), tables.whole(row, "height", self.where)
-        return camera_from_intrinsics(name, width, height, calibration.get("camera_intrinsic"), where)
-
-
-def camera_from_intrinsics(name: str, width: int, height: int, intrinsics: Any, where: str) -> Camera:
-    """A camera from the release's 3x3 intrinsics, whose pixel centres are whole numbers: half a pixel is added here."""
-    try:
-        k = np.array(intrinsics, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
-    off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
-    if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
-        raise InputError(
-            "intrinsics are malformed",
-            where=where,
-            expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
-            got=str(intrinsics)[:120],
-        )
-    return Camera(name, width, height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
+        size = tables.integer(row, "width", self.where), tables.integer(row, "height", self.where)
+        return camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), where)
 
 
 def _pose(row: tables.Row, where: str) -> Matrix:
@@ -347,74 +261,32 @@ def _pose(row: tables.Row, where: str) -> Matrix:
 # --- boxes ----------------------------------------------------------------------------------------------------------
 
 
-def _read_tracks(release: _Release, samples: Mapping[str, int], zero_us: int) -> tuple[list[Track], list[str]]:
+def _read_tracks(folder: Path, samples: Mapping[str, int], zero_us: int) -> tuple[list[Track], list[str]]:
     """Tracks of the whole scene in the map's frame, and notes; a release without annotations has none."""
-    path = release.path("sample_annotation")
-    if not path.is_file():
+    if not (folder / "sample_annotation.json").is_file():
         return [], ["no annotations in this release: everything counts as static"]
-    annotations = release.those("sample_annotation", "sample_token", set(samples))
-    instances = release.those("instance", "token", {str(r.get("instance_token")) for r in annotations.rows.values()})
-    categories = release.all_of("category")
-    attributes = release.all_of("attribute") if release.path("attribute").is_file() else None
+    annotations = _those(folder, "sample_annotation", "sample_token", set(samples))
+    instances = _those(folder, "instance", "token", {str(r.get("instance_token")) for r in annotations.rows.values()})
+    categories = _all_of(folder, "category")
+    attributes = _all_of(folder, "attribute") if (folder / "attribute.json").is_file() else None
     tracks = BoxTracks(annotations.where, LABELS, MAX_GAP_S)
     for row in annotations.rows.values():
         instance = instances.get(row, "instance_token", annotations.where)
         category = categories.get(instance, "category_token", instances.where)
-        label = tracks.word(tables.text(category, "name", categories.where))
+        label = tracks.label_of(tables.text(category, "name", categories.where))
         if attributes is not None and label in _RIDDEN and _is_ridden(row, attributes):
             label = _RIDDEN[label]
         width, length, height = tables.numbers(row, "size", 3, annotations.where)  # in this order in the tables
         where = f"{annotations.where}: record {row['token']!r}"
         time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
-        tracks.add(instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where)
+        tracks.add(
+            instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where
+        )
     return tracks.tracks()
 
 
-def _is_ridden(row: tables.Row, attributes: tables.Table) -> bool:
+def _is_ridden(row: tables.Row, attributes: tables.TokenTable) -> bool:
     tokens = row.get("attribute_tokens")
     return isinstance(tokens, list) and any(
         attributes.rows.get(token, {}).get("name") == _WITH_RIDER for token in tokens if isinstance(token, str)
     )
-
-
-# --- sweeps ---------------------------------------------------------------------------------------------------------
-
-
-def read_scan(path: Path) -> SweepPoints:
-    """A ``LIDAR_TOP`` file: float32 rows x, y, z, intensity (0..255), ring; LiDAR axes x right, y forward, z up.
-
-    Returns of the recording vehicle are dropped; intensity becomes 0..1.
-
-    Raises:
-        InputError: cut off, not finite, or rings that no 32-beam sensor has.
-    """
-    rows = read_float_rows(path, 5, "sweep")
-    rings = rows[:, 4]
-    if len(rows) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
-        raise InputError(
-            "fifth value of the points is no ring number",
-            where=str(path),
-            expected=f"whole numbers 0 to {BEAMS - 1}",
-            got=f"{rings.min():g} to {rings.max():g}",
-            remedy="is this a file of another sensor or format?",
-        )
-    dt_s = point_times(rows[:, :3], rings)
-    own = np.ones(len(rows), bool)
-    for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
-        own &= (rows[:, axis] > low) & (rows[:, axis] < high)
-    kept = rows[~own]
-    return SweepPoints(np.ascontiguousarray(kept[:, :3]), (kept[:, 3] / 255).clip(0, 1).astype(np.float32), dt_s[~own])
-
-
-def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray[np.float32]:
-    """When each point was measured, f32[N] seconds relative to the end of the turn (-0.05..0).
-
-    By column where all 32 returns of every column are there in firing order, else by azimuth.
-    """
-    columns = len(rings) // BEAMS
-    if columns > 1 and len(rings) == columns * BEAMS and (rings.reshape(-1, BEAMS) == np.arange(BEAMS)).all():
-        fraction = (np.arange(len(rings)) // BEAMS + 1) / columns
-    else:
-        azimuth = np.arctan2(xyz[:, 1].astype(np.float64), xyz[:, 0].astype(np.float64))
-        fraction = np.mod(_FIRST_AZIMUTH_RAD - azimuth, 2 * np.pi) / (2 * np.pi)
-    return ((fraction - 1) * TURN_PERIOD_S).astype(np.float32)

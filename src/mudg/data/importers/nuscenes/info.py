@@ -14,17 +14,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log, store
+from mudg.base import log
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, yaw_matrix
-from mudg.base.types import EgoPath, Scene, Source, Track
+from mudg.base.types import EgoPath, Scene, Source
 from mudg.data.importers import common, drive_log
-from mudg.data.importers.box_tracks import box_size, check_sides
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.data.importers.layout import chosen_cameras, refuse_options
-from mudg.data.importers.nuscenes.importer import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
+from mudg.data.importers.images import image_size
+from mudg.data.importers.info_frames import Size, info_record, info_tracks
+from mudg.data.importers.layout import chosen_cameras, folder_contents, path_inside, refuse_options
+from mudg.data.importers.nuscenes.sensors import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import decode_image
 
 Matrix = NDArray[np.float64]
 _MAX_RECOGNISED_BYTES: Final = 16 * 1024 * 1024
@@ -51,35 +51,19 @@ def import_info_frame(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     path = source / "info.json"
     if not path.is_file():
-        inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-        raise InputError(
-            "no nuScenes tables found",
-            where=str(source),
+        raise InputError("no nuScenes tables found", where=str(source), got=folder_contents(source),
             expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json",
-            got=inside,
-            remedy="give the folder that holds v1.0-*, samples and sweeps",
-        )
-    where = str(path)
+            remedy="give the folder that holds v1.0-*, samples and sweeps")  # fmt: skip
     refuse_options(options, "single-frame nuScenes", "sequence")
-    try:
-        record = json.loads(
-            store.read_bytes(path)
-        )  # unknown velocities are NaN there; what is used is checked to be finite
-        drive = _drive_log(source, record["metainfo"], record["data_list"][0], where, options)
-    except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
-        raise InputError(
-            "frame record is malformed or incomplete",
-            where=where,
-            got=repr(error),
-            expected="metainfo.categories and data_list[0] with images, lidar_points, ego2global and instances",
-        ) from error
-    log.info(f"nuscenes: one frame from {where}")
+    expected = "metainfo.categories and data_list[0] with images, lidar_points, ego2global and instances"
+    with info_record(path, expected) as record:
+        drive = _drive_log(source, record["metainfo"], record["data_list"][0], options)
+    log.info(f"nuscenes: one frame from {path}")
     return drive_log.write_log(drive, out, options)
 
 
-def _drive_log(
-    source: Path, meta: dict[str, Any], sample: dict[str, Any], where: str, options: ImportOptions
-) -> DriveLog:
+def _drive_log(source: Path, meta: dict[str, Any], sample: dict[str, Any], options: ImportOptions) -> DriveLog:
+    where = str(source / "info.json")
     map_from_ego = common.rigid_pose(sample["ego2global"], f"{where}: ego2global")
     lidar = sample["lidar_points"]
     map_from_lidar = map_from_ego @ common.rigid_pose(lidar["lidar2ego"], f"{where}: lidar2ego")
@@ -88,39 +72,20 @@ def _drive_log(
     cameras, images = {}, []
     for name, raw in chosen.items():
         item = sample["images"][raw]
-        image_path = drive_log.path_inside(source, item["img_path"], f"{where}: {raw}")
-        height, width = decode_image(store.read_bytes(image_path), str(image_path)).shape[:2]
-        cameras[name] = camera_from_intrinsics(name, width, height, item["cam2img"], f"{where}: {raw}.cam2img")
+        image_path = path_inside(source, item["img_path"], f"{where}: {raw}")
+        cameras[name] = camera_from_intrinsics(name, image_size(image_path), item["cam2img"], f"{where}: {raw}.cam2img")
         # lidar2cam holds the vehicle's motion between the two moments, which cam2ego alone does not
         lidar_from_cam = invert(common.rigid_pose(item["lidar2cam"], f"{where}: {raw}.lidar2cam"))
         images.append(ImageRecord(name, 0.0, map_from_lidar @ lidar_from_cam, image_path))
-    scan = drive_log.path_inside(source, lidar["lidar_path"], f"{where}: lidar_path")
+    scan = path_inside(source, lidar["lidar_path"], f"{where}: lidar_path")
     sweeps = [SweepRecord(SENSOR, 0.0, map_from_lidar, scan, partial(read_scan, scan))]
-    ego = EgoPath(np.zeros(1), map_from_ego[None])
-    tracks = _tracks(meta, sample.get("instances", []), map_from_lidar, where)
+
+    def shape(values: list[float]) -> tuple[Size, Matrix]:
+        x, y, z, length, width, height, yaw = values
+        return (length, width, height), map_from_lidar @ yaw_matrix(yaw, (x, y, z))
+
+    labels = {int(number): str(name) for name, number in meta["categories"].items()}
+    tracks = info_tracks(sample.get("instances", []), labels, where, shape)
     notes = ("one key frame: images and sweep, up to 0.05 s apart, count as one moment",)
-    origin = Source("nuscenes", LICENCE, None, notes)
+    origin, ego = Source("nuscenes", LICENCE, None, notes), EgoPath(np.zeros(1), map_from_ego[None])
     return DriveLog(source.resolve().name, cameras, next(iter(chosen)), images, sweeps, tracks, ego, origin, where)
-
-
-def _tracks(meta: dict[str, Any], instances: list[dict[str, Any]], map_from_lidar: Matrix, where: str) -> list[Track]:
-    """One track with one key per box; boxes of no category (-1) are left out."""
-    names = {int(number): str(name) for name, number in meta["categories"].items()}
-    tracks = []
-    for index, item in enumerate(instances):
-        if int(item["bbox_label_3d"]) < 0:
-            continue
-        here = f"{where}: instances[{index}]"
-        if int(item["bbox_label_3d"]) not in names:
-            raise InputError(
-                "box has a class that metainfo.categories lacks", where=here, got=str(item["bbox_label_3d"]),
-                expected=", ".join(f"{number} ({name})" for number, name in names.items())[:200],
-            )  # fmt: skip
-        x, y, z, length, width, height, yaw = (float(value) for value in item["bbox_3d"])
-        size = box_size(length, width, height, here)
-        if not np.isfinite([x, y, z, yaw]).all():
-            raise InputError("box is not finite", where=here, got=str(item["bbox_3d"]))
-        pose = map_from_lidar @ yaw_matrix(yaw, (x, y, z))
-        tracks.append(Track(str(index), names[int(item["bbox_label_3d"])], np.array(size), np.zeros(1), pose[None]))
-    check_sides(tracks, where)
-    return tracks

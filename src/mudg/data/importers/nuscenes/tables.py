@@ -18,8 +18,10 @@ from mudg.base.errors import InputError
 
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
-_SPACE: Final = b" \t\r\n"
-_NOT_SPACE: Final = re.compile(rb"[^ \t\r\n]")
+_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
+"""A flat object; braces may stand in its texts."""
+_FLAT: Final = re.compile(_RECORD, re.DOTALL)
+_ENTRY: Final = re.compile(rb"\s*+(,?)\s*+(" + _RECORD + rb"|\])", re.DOTALL)
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_\-]{1,128}")
 
 Row = dict[str, Any]
@@ -29,10 +31,27 @@ def iter_records(path: Path, *, buffer_bytes: int = _BUFFER_BYTES) -> Iterator[R
     """Every record of a table, in file order. The file is read in pieces; one record is an object at a time.
 
     Raises:
-        InputError: not a JSON array of objects, a record over 1 MiB, or the file is cut off.
+        InputError: not a JSON array of flat objects, a record over 1 MiB, or the file is cut off.
     """
-    for content, where in _raw_records(path, buffer_bytes):
-        yield _parse(content, where)
+    with _open(path) as file:
+        buffer, offset, first = _start_of_array(file, path, buffer_bytes), 0, True
+        position = buffer.index(b"[") + 1
+        while True:
+            entry = _ENTRY.match(buffer, position)
+            if entry is None:
+                piece, rest = file.read(buffer_bytes), buffer[position:]
+                if not piece and rest.lstrip()[:1] in (b"", b",", b"{"):
+                    raise _cut_off(path)
+                if not piece or len(rest) > _MAX_RECORD_BYTES:
+                    raise _no_records(path, offset + position, rest)
+                buffer, offset, position = rest + piece, offset + position, 0
+                continue
+            if entry[2] == b"]" and not entry[1]:
+                return
+            if entry[2] == b"]" or first == bool(entry[1]):
+                raise _no_records(path, offset + position, entry[0])
+            yield _parse(entry[2], f"{path}: byte {offset + entry.start(2)}")
+            first, position = False, entry.end()
 
 
 def find_records(
@@ -65,89 +84,23 @@ def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) 
     wanted = {value.encode() for value in values}
     hit = re.compile(rb'"' + re.escape(field.encode()) + rb'"\s*:\s*"([^"\\]*)"')
     with _open(path) as file:
-        buffer = file.read(buffer_bytes)
-        if _first(buffer) != b"[":
-            raise _not_an_array(path, buffer)
-        offset, at_end = 0, False
-        while not at_end:
+        buffer, offset, piece = _start_of_array(file, path, buffer_bytes), 0, b" "
+        while piece:
             piece = file.read(buffer_bytes)
-            at_end = not piece
             buffer += piece
             # what follows the last closing brace may be half a record: it waits for the next piece
             end = buffer.rfind(b"}") + 1
             for match in hit.finditer(buffer, 0, end):
                 if match[1] in wanted:
-                    start, stop = _record_around(buffer, match.start())
-                    yield _parse(buffer[start:stop], f"{path}: byte {offset + start}")
-            if at_end and not buffer.rstrip(_SPACE).endswith(b"]"):
+                    record = _FLAT.match(buffer, max(0, buffer.rfind(b"{", 0, match.start())))
+                    if record is None or record.end() <= match.start():
+                        raise _Unclear
+                    yield _parse(record[0], f"{path}: byte {offset + record.start()}")
+            if not piece and not buffer.rstrip().endswith(b"]"):
                 raise _cut_off(path)
             if len(buffer) - end > _MAX_RECORD_BYTES + buffer_bytes:
-                raise InputError("a record is too long", where=f"{path}: byte {offset + end}", expected="under 1 MiB")
+                raise _no_records(path, offset + end, buffer[end:])
             buffer, offset = buffer[end:], offset + end
-
-
-def _record_around(buffer: bytes, at: int) -> tuple[int, int]:
-    """Start and end of the object that holds the byte ``at``."""
-    start = buffer.rfind(b"{", max(0, at - _MAX_RECORD_BYTES), at)
-    end = _object_end(buffer, start) if start >= 0 else None
-    if end is None or end <= at:
-        raise _Unclear
-    return start, end
-
-
-_STRUCTURE: Final = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*(?:"|\\?\Z)|[{}\[\]]', re.DOTALL)
-"""A text (to its closing quote, or to the end of the buffer) or a bracket."""
-
-
-def _object_end(buffer: bytes, start: int) -> int | None:
-    """Where the object that opens at ``start`` ends (exclusive); None when it does not end in the buffer."""
-    depth = 0
-    for match in _STRUCTURE.finditer(buffer, start, start + _MAX_RECORD_BYTES):
-        mark = match[0]
-        if mark in (b"{", b"["):
-            depth += 1
-        elif mark in (b"}", b"]"):
-            depth -= 1
-            if depth == 0:
-                return match.end()
-    return None
-
-
-def _raw_records(path: Path, buffer_bytes: int) -> Iterator[tuple[bytes, str]]:
-    """Bytes and place of each record of a JSON array of objects."""
-    with _open(path) as file:
-        buffer, position, offset = file.read(buffer_bytes), 0, 0
-        if _first(buffer) != b"[":
-            raise _not_an_array(path, buffer)
-        position = buffer.index(b"[") + 1
-        after_record = False
-        while True:
-            found = _NOT_SPACE.search(buffer, position)
-            end = _object_end(buffer, found.start()) if found and buffer[found.start()] == ord("{") else None
-            if found is None or (buffer[found.start()] == ord("{") and end is None):
-                piece = file.read(buffer_bytes)
-                if not piece:
-                    raise _cut_off(path)
-                if len(buffer) - position > _MAX_RECORD_BYTES:
-                    raise InputError("a record is too long", where=f"{path}: byte {offset + position}")
-                buffer, offset, position = buffer[position:] + piece, offset + position, 0
-                continue
-            start = found.start()
-            mark = buffer[start : start + 1]
-            if mark == b"]":
-                return
-            if mark == b"," and after_record:
-                after_record, position = False, start + 1
-            elif mark == b"{" and not after_record and end is not None:
-                yield buffer[start:end], f"{path}: byte {offset + start}"
-                after_record, position = True, end
-            else:
-                raise InputError(
-                    "table is not an array of records",
-                    where=f"{path}: byte {offset + start}",
-                    expected="records {...} between commas",
-                    got=repr(buffer[start : start + 20]),
-                )
 
 
 def _parse(content: bytes, where: str) -> Row:
@@ -166,31 +119,29 @@ def _open(path: Path) -> BinaryIO:
     try:
         return path.open("rb")
     except FileNotFoundError as error:
-        raise InputError(
-            "table is missing", where=str(path), remedy="unpack the release's metadata archive, which holds all tables"
-        ) from error
+        raise InputError("table is missing", where=str(path),
+            remedy="unpack the release's metadata archive, which holds all tables") from error  # fmt: skip
     except OSError as error:
         raise InputError("table cannot be read", where=str(path), got=str(error)) from error
 
 
-def _first(piece: bytes) -> bytes:
-    return piece.lstrip(_SPACE)[:1]
-
-
-def _not_an_array(path: Path, piece: bytes) -> InputError:
-    return InputError(
-        "table does not start as a JSON array",
-        where=str(path),
-        expected="[ {...}, ... ]",
-        got=repr(piece[:20]) if piece else "an empty file",
-        remedy="copy the table again",
-    )
+def _start_of_array(file: BinaryIO, path: Path, buffer_bytes: int) -> bytes:
+    """The first piece of the file, to its opening bracket at least."""
+    start = file.read(buffer_bytes)
+    if start.lstrip()[:1] != b"[":
+        raise InputError("table does not start as a JSON array", where=str(path), expected="[ {...}, ... ]",
+            got=repr(start[:20]) if start else "an empty file", remedy="copy the table again")  # fmt: skip
+    return start
 
 
 def _cut_off(path: Path) -> InputError:
-    return InputError(
-        "table is cut off", where=str(path), expected="a JSON array closed by ]", remedy="copy the table again"
-    )
+    expected = "a JSON array closed by ]"
+    return InputError("table is cut off", where=str(path), expected=expected, remedy="copy the table again")
+
+
+def _no_records(path: Path, place: int, got: bytes) -> InputError:
+    return InputError("table is not an array of records", where=f"{path}: byte {place}", got=repr(got[:20]),
+        expected="flat records {...} of less than 1 MiB between commas")  # fmt: skip
 
 
 # --- rows -----------------------------------------------------------------------------------------------------------
@@ -204,7 +155,7 @@ def text(row: Row, key: str, where: str) -> str:
     return value
 
 
-def whole(row: Row, key: str, where: str) -> int:
+def integer(row: Row, key: str, where: str) -> int:
     """An integer field."""
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
@@ -225,15 +176,11 @@ def _is_number(value: Any) -> bool:
 
 
 def _bad_field(row: Row, key: str, where: str, expected: str) -> InputError:
-    return InputError(
-        f"field {key!r} is missing or malformed",
-        where=f"{where}: record {row.get('token', '?')!r}",
-        expected=expected,
-        got=repr(row.get(key))[:120],
-    )
+    return InputError(f"field {key!r} is missing or malformed", where=f"{where}: record {row.get('token', '?')!r}",
+        expected=expected, got=repr(row.get(key))[:120])  # fmt: skip
 
 
-class Table:
+class TokenTable:
     """Records of one table by their token; asking for one that is not there names who refers to it."""
 
     def __init__(self, path: Path, records: Iterator[Row]) -> None:
@@ -246,25 +193,13 @@ class Table:
             if self.rows.setdefault(token, row) is not row:
                 raise InputError("two records have one token", where=self.where, got=token)
 
-    def __getitem__(self, token: str) -> Row:
-        if token not in self.rows:
-            raise InputError(
-                "a token points nowhere",
-                where=self.where,
-                got=f"no record {token!r}",
-                remedy="are the tables of one release, and complete?",
-            )
+    def record(self, token: Any, where: str) -> Row:
+        """The record of a token; ``where`` says who refers to it."""
+        if not isinstance(token, str) or token not in self.rows:
+            raise InputError("a token points nowhere", where=where, got=repr(token),
+                expected=f"a record of {self.where}", remedy="are the tables of one release, and complete?")  # fmt: skip
         return self.rows[token]
 
     def get(self, row: Row, key: str, where: str) -> Row:
         """The record that field ``key`` of ``row`` (in table ``where``) refers to."""
-        token = row.get(key)
-        if not isinstance(token, str) or token not in self.rows:
-            raise InputError(
-                "a token points nowhere",
-                where=f"{where}: record {row.get('token', '?')!r}: {key}",
-                got=repr(token),
-                expected=f"a record of {self.where}",
-                remedy="are the tables of one release, and complete?",
-            )
-        return self.rows[token]
+        return self.record(row.get(key), f"{where}: record {row.get('token', '?')!r}: {key}")

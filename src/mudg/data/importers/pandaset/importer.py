@@ -22,8 +22,7 @@ it is moved to the frame's time with its track's velocity.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -31,17 +30,19 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix, yaw_of
-from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, View
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
+from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.common import for_each, pose_from_quaternion, seconds
-from mudg.data.importers.images import ImageFit, fit_images
-from mudg.data.importers.layout import LogFiles, chosen_cameras, numbered_files, refuse_options, whole_frames
-from mudg.data.importers.options import ImportOptions, holdout_split
+from mudg.data.importers.columns import finite_columns, record_fields, require_columns
+from mudg.data.importers.common import pose_from_quaternion, seconds, world_from_first
+from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
+from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_size
+from mudg.data.importers.layout import LogFiles
+from mudg.data.importers.options import ImportOptions
 from mudg.data.importers.pandaset.pandas_frame import read_frame
-from mudg.data.scene import SceneWriter, decode_image
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
@@ -56,7 +57,7 @@ CAMERAS: Final = {
 SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
 OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
 """Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
-WORDS: Final = {
+LABELS: Final = {
     "Car": "car", "Pickup Truck": "car", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Towed Object": "trailer",
     "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Bicycle": "bicycle", "Bus": "bus", "Train": "train",
     "Trolley": "tram", "Tram / Subway": "tram", "Emergency Vehicle": "vehicle", "Pedestrian": "pedestrian",
@@ -66,7 +67,7 @@ WORDS: Final = {
     "Road Barriers": "barrier", "Cones": "traffic_cone", "Signs": "sign", "Construction Signs": "sign",
     "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
 }  # fmt: skip
-"""The data set's classes -> words of the product; pickup trucks count as cars, as in Cityscapes."""
+"""The data set's classes -> labels; pickup trucks count as cars, as in Cityscapes."""
 FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
 """Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
 MAX_POINT_DELAY_S: Final = 0.25
@@ -122,95 +123,79 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
         UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
         InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
-    refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
+    layout.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)
     cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}
-    chosen = chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
-    images = {name: numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
-    clouds = numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
-    frames = whole_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
-    log_ = _Log.read(folder, frames, chosen)
-    fits = {name: _fit(folder / "camera" / name, cameras[name], images[name][frames[0]], options) for name in chosen}
-    cuboids = numbered_files(folder / "annotations" / "cuboids", (".pkl.gz", ".pkl"))
-    notes = [f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here"]
-    notes += [fit.words for fit in fits.values() if fit.words]
-    if "front_camera" not in log_.world_from_cam:
+    chosen = layout.chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
+    images = {name: layout.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
+    clouds = layout.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
+    frames = layout.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
+    motion = _Motion.read(folder, frames, chosen)
+    fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
+    cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
+    notes = [f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here", *image_notes(fits)]
+    if "front_camera" not in motion.world_from_cam:
         notes.append("front camera's poses are missing: the LiDARs' places are those of sequence 002")
     if not cuboids:
         notes.append("no boxes found: everything counts as static")
-    elif any(n not in cuboids for n in frames) and not options.skip_missing:
-        lacks = next(n for n in frames if n not in cuboids)
-        raise InputError(
-            "a frame has no boxes", where=str(folder / "annotations" / "cuboids"), expected=f"{lacks:02d}.pkl.gz",
-            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
-        )  # fmt: skip
     boxes: dict[int, list[_Cuboid]] = {}
-    lock = threading.Lock()
 
-    def convert(index: int) -> None:
+    def convert(index: int) -> Iterator[SceneImage | SceneSweep]:
         number = frames[index]
         for name in chosen:
-            view = View(fits[name].camera, log_.world_from_cam[name][index], float(log_.camera_s[name][index]))
-            path = images[name][number]
-            writer.add_frame(f"{cameras[name]}/{index:06d}", view, fits[name].image(path, str(path)))
-        points = _read_points(clouds[number], log_.raw_s[index])
+            time_s, pose = float(motion.camera_s[name][index]), motion.world_from_cam[name][index]
+            yield SceneImage(cameras[name], index, time_s, pose, images[name][number])
+        points = _read_points(clouds[number], motion.raw_s[index])
         for d, sensor in SENSORS.items():
             mine = points["d"] == d
             if d == 0 or mine.any():
-                pose = log_.world_from_lidar[d][index]
-                sweep = _sweep_points(points, mine, invert(pose) @ log_.world_from_source)
-                writer.add_sweep(f"{sensor}/{index:06d}", sensor, float(log_.ego.times_s[index]), pose, sweep)
+                pose = motion.world_from_lidar[d][index]
+                sweep = _sweep_points(points, mine, invert(pose) @ motion.world_from_source)
+                yield SceneSweep(sensor, index, float(motion.ego.times_s[index]), pose, sweep, str(clouds[number]))
         if number in cuboids:
-            rows = _read_cuboids(cuboids[number], points, log_, index)
-            with lock:
-                boxes[index] = rows
+            boxes[index] = _read_cuboids(cuboids[number], points, motion, index)
 
-    with SceneWriter(out, folder.resolve().name, Source("pandaset", LICENCE, None, ())) as writer:
-        for fit in fits.values():
-            writer.add_camera(fit.camera)
-        for_each(
-            range(len(frames)), convert, title="importing PandaSet", workers=options.workers,
-            name=lambda index: f"frame {frames[index]}",
-        )  # fmt: skip
-        tracks = BoxTracks(str(folder / "annotations" / "cuboids"), WORDS)
-        notes += _add_boxes(tracks, boxes)
-        found, track_notes = tracks.tracks()
-        for track in found:
-            writer.add_track(track)
-        notes += track_notes
-        for note in notes:
-            log.info(f"pandaset: {note}")
-        writer.set_ego(log_.ego)
-        moments = [[f"{cameras[name]}/{index:06d}" for name in chosen] for index in range(len(frames))]
-        writer.set_split(holdout_split(moments, options.test_every))
-        writer.add_notes(notes)
-        return writer.finish()
+    def tracks() -> Tracks:
+        found = BoxTracks(str(folder / "annotations" / "cuboids"), LABELS)
+        box_notes = _add_boxes(found, boxes)
+        made, track_notes = found.tracks()
+        return made, [*box_notes, *track_notes]
+
+    origin, numbers = Source("pandaset", LICENCE, None, tuple(notes)), range(len(frames))
+    content = SceneContent(
+        folder.resolve().name,
+        origin,
+        fits,
+        numbers,
+        convert,
+        lambda index: f"frame {frames[index]}",
+        motion.ego,
+        tracks,
+    )
+    return write_scene(content, out, options)
 
 
 def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
     if not source.is_dir():
         raise InputError("PandaSet folder does not exist", where=str(source), expected="a folder")
-    if options.sequence:
-        folder = source / options.sequence
-        if not options.sequence.isdigit() or not _is_sequence(folder):
-            raise UsageError(
-                "there is no such sequence", where=str(source), got=options.sequence,
-                expected=", ".join(_sequences(source)[:12]) or "a folder of sequences 001, 002, ...",
-            )  # fmt: skip
-        return folder
-    if _is_sequence(source):
+    if not options.sequence and _is_sequence(source):
         return source
     sequences = _sequences(source)
-    if sequences:
-        raise UsageError(
-            "the folder holds several sequences", where=str(source), got="none chosen",
-            expected="--sequence with one of " + ", ".join(sequences[:12]),
-        )  # fmt: skip
-    inside = sorted(path.name for path in source.iterdir())[:12]
-    raise InputError(
-        "no PandaSet sequence found", where=str(source), got=", ".join(inside) or "an empty folder",
-        expected="lidar/poses.json and camera/front_camera and so on",
-    )  # fmt: skip
+    if not sequences and not options.sequence:
+        raise InputError("no PandaSet sequence found", where=str(source), got=layout.folder_contents(source),
+            expected="lidar/poses.json and camera/front_camera and so on")  # fmt: skip
+    matching = [name for name in sequences if options.sequence in ("", name)]
+    return source / layout.the_only(matching, sequences, options, source, "sequence")
+
+
+def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -> dict[int, Path]:
+    """Cuboid tables by frame number; none at all is allowed, gaps are not."""
+    cuboids = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
+    lacks = [number for number in frames if number not in cuboids]
+    if cuboids and lacks and not options.skip_missing:
+        raise InputError("a frame has no boxes", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz",
+            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+    return cuboids
 
 
 def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
@@ -222,7 +207,7 @@ def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Log:
+class _Motion:
     """Times and poses of the chosen frames, in the scene's world and clock.
 
     Args:
@@ -242,12 +227,11 @@ class _Log:
     ego: EgoPath
 
     @classmethod
-    def read(cls, folder: Path, frames: Sequence[int], cameras: Sequence[str]) -> _Log:
+    def read(cls, folder: Path, frames: Sequence[int], cameras: Sequence[str]) -> _Motion:
         raw_s = _times(folder / "lidar" / "timestamps.json", frames)
         start_s = float(raw_s[0])
         forward = _poses(folder / "lidar" / "poses.json", frames) @ yaw_matrix(np.pi / 2)
-        first = forward[0]
-        world_from_source = yaw_matrix(-yaw_of(first)) @ from_rotation_translation(np.eye(3), -first[:3, 3])
+        world_from_source = world_from_first(forward[0])
         ego = EgoPath(
             seconds(raw_s, "s", str(folder / "lidar" / "timestamps.json"), start_s), world_from_source @ forward
         )
@@ -261,11 +245,10 @@ class _Log:
             times = _times(path, frames)
             late = np.abs(times - raw_s)
             if late.max() > MAX_CAMERA_DELAY_S:
-                raise InputError(
-                    "camera and LiDAR do not share a clock", where=f"{path}: entry {frames[int(late.argmax())]}",
-                    expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json", got=f"{late.max():.3f} s apart",
-                    remedy="are the times in seconds, and of this sequence?",
-                )  # fmt: skip
+                raise InputError("camera and LiDAR do not share a clock",
+                    where=f"{path}: entry {frames[int(late.argmax())]}",
+                    expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json",
+                    got=f"{late.max():.3f} s apart", remedy="are the times in seconds, and of this sequence?")  # fmt: skip
             camera_s[name] = seconds(times, "s", str(path), start_s)
             world_from_cam[name] = world_from_source @ _poses(here / "poses.json", frames)
         places = _lidar_places(ego, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
@@ -295,11 +278,9 @@ def _entries(path: Path, frames: Sequence[int]) -> list[Any]:
     values = store.read_json(path)
     if not isinstance(values, list) or len(values) <= frames[-1]:
         got = f"{len(values)} entries" if isinstance(values, list) else type(values).__name__
-        raise InputError(
-            "list does not cover the frames", where=str(path), got=got,
+        raise InputError("list does not cover the frames", where=str(path), got=got,
             expected=f"a list with an entry per frame, at least {frames[-1] + 1}",
-            remedy="is the file cut off, or of another sequence?",
-        )  # fmt: skip
+            remedy="is the file cut off, or of another sequence?")  # fmt: skip
     return [values[n] for n in frames]
 
 
@@ -310,10 +291,8 @@ def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
     times = np.array(values, np.float64)
     seconds(times, "s", str(path))
     if times[0] > 1e11:
-        raise InputError(
-            "timestamps are in another unit than expected", where=str(path), expected="seconds of the epoch",
-            got=f"{times[0]:.6g}", remedy="divide them by 1000 or 1000000",
-        )  # fmt: skip
+        raise InputError("timestamps are in another unit than expected", where=str(path),
+            expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy="divide them by 1000 or 1000000")  # fmt: skip
     return times
 
 
@@ -321,30 +300,19 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
     poses = []
     for number, entry in zip(frames, _entries(path, frames), strict=True):
         where = f"{path}: entry {number}"
-        try:
+        with record_fields("pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"):
             heading = [entry["heading"][key] for key in "wxyz"]
-            position = [entry["position"][key] for key in "xyz"]
-            poses.append(pose_from_quaternion(heading, position, where))
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                "pose is incomplete", where=where, got=repr(error)[:80],
-                expected="position x y z (metres) and heading w x y z (quaternion)",
-            ) from error  # fmt: skip
+            poses.append(pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
     return np.stack(poses)
 
 
 def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageFit:
     path = folder / "intrinsics.json"
     values = store.read_json(path)
-    try:
+    with record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            "intrinsics are incomplete", where=str(path), got=repr(error), expected="fx fy cx cy"
-        ) from error
-    height, width = decode_image(store.read_bytes(image), str(image)).shape[:2]
     # the data set counts pixels from the centre of the top-left one, as OpenCV does
-    return fit_images(Camera(name, width, height, fx, fy, cx + 0.5, cy + 0.5), options)
+    return fit_images(Camera(name, *image_size(image), fx, fy, cx + 0.5, cy + 0.5), options)
 
 
 # --- points -----------------------------------------------------------------------------------------------------------
@@ -352,39 +320,20 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
 
 def _columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     frame = read_frame(path)
-    missing = [name for name in names if name not in frame]
-    if missing:
-        raise InputError(
-            "table lacks columns", where=str(path), expected=", ".join(names), got=", ".join(frame) or "no columns",
-            remedy="is it the file of another kind of annotation?",
-        )  # fmt: skip
+    require_columns(names, frame, path)
     return frame
-
-
-def _numbers(frame: Mapping[str, NDArray[Any]], name: str, path: Path) -> NDArray[np.float64]:
-    try:
-        values = frame[name].astype(np.float64)
-    except (ValueError, TypeError) as error:
-        raise InputError("column is not of numbers", where=f"{path}: {name}", got=str(error)[:80]) from error
-    if not np.isfinite(values).all():
-        at = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise InputError("column holds a value that is not finite", where=f"{path}: {name}, row {at}")
-    return values
 
 
 def _read_points(path: Path, frame_s: float) -> dict[str, NDArray[np.float64]]:
     """Columns of one cloud: ``xyz`` f64[N, 3] in the data set's world, ``i`` 0..1, ``dt`` seconds, ``d`` 0 or 1."""
     frame = _columns(path, _POINT_COLUMNS)
-    if not len(frame["x"]):
-        log.warn(f"pandaset: {path} has no points")
-    columns = {name: _numbers(frame, name, path) for name in _POINT_COLUMNS}
+    columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
     dt_s = columns["t"] - frame_s
     if len(dt_s) and np.abs(dt_s).max() > MAX_POINT_DELAY_S:
-        raise InputError(
-            "points do not belong to their frame's time", where=f"{path}: t",
+        raise InputError("points do not belong to their frame's time", where=f"{path}: t",
             expected=f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})",
-            got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}", remedy="is the file of another frame or sequence?",
-        )  # fmt: skip
+            got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}",
+            remedy="is the file of another frame or sequence?")  # fmt: skip
     if not np.isin(columns["d"], list(SENSORS)).all():
         raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
     xyz = np.stack([columns[axis] for axis in "xyz"], 1)
@@ -401,38 +350,27 @@ def _sweep_points(
 # --- boxes ------------------------------------------------------------------------------------------------------------
 
 
-def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], log_: _Log, index: int) -> list[_Cuboid]:
+def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], motion: _Motion, index: int) -> list[_Cuboid]:
     frame = _columns(path, _CUBOID_COLUMNS)
-    centre = np.stack([_numbers(frame, f"position.{axis}", path) for axis in "xyz"], 1)
-    width, length, height = (_numbers(frame, f"dimensions.{axis}", path) for axis in "xyz")
-    yaw = _numbers(frame, "yaw", path)
-    count = len(yaw)
-    sensor = np.full(count, -1.0)
+    centre = finite_columns(frame, ("position.x", "position.y", "position.z"), path)
+    sizes = finite_columns(frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path)  # length, width, height
+    yaw = finite_columns(frame, ("yaw",), path)[:, 0]
+    sensor = np.full(len(yaw), -1.0)
     if "cuboids.sensor_id" in frame:
-        given = {"id": np.where(_missing(frame["cuboids.sensor_id"]), -1, frame["cuboids.sensor_id"])}
-        sensor = _numbers(given, "id", path)
-    siblings = frame.get("cuboids.sibling_id", np.full(count, "", object))
-    when = _BoxTimes(points, log_, index)
+        given = np.where(_missing(frame["cuboids.sensor_id"]), -1, frame["cuboids.sensor_id"])
+        sensor = finite_columns({"cuboids.sensor_id": given}, ("cuboids.sensor_id",), path)[:, 0]
+    siblings = frame.get("cuboids.sibling_id", np.full(len(yaw), "", object))
+    when, time_s = _MeasuringTimes(points, motion, index), float(motion.ego.times_s[index])
     rows = []
-    for row in range(count):
+    for row in range(len(yaw)):
         box = yaw_matrix(yaw[row] + np.pi / 2, centre[row])
-        size = (float(length[row]), float(width[row]), float(height[row]))
-        standing = bool(frame["stationary"][row])
-        late_s = 0.0 if standing else when.delay_s(box, size, int(sensor[row]))
+        length, width, height = sizes[row].tolist()
+        size, uuid, label = (length, width, height), str(frame["uuid"][row]), str(frame["label"][row])
+        standing, of = bool(frame["stationary"][row]), int(sensor[row])
+        late_s = 0.0 if standing else when.delay_s(box, size, of)
         sibling = siblings[row] if isinstance(siblings[row], str) and len(siblings[row]) > 1 else ""
-        rows.append(
-            _Cuboid(
-                str(frame["uuid"][row]),
-                str(frame["label"][row]),
-                float(log_.ego.times_s[index]),
-                late_s,
-                size,
-                log_.world_from_source @ box,
-                standing,
-                int(sensor[row]),
-                sibling,
-            )  # fmt: skip
-        )
+        world_from_box = motion.world_from_source @ box
+        rows.append(_Cuboid(uuid, label, time_s, late_s, size, world_from_box, standing, of, sibling))
     return rows
 
 
@@ -441,12 +379,12 @@ def _missing(column: NDArray[Any]) -> NDArray[np.bool_]:
     return np.array([value is None or value != value for value in column], bool)
 
 
-class _BoxTimes:
+class _MeasuringTimes:
     """When the boxes of one frame were measured."""
 
-    def __init__(self, points: Mapping[str, NDArray[np.float64]], log_: _Log, index: int) -> None:
+    def __init__(self, points: Mapping[str, NDArray[np.float64]], motion: _Motion, index: int) -> None:
         self._points = points
-        self._source_from_lidar = invert(log_.world_from_source) @ log_.world_from_lidar[0][index]
+        self._source_from_lidar = invert(motion.world_from_source) @ motion.world_from_lidar[0][index]
         self._turning: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
 
     def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
@@ -488,5 +426,7 @@ def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> lis
             doubled += name in kept
             kept.setdefault(name, box)
         for name, box in kept.items():
-            tracks.add(name, tracks.word(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s)
+            tracks.add(
+                name, tracks.label_of(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s
+            )
     return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []

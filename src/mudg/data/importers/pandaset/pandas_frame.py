@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.data.importers.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, Record, read_pickle
+from mudg.data.importers.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
 
 _MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
 MAX_COLUMNS: Final = 1000
@@ -82,9 +82,8 @@ def gunzip(content: bytes, where: str) -> bytes:
     if len(unpacked) > MAX_BYTES:
         raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
     if not unpacker.eof:
-        raise InputError(
-            "gzip file is cut off", where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again"
-        )
+        raise InputError("gzip file is cut off", where=where, got=f"{len(content)} bytes, no end",
+            remedy="copy the file again")  # fmt: skip
     return unpacked
 
 
@@ -94,17 +93,14 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     try:
         return _columns(value)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            "pickle is not a plain data frame",
-            where=where,
+        raise InputError("pickle is not a plain data frame", where=where,
             expected="a table of numbers and texts as pandas 0.2x to 2.x writes it",
             got=f"{type(error).__name__}: {error}"[:200],
-            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2",
-        ) from error
+            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2") from error  # fmt: skip
 
 
 def _columns(frame: Any) -> dict[str, NDArray[Any]]:
-    if not isinstance(frame, Record) or frame.name != "pandas.core.frame.DataFrame":
+    if not isinstance(frame, PickledObject) or frame.name != "pandas.core.frame.DataFrame":
         raise ValueError(f"holds a {getattr(frame, 'name', type(frame).__name__)}")
     manager = frame.state["_mgr"] if "_mgr" in frame.state else frame.state["_data"]
     if manager.name not in _MANAGERS:
@@ -135,7 +131,7 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
 
 def _block_parts(block: Any) -> tuple[Any, Any]:
     """Values and places of a block in the forms of pandas 1.3 (a partial call) and later (a tuple)."""
-    if isinstance(block, Record):
+    if isinstance(block, PickledObject):
         if block.name != "functools.partial":
             raise ValueError(f"a block is a {block.name}")
         partial, values, places = block.arguments

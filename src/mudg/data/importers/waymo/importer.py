@@ -7,7 +7,7 @@ images      five cameras (``front``, ``front_left``, ``front_right``, ``side_lef
             of the middle column's exposure
 labels      panoptic labels, where an image has them: ``semantics``, ``instance``, ``sky``, ``ego``
 scans       five LiDARs (``lidar_top``, ``lidar_front``, ...), both returns, at the frame's pose; ``dt_s`` for the top one
-boxes       3D boxes as tracks, carried to the moment of the frame's pose (``waymo_tracks``)
+boxes       3D boxes as tracks, carried to the moment of the frame's pose (``tracks``)
 world       z up, origin and x axis at the vehicle's pose of the first imported frame; the offset stands in the scene's notes
 time        seconds since the first imported frame's timestamp
 =========== =============================================================================================================
@@ -29,13 +29,14 @@ from numpy.typing import NDArray
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
-from mudg.base.types import EgoPath, Scene, Source, View
-from mudg.data.importers.common import for_each, seconds
+from mudg.base.types import EgoPath, Scene, Source
+from mudg.data.importers.common import seconds
+from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, fit_images
-from mudg.data.importers.layout import LogFiles, chosen_cameras, refuse_options
-from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.importers.waymo import camera as waymo_camera
-from mudg.data.importers.waymo import lidar
+from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
+from mudg.data.importers.options import ImportOptions
+from mudg.data.importers.waymo import sensors, tracks
+from mudg.data.importers.waymo.parquet import REQUIRED, ParquetLog
 from mudg.data.importers.waymo.records import (
     CAMERAS,
     TOP,
@@ -45,19 +46,8 @@ from mudg.data.importers.waymo.records import (
     Matrix,
     WaymoLog,
 )
-from mudg.data.importers.waymo.tracks import (
-    FAST_M_S,
-    MOMENTS,
-    Moment,
-    TimedBoxes,
-    build_tracks,
-    choose_moment,
-    points_inside,
-    velocities,
-)
-from mudg.data.importers.waymo.v1 import TfrecordLog
-from mudg.data.importers.waymo.v2 import REQUIRED, ParquetLog
-from mudg.data.scene import SceneWriter
+from mudg.data.importers.waymo.tfrecord import TfrecordLog
+from mudg.data.importers.waymo.tracks import Moment, TimedBoxes
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
@@ -96,61 +86,39 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     frames, notes = _usable_frames(waymo, options)
     cameras = _chosen_cameras(waymo, options, source)
     plan = _plan(waymo, frames, cameras, options, notes)
-    moment, words = _moment_of_boxes(waymo, frames, plan)
-    notes += [words] if words else []
-    tracks, track_notes = build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
+    moment, note = _moment_of_boxes(waymo, frames, plan)
+    notes += [note] if note else []
+    found, track_notes = tracks.build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
     notes += track_notes
     check = _check_projections(waymo, frames, cameras, plan)
     notes += [check] if check else []
-    for note in notes:
-        log.info(f"waymo: {note}")
     numbers = {frame.number: index for index, frame in enumerate(frames)}
-    with SceneWriter(out, waymo.name, Source("waymo", LICENCE, None, tuple(notes))) as writer:
-        for fit in plan.fits.values():
-            writer.add_camera(fit.camera)
 
-        def items() -> Iterator[tuple[FrameRecord, FrameContent]]:
-            for frame in frames:
-                yield frame, waymo.read(frame, cameras)
+    def items() -> Iterator[tuple[FrameRecord, FrameContent]]:
+        return ((frame, waymo.read(frame, cameras)) for frame in frames)
 
-        def convert(item: tuple[FrameRecord, FrameContent]) -> None:
-            _write_frame(writer, plan, item[0], item[1], numbers[item[0].number])
+    def convert(item: tuple[FrameRecord, FrameContent]) -> Iterator[SceneImage | SceneSweep]:
+        return _converted(plan, item[0], item[1], numbers[item[0].number])
 
-        for_each(
-            items(), convert, title="importing Waymo", total=len(frames), workers=options.workers,
-            name=lambda item: item[0].where,
-        )  # fmt: skip
-        for track in tracks:
-            writer.add_track(track)
-        writer.set_ego(
-            EgoPath(np.array([plan.pose_s(f) for f in frames]), np.stack([plan.world_from_vehicle(f) for f in frames]))
-        )
-        moments = [[f"{name}/{index:06d}" for name in cameras] for index in range(len(frames))]
-        writer.set_split(holdout_split(moments, options.test_every))
-        return writer.finish()
+    path = EgoPath(np.array([plan.pose_s(f) for f in frames]), np.stack([plan.world_from_vehicle(f) for f in frames]))
+    origin = Source("waymo", LICENCE, None, tuple(notes))
+    content = SceneContent(
+        waymo.name, origin, plan.fits, items(), convert, lambda item: item[0].where, path, lambda: (found, ()), len(frames)
+    )  # fmt: skip
+    return write_scene(content, out, options)
 
 
 def _refuse_options(options: ImportOptions) -> None:
     refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
-        raise UsageError(
-            "Waymo scans cannot be left twisted", where="--untwist", got="no", remedy="leave it out",
-            expected="auto or yes: points carry the pose they were measured at",
-        )  # fmt: skip
+        raise UsageError("Waymo scans cannot be left twisted", where="--untwist", got="no", remedy="leave it out",
+            expected="auto or yes: points carry the pose they were measured at")  # fmt: skip
 
 
 def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
     """The chosen log's record file, or its tables."""
-    if source.is_file() or not source.is_dir():
-        return LogFiles((source,))
-    records = {path.stem: path for path in sorted(source.glob(f"*{_SUFFIX}"))}
-    if records:
-        return LogFiles((records[_choose(list(records), options.sequence, source)],))
-    segments = sorted({path.stem for path in source.glob("*/*.parquet")})
-    if not segments:
-        return LogFiles((source,))
-    segment = _choose(segments, options.sequence, source)
-    return LogFiles(tuple(sorted(source.glob(f"*/{segment}.parquet"))))
+    record, segment = _find(source, options)
+    return LogFiles((record,) if record is not None else tuple(sorted(source.glob(f"*/{segment}.parquet"))))
 
 
 # --- finding the log ------------------------------------------------------------------------------------------------
@@ -162,51 +130,38 @@ def open_log(source: Path, options: ImportOptions) -> WaymoLog:
     Raises:
         UsageError: there are several, and none or more than one was meant. InputError: there is none, or it is damaged.
     """
+    record, segment = _find(source, options)
+    return TfrecordLog(record, options.frames) if record is not None else ParquetLog(source, segment, options.frames)
+
+
+def _find(source: Path, options: ImportOptions) -> tuple[Path | None, str]:
+    """The record file of the chosen log, or None and the name of its tables."""
     if source.is_file():
-        return TfrecordLog(source, options.frames)
+        return source, ""
     if not source.is_dir():
         raise InputError("Waymo log does not exist", where=str(source), expected="a TFRecord file or a folder")
     records = {path.stem: path for path in sorted(source.glob(f"*{_SUFFIX}"))}
-    if records:
-        return TfrecordLog(records[_choose(list(records), options.sequence, source)], options.frames)
-    folders = [source / name for name in REQUIRED if (source / name).is_dir()]
-    segments = sorted({path.stem for folder in folders for path in folder.glob("*.parquet")})
-    if segments:
-        return ParquetLog(source, _choose(segments, options.sequence, source), options.frames)
-    raise InputError(
-        "no Waymo log found", where=str(source), expected=f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}",
-        got=", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "an empty folder",
-    )  # fmt: skip
-
-
-def _choose(names: Sequence[str], wanted: str, source: Path) -> str:
-    """The one name that is, or contains, ``wanted``."""
-    found = [name for name in names if name == wanted] or [name for name in names if wanted in name]
-    if len(found) == 1:
-        return found[0]
-    listed = found or names
-    raise UsageError(
-        "the folder holds several logs" if not wanted else f"{len(found) or 'no'} logs have such a name", where=str(source),
-        expected="--sequence with (a part of) one of " + ", ".join(listed[:12]) + (f", ... ({len(listed)})" if len(listed) > 12 else ""),
-        got=wanted or "none chosen",
-    )  # fmt: skip
+    segments = records or sorted({path.stem for name in REQUIRED for path in (source / name).glob("*.parquet")})
+    if not segments:
+        raise InputError("no Waymo log found", where=str(source), got=folder_contents(source),
+            expected=f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}")  # fmt: skip
+    matching = [name for name in segments if name == options.sequence] or [n for n in segments if options.sequence in n]
+    name = the_only(matching, matching or list(segments), options, source, "log")
+    return records.get(name), name
 
 
 def _chosen_cameras(waymo: WaymoLog, options: ImportOptions, source: Path) -> list[str]:
     recorded = {name for frame in waymo.frames for name in frame.shots}
     there = {name: name for name in CAMERAS.values() if name in recorded}
     if not there:
-        raise InputError(
-            "the log has no images", where=str(source), expected="images of the cameras",
-            got=f"{len(waymo.frames)} frames with poses and boxes only", remedy="take the files with camera and LiDAR data",
-        )  # fmt: skip
+        raise InputError("the log has no images", where=str(source), expected="images of the cameras",
+            got=f"{len(waymo.frames)} frames with poses and boxes only",
+            remedy="take the files with camera and LiDAR data")  # fmt: skip
     chosen = chosen_cameras(there, options, str(source), tuple(there))
     lacking = [name for name in chosen if name not in waymo.cameras]
     if lacking:
-        raise InputError(
-            "cameras have images and no calibration", where=str(source), got=", ".join(lacking),
-            expected=", ".join(waymo.cameras) or "a calibration for each", remedy="choose others with --cameras",
-        )  # fmt: skip
+        raise InputError("cameras have images and no calibration", where=str(source), got=", ".join(lacking),
+            expected=", ".join(waymo.cameras) or "a calibration for each", remedy="choose others with --cameras")  # fmt: skip
     return chosen
 
 
@@ -217,25 +172,21 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
     lasers = sorted({name for frame in waymo.frames for name in frame.lasers})
     without = [name for name in lasers if name not in waymo.lasers]
     if without:
-        raise InputError(
-            "LiDARs have scans and no calibration", where=waymo.frames[0].where, got=", ".join(without),
-            expected=", ".join(waymo.lasers) or "a calibration for each",
-        )  # fmt: skip
+        raise InputError("LiDARs have scans and no calibration", where=waymo.frames[0].where, got=", ".join(without),
+            expected=", ".join(waymo.lasers) or "a calibration for each")  # fmt: skip
     complete, missing = [], []
     for frame in waymo.frames:
         lack = sorted(cameras - set(frame.shots)) + [f"LiDAR {name}" for name in lasers if name not in frame.lasers]
         (missing if lack else complete).append((frame, lack))
     if missing and not options.skip_missing:
         frame, lack = missing[0]
-        raise InputError(
-            "frame lacks images or scans", where=frame.where, got=f"no {', '.join(lack)}"
-            + (f"; {len(missing)} frames in all" if len(missing) > 1 else ""),
-            expected="what the other frames have", remedy="choose frames with --frames FIRST:END, or add --skip-missing",
-        )  # fmt: skip
+        raise InputError("frame lacks images or scans", where=frame.where,
+            got=f"no {', '.join(lack)}" + (f"; {len(missing)} frames in all" if len(missing) > 1 else ""),
+            expected="what the other frames have",
+            remedy="choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
     if not complete:
-        raise InputError(
-            "no frame is complete", where=waymo.frames[0].where, got=f"the first has no {', '.join(missing[0][1])}"
-        )
+        raise InputError("no frame is complete", where=waymo.frames[0].where,
+            got=f"the first has no {', '.join(missing[0][1])}")  # fmt: skip
     notes = [f"Waymo Open Dataset, {waymo.form}" + (f"; {waymo.conditions}" if waymo.conditions else "")]
     if missing:
         notes.append(
@@ -265,7 +216,7 @@ class _Plan:
     waymo: WaymoLog
     world_from_global: Matrix
     start_us: int
-    turn: lidar.TurnClock
+    turn: sensors.TurnClock
     middle_s: Mapping[int, float]
     fits: Mapping[str, ImageFit]
 
@@ -281,11 +232,11 @@ class _Plan:
         """Seconds after ``pose_s`` at parts of the top LiDAR's turn (0..1)."""
         return self.turn.after_timestamp_s(turn) - self.middle_s[frame.number]
 
-    def view(self, frame: FrameRecord, camera: str) -> View:
-        """Where and when an image was taken."""
-        pose, time_s = waymo_camera.middle_of_exposure(frame.shots[camera])
-        world_from_cam = self.world_from_global @ pose @ waymo_camera.vehicle_from_cam(self.waymo.cameras[camera])
-        return View(self.fits[camera].camera, world_from_cam, time_s - self.start_us / 1e6)
+    def taken(self, frame: FrameRecord, camera: str) -> tuple[Matrix, float]:
+        """Where an image was taken (world from camera, f64[4, 4]), and when in the scene's clock."""
+        pose, time_s = sensors.middle_of_exposure(frame.shots[camera])
+        world_from_cam = self.world_from_global @ pose @ sensors.vehicle_from_cam(self.waymo.cameras[camera])
+        return world_from_cam, time_s - self.start_us / 1e6
 
     def timed_boxes(self, frame: FrameRecord, moment: Moment) -> TimedBoxes:
         """The frame's boxes with the times for which they hold."""
@@ -294,7 +245,7 @@ class _Plan:
             late -= self.middle_s[frame.number]
         elif moment == "seen":
             late = self.seen_s(frame) - self.middle_s[frame.number]
-        times = [waymo_camera.middle_of_exposure(shot)[1] - self.start_us / 1e6 for shot in frame.shots.values()]
+        times = [sensors.middle_of_exposure(shot)[1] - self.start_us / 1e6 for shot in frame.shots.values()]
         images_s = (min(times), max(times)) if times else None
         return TimedBoxes(self.pose_s(frame), self.world_from_vehicle(frame), frame.boxes, late, frame.where, images_s)
 
@@ -303,7 +254,7 @@ class _Plan:
         if TOP not in frame.lasers or not frame.boxes:
             return np.full(len(frame.boxes), self.middle_s[frame.number])
         centres = np.array([box.centre for box in frame.boxes])
-        return self.turn.after_timestamp_s(lidar.turn_of_direction(centres, self.waymo.lasers[TOP]))
+        return self.turn.after_timestamp_s(sensors.turn_of_direction(centres, self.waymo.lasers[TOP]))
 
 
 def _plan(
@@ -331,29 +282,30 @@ def _plan(
         notes.append(f"the pose of {assumed} frames is no image's: taken to belong to the middle of the LiDAR's turn")
     fits: dict[str, ImageFit] = {}
     for name in cameras:
-        camera, lens = waymo_camera.recorded_camera(waymo.cameras[name], first.shots[name])
+        camera, lens = sensors.recorded_camera(waymo.cameras[name], first.shots[name])
         fits[name] = fit_images(camera, options, lens)
-        notes += [fits[name].words] if fits[name].words else []
+        notes += [fits[name].note] if fits[name].note else []
     rolling = sorted({waymo.cameras[name].direction for name, fit in fits.items() if fit.camera.readout_s > 0})
     if rolling:
-        ways = ", ".join(
-            waymo_camera.DIRECTIONS[d] if 0 <= d < len(waymo_camera.DIRECTIONS) else f"code {d}" for d in rolling
-        )
+        ways = ", ".join(sensors.DIRECTIONS[d] if 0 <= d < len(sensors.DIRECTIONS) else f"code {d}" for d in rolling)
         notes.append(f"shutters roll {ways}; a view is that of the middle of the exposure")
     return _Plan(
         waymo, world_from_global, start_us, turn, {number: value for number, (value, _) in middles.items()}, fits
     )
 
 
-def _pose_moment(frame: FrameRecord, turn: lidar.TurnClock) -> tuple[float, bool]:
-    """Seconds after the frame's timestamp to which its pose belongs, and whether that is known or assumed."""
+def _pose_moment(frame: FrameRecord, turn: sensors.TurnClock) -> tuple[float, bool]:
+    """When the vehicle was at the frame's pose, in seconds after the frame's timestamp, and whether that was recorded.
+
+    An image with the same pose has its time. Without one, the middle of the LiDAR's turn is assumed.
+    """
     for shot in frame.shots.values():
         if np.abs(shot.global_from_vehicle - frame.global_from_vehicle).max() < _SAME_POSE:
             return shot.pose_time_s - frame.timestamp_us / 1e6, True
     return float(turn.after_timestamp_s(np.array(0.5))), False
 
 
-def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> lidar.TurnClock:
+def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> sensors.TurnClock:
     """The top LiDAR's timing, from the frames during which the vehicle moved most."""
     moved = [
         (float(np.linalg.norm(after.global_from_vehicle[:3, 3] - before.global_from_vehicle[:3, 3])), index + 1)
@@ -368,19 +320,20 @@ def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> lidar.TurnC
         poses = waymo.pixel_poses(frames[index])
         if poses is not None:
             places = np.stack([path[time] for time in times])
-            found = lidar.measure_turn(poses, frames[index].timestamp_us / 1e6, times, places)
+            found = sensors.measure_turn(poses, frames[index].timestamp_us / 1e6, times, places)
             turns += [found] if found is not None else []
-    return lidar.median_clock(turns)
+    return sensors.median_clock(turns)
 
 
 def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan) -> tuple[Moment, str]:
-    """For which moment the boxes of this log hold, by the points in the boxes of its fast objects; and words for the notes."""
+    """For which moment the boxes of this log hold, by the points in the boxes of its fast objects; and a note."""
     boxes = [plan.timed_boxes(frame, "pose") for frame in frames]
     fast = [
-        {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= FAST_M_S} for speeds in velocities(boxes)
+        {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= tracks.FAST_M_S}
+        for speeds in tracks.velocities(boxes)
     ]
     order = sorted(range(len(frames)), key=lambda index: -len(fast[index]))[:_MOMENT_FRAMES]
-    counts = np.zeros(len(MOMENTS), np.int64)
+    counts = np.zeros(len(tracks.MOMENTS), np.int64)
     for index in sorted(order):
         frame = frames[index]
         if not fast[index] or TOP not in frame.lasers:
@@ -392,58 +345,53 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
         for box, late in zip(frame.boxes, plan.seen_s(frame), strict=True):
             if box.id in fast[index]:
                 velocity = fast[index][box.id] @ rotation
-                counts += points_inside(box, velocity, xyz, seen, float(late), plan.middle_s[frame.number])
+                counts += tracks.points_inside(box, velocity, xyz, seen, float(late), plan.middle_s[frame.number])
     if not counts.any():
         return ("seen" if any(TOP in frame.lasers for frame in frames) else "pose"), ""
-    moment = choose_moment(counts)
-    words = {"seen": "when the LiDAR passes them", "start": "at the timestamp", "pose": "at the frame's pose"}
-    tallies = ", ".join(f"{count} {words[name]}" for name, count in zip(MOMENTS, counts, strict=True))
-    return moment, f"boxes hold {words[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
+    moment = tracks.choose_moment(counts)
+    texts = {"seen": "when the LiDAR passes them", "start": "at the timestamp", "pose": "at the frame's pose"}
+    tallies = ", ".join(f"{count} {texts[name]}" for name, count in zip(tracks.MOMENTS, counts, strict=True))
+    return moment, f"boxes hold {texts[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
 
 
-def _write_frame(writer: SceneWriter, plan: _Plan, frame: FrameRecord, content: FrameContent, index: int) -> None:
+def _converted(plan: _Plan, frame: FrameRecord, content: FrameContent, index: int) -> Iterator[SceneImage | SceneSweep]:
     for name, fit in plan.fits.items():
         where = f"{frame.where}: image of camera {name}"
         labels: dict[str, NDArray[Any]] = {}
         if name in content.panoptic:
             panoptic = content.panoptic[name]
-            ids = waymo_camera.panoptic_ids(panoptic, fit.recorded, f"{where}: panoptic label")
-            labels = waymo_camera.panoptic_labels(fit.ids(ids), panoptic.divisor)
-        image = fit.image(content.images[name], where)
-        writer.add_frame(f"{name}/{index:06d}", plan.view(frame, name), image, labels)
+            ids = sensors.panoptic_ids(panoptic, fit.recorded, f"{where}: panoptic label")
+            labels = sensors.panoptic_labels(fit.ids(ids), panoptic.divisor)
+        pose, time_s = plan.taken(frame, name)
+        yield SceneImage(name, index, time_s, pose, content.images[name], where, labels)
     for name, scan in content.scans.items():
-        points = _points(plan, frame, name, scan)
-        sweep = lidar.sweep_points(
-            points, plan.dt_s(frame, points.turn) if name == TOP else np.zeros(len(points.turn))
-        )
+        points, where = _points(plan, frame, name, scan), f"frame {frame.number}: LiDAR {name}"
+        late_s = plan.dt_s(frame, points.turn) if name == TOP else np.zeros(len(points.turn))
         pose = plan.world_from_vehicle(frame) @ plan.waymo.lasers[name].vehicle_from_lidar
-        writer.add_sweep(f"lidar_{name}/{index:06d}", f"lidar_{name}", plan.pose_s(frame), pose, sweep)
+        sweep = sensors.sweep_points(points, late_s)
+        yield SceneSweep(f"lidar_{name}", index, plan.pose_s(frame), pose, sweep, where)
         if points.without_pose:
-            log.info(
-                f"waymo: frame {frame.number}: {points.without_pose} points of LiDAR {name} have no pose and were left out"
-            )
-        if not len(points.xyz):
-            log.warn(f"waymo: frame {frame.number}: LiDAR {name} has no points")
+            log.info(f"waymo: {where}: {points.without_pose} points have no pose and were left out")
 
 
-def _points(plan: _Plan, frame: FrameRecord, name: str, scan: LaserScan) -> lidar.Points:
-    return lidar.points_of_scan(
+def _points(plan: _Plan, frame: FrameRecord, name: str, scan: LaserScan) -> sensors.ScanPoints:
+    return sensors.points_of_scan(
         scan, plan.waymo.lasers[name], frame.global_from_vehicle, f"{frame.where}: LiDAR {name}"
     )
 
 
 def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: Sequence[str], plan: _Plan) -> str:
-    """Compare our projections of the first frame's points with those recorded; words for the notes, empty if there are none."""
+    """Compare our projections of the first frame's points with those recorded; a note, empty if there are none."""
     frame = frames[0]
     if not frame.lasers:
         return ""
-    shots = {name: (waymo.cameras[name], waymo_camera.middle_of_exposure(frame.shots[name])[0]) for name in cameras}
+    shots = {name: (waymo.cameras[name], sensors.middle_of_exposure(frame.shots[name])[0]) for name in cameras}
     errors: dict[str, list[NDArray[np.float64]]] = {}
     for name, scan in waymo.read(frame, (), projections=True).scans.items():
-        found = waymo_camera.projection_errors(
+        found = sensors.projection_errors(
             _points(plan, frame, name, scan), scan, waymo.lasers[name], frame.global_from_vehicle, shots
         )
         for camera, off in found.items():
@@ -451,9 +399,9 @@ def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: 
     medians = {camera: float(np.median(np.concatenate(off))) for camera, off in errors.items()}
     if not medians:
         return ""
-    words = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
+    texts = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
     if max(medians.values()) > DOUBTFUL_PROJECTION_PX:
         log.warn(
-            f"waymo: points do not fall where the log says they do ({words}, median); are calibrations and poses of this log?"
+            f"waymo: points do not fall where the log says they do ({texts}, median); are calibrations and poses of this log?"
         )
-    return f"points fall where the log says they do, up to (median, first frame): {words}"
+    return f"points fall where the log says they do, up to (median, first frame): {texts}"

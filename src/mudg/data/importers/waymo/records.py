@@ -7,7 +7,7 @@ data set's camera frame is x forward, y left, z up.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mudg.base.errors import InputError
 from mudg.data.importers.common import rigid_pose
-from mudg.data.importers.waymo.proto import MATRIX_FLOAT, MATRIX_INT, Message, parse_message
+from mudg.data.importers.waymo.messages import MATRIX_FLOAT, MATRIX_INT, Message, parse_message
 
 Matrix = NDArray[np.float64]
 
@@ -59,12 +59,8 @@ class LaserCalibration:
         """Inclination of every row of a range image, f64[rows] radians; the top row looks highest."""
         if self.inclinations:
             if len(self.inclinations) != rows:
-                raise InputError(
-                    "range image does not have a row for every beam",
-                    where=where,
-                    expected=f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})",
-                    got=f"{rows} rows",
-                )
+                raise InputError("range image does not have a row for every beam", where=where,
+                    expected=f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})", got=f"{rows} rows")  # fmt: skip
             return np.array(self.inclinations)[::-1]
         step = (self.inclination_max - self.inclination_min) / rows
         return self.inclination_max - (np.arange(rows, dtype=np.float64) + 0.5) * step
@@ -172,7 +168,10 @@ class WaymoLog(Protocol):
         ...
 
 
-def checked_transform(values: NDArray[np.float64], where: str) -> Matrix:
+# --- records from the numbers of either form ----------------------------------------------------------------------------
+
+
+def transform_of(values: Sequence[float] | NDArray[np.float64], where: str) -> Matrix:
     """A rigid 4x4 from its sixteen numbers, row by row.
 
     Raises:
@@ -183,42 +182,81 @@ def checked_transform(values: NDArray[np.float64], where: str) -> Matrix:
     return rigid_pose(np.asarray(values, np.float64).reshape(4, 4), where)
 
 
-def checked_shot(shot: CameraShot, timestamp_us: int, where: str) -> CameraShot:
-    """The shot, its clock compared with the frame's: seconds and microseconds of one epoch.
+def camera_of(
+    name: str, intrinsic: Sequence[float], extrinsic: Sequence[float], image: tuple[int, int, int], where: str
+) -> CameraCalibration:
+    """A calibration from its numbers; ``image`` is width, height and the direction of the shutter.
 
     Raises:
-        InputError: times are not finite, or more than a second apart.
+        InputError: intrinsics that are not nine finite numbers, or no rigid extrinsics.
     """
-    times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
-    gap = max(abs(time - timestamp_us / 1e6) for time in times)
-    if not gap <= MAX_CLOCK_GAP_S:
-        raise InputError(
-            "image and frame are not of one time",
-            where=where,
-            expected=f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds",
-            got=", ".join(f"{time!r}" for time in times),
-            remedy="are the units seconds (images) and microseconds (frames)?",
-        )
-    if shot.done_s and not 0 <= shot.shutter_s <= shot.done_s - shot.trigger_s < MAX_CLOCK_GAP_S:
-        raise InputError(
-            "exposure times contradict each other",
-            where=where,
-            expected="0 <= shutter <= readout end - trigger, seconds",
-            got=f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}",
-        )
-    return shot
+    where, values = f"{where}: calibration of camera {name}", tuple(float(value) for value in intrinsic)
+    if len(values) != 9 or not np.isfinite(values).all():
+        raise InputError("intrinsics are incomplete", where=where, expected="9 finite numbers", got=str(values))
+    return CameraCalibration(name, values, transform_of(extrinsic, where), *image)
 
 
-def checked_box(box: WaymoBox, where: str) -> WaymoBox:
-    """The box, if its numbers are finite and its size is positive."""
-    if not np.isfinite([*box.centre, *box.size_m, box.heading]).all() or min(box.size_m) <= 0:
-        raise InputError(
-            "box makes no sense",
-            where=f"{where}: box {box.id}",
+def laser_of(
+    name: str, beams: Sequence[float], limits: tuple[float, float], extrinsic: Sequence[float], where: str
+) -> LaserCalibration:
+    """A calibration from its numbers: inclinations of the beams, or none and their limits, in radians.
+
+    Raises:
+        InputError: inclinations that are not finite or not in order, or no rigid extrinsics.
+    """
+    where, beams = f"{where}: calibration of LiDAR {name}", tuple(float(value) for value in beams)
+    if not np.isfinite(beams or limits).all() or not (beams or limits[0] < limits[1]):
+        raise InputError("beam inclinations make no sense", where=where, expected="radians", got=str(beams or limits))
+    return LaserCalibration(name, beams, *limits, transform_of(extrinsic, where))
+
+
+def box_of(box_id: str, number: int, values: Sequence[float], where: str) -> WaymoBox:
+    """A box from the number of its class and x, y, z, length, width, height, heading.
+
+    Raises:
+        InputError: numbers that are not finite, or a size that is not positive.
+    """
+    x, y, z, length, width, height, heading = (float(value) for value in values)
+    if not np.isfinite(values).all() or min(length, width, height) <= 0:
+        raise InputError("box makes no sense", where=f"{where}: box {box_id}",
             expected="finite numbers, positive length, width and height",
-            got=f"centre {box.centre}, size {box.size_m}, heading {box.heading}",
-        )
-    return box
+            got=f"centre {(x, y, z)}, size {(length, width, height)}, heading {heading}")  # fmt: skip
+    return WaymoBox(box_id, LABELS.get(number, "unknown"), (x, y, z), (length, width, height), heading)
+
+
+def by_name(shots: Iterable[tuple[str, CameraShot]], timestamp_us: int, where: str) -> dict[str, CameraShot]:
+    """The images of one frame by camera, their clock compared with the frame's: seconds and microseconds of one epoch.
+
+    Raises:
+        InputError: two images of one camera; times that are not finite, contradict each other, or are more than a second off.
+    """
+    found: dict[str, CameraShot] = {}
+    for name, shot in shots:
+        here = f"{where}: image of camera {name}"
+        if name in found:
+            raise InputError("frame has two images of one camera", where=here)
+        times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
+        if not max(abs(time - timestamp_us / 1e6) for time in times) <= MAX_CLOCK_GAP_S:
+            raise InputError("image and frame are not of one time", where=here,
+                expected=f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds",
+                got=", ".join(f"{time!r}" for time in times),
+                remedy="are the units seconds (images) and microseconds (frames)?")  # fmt: skip
+        if shot.done_s and not 0 <= shot.shutter_s <= shot.done_s - shot.trigger_s < MAX_CLOCK_GAP_S:
+            raise InputError("exposure times contradict each other", where=here,
+                expected="0 <= shutter <= readout end - trigger, seconds",
+                got=f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}")  # fmt: skip
+        found[name] = shot
+    return found
+
+
+def each_once(lasers: Sequence[str], where: str) -> tuple[str, ...]:
+    """Names of the LiDARs with a scan in one frame; two scans of one are refused."""
+    if len(set(lasers)) < len(lasers):
+        raise InputError("frame has two scans of one LiDAR", where=where, got=", ".join(lasers))
+    return tuple(lasers)
+
+
+# --- range images -------------------------------------------------------------------------------------------------------
 
 
 def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, where: str) -> NDArray[Any]:
@@ -234,12 +272,8 @@ def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, w
         raise InputError("range image cannot be unpacked", where=where, got=str(error)) from error
     if not unpacker.eof:
         cut_off = not unpacker.unconsumed_tail
-        raise InputError(
-            "range image is cut off" if cut_off else "range image unpacks to more than any has",
-            where=where,
-            expected=f"at most {MAX_UNPACKED_BYTES} bytes",
-            got=f"{len(content)} bytes",
-        )
+        raise InputError("range image is cut off" if cut_off else "range image unpacks to more than any has",
+            where=where, expected=f"at most {MAX_UNPACKED_BYTES} bytes", got=f"{len(content)} bytes")  # fmt: skip
     values = parse_message(content, message, where)
     return shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
 
@@ -248,12 +282,9 @@ def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channe
     """``data`` [H * W * channels] as [H, W, channels], if its declared shape says so."""
     shape = tuple(int(n) for n in dims)
     if len(shape) != 3 or min(shape) < 1 or shape[2] != channels or int(np.prod(shape)) != len(data):
-        raise InputError(
-            "range image has the wrong shape",
-            where=where,
+        raise InputError("range image has the wrong shape", where=where,
             expected=f"[rows, columns, {channels}], as many values as that",
-            got=f"{list(shape)} with {len(data)} values",
-        )
+            got=f"{list(shape)} with {len(data)} values")  # fmt: skip
     return data.reshape(shape)
 
 

@@ -8,7 +8,7 @@ speed, to the moment that all of the frame's points are given for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Track
-from mudg.data.importers.box_tracks import check_sides
+from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.waymo.records import Matrix, WaymoBox
 
 Moment = Literal["seen", "start", "pose"]
@@ -28,10 +28,6 @@ MOMENTS: Final[tuple[Moment, ...]] = ("seen", "start", "pose")
 FAST_M_S: Final = 3.0
 _CLEAR_GAIN: Final = 1.05
 _FLOOR_M: Final = 0.3
-_SAME_TIME_S: Final = 1e-4
-
-MAX_GAP_S: Final = 0.55
-"""A track that is not seen for longer than this is split: interpolating across would invent its path."""
 
 _SPEED_REACH: Final = 2
 """A speed is the slope of a straight line through so many boxes before and after."""
@@ -66,66 +62,31 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
     Raises:
         InputError: a box without an id, two boxes of one id in a frame, a class that changes, or length and width are swapped.
     """
-    members: dict[str, list[tuple[float, float, Matrix, WaymoBox]]] = {}
-    images_s = {frame.time_s: frame.images_s or (frame.time_s, frame.time_s) for frame in frames}
+    tracks = BoxTracks(frames[0].where if frames else "", {})
+    labels: dict[str, str] = {}
     for frame in frames:
         seen: set[str] = set()
         for box, late in zip(frame.boxes, frame.late_s, strict=True):
             if not box.id or box.id in seen:
-                raise InputError(
-                    "frame has two boxes of one object" if box.id else "box has no id",
-                    where=frame.where,
-                    got=repr(box.id),
-                )
+                raise InputError("frame has two boxes of one object" if box.id else "box has no id", where=frame.where,
+                    got=repr(box.id))  # fmt: skip
             seen.add(box.id)
+            if labels.setdefault(box.id, box.label) != box.label:
+                raise InputError("the class of an object changes", where=f"{frame.where}: object {box.id}",
+                    expected=labels[box.id], got=box.label)  # fmt: skip
+            # a track's name begins with no sign, as the data set's random ids may
+            name = box.id if box.id[0].isalnum() else f"t{box.id}"
             pose = frame.world_from_vehicle @ yaw_matrix(box.heading, box.centre)
-            members.setdefault(box.id, []).append((frame.time_s, float(late), pose, box))
-    names = _names(members)
-    tracks: list[Track] = []
-    split = 0
-    for box_id, found in members.items():
-        labels = sorted({box.label for *_, box in found})
-        if len(labels) > 1:
-            raise InputError(
-                "the class of an object changes", where=f"{frames[0].where}: object {box_id}", got=", ".join(labels)
-            )
-        times, late = np.array([item[0] for item in found]), np.array([item[1] for item in found])
-        poses = np.stack([item[2] for item in found])
-        velocity = _velocity(times + late, poses[:, :3, 3])
-        poses[:, :3, 3] -= velocity * late[:, None]
-        size = np.median([box.size_m for *_, box in found], axis=0)
-        pieces = np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > MAX_GAP_S) + 1)
-        split += len(pieces) > 1
-        for part, piece in enumerate(pieces):
-            name = f"{names[box_id]}.{part}" if part else names[box_id]
-            ends = (images_s[float(times[piece[0]])][0], images_s[float(times[piece[-1]])][1])
-            tracks.append(Track(name, labels[0], size, *_widened(times[piece], poses[piece], velocity[piece], ends)))
-    check_sides(tracks, frames[0].where if frames else "")
-    notes = [f"{split} tracks are not seen for more than {MAX_GAP_S} s and were split"] if split else []
-    unknown = sum(track.label == "unknown" for track in tracks)
+            tracks.add(name, box.label, frame.time_s, box.size_m, pose, late_s=float(late), where=frame.where)
+    images_s = {frame.time_s: frame.images_s or (frame.time_s, frame.time_s) for frame in frames}
+    found, notes = tracks.tracks(_line_speeds, images_s)
+    unknown = sum(track.label == "unknown" for track in found)
     if unknown:
         notes.append(f"{unknown} boxes have a class that is not known and are called unknown")
-    return tracks, notes
+    return found, notes
 
 
-def _widened(
-    times_s: NDArray[np.float64], poses: Matrix, velocity: NDArray[np.float64], ends_s: tuple[float, float]
-) -> tuple[NDArray[np.float64], Matrix]:
-    """Keys with one more at each end that lies outside of them."""
-    for end, place in zip(ends_s, (0, -1), strict=True):
-        beyond = end - times_s[place]
-        if (beyond < -_SAME_TIME_S) if place == 0 else (beyond > _SAME_TIME_S):
-            pose = poses[place].copy()
-            pose[:3, 3] += velocity[place] * beyond
-            at = 0 if place == 0 else len(times_s)
-            times_s, poses, velocity = (
-                np.insert(array, at, value, axis=0)
-                for array, value in ((times_s, end), (poses, pose), (velocity, velocity[place]))
-            )
-    return times_s, poses
-
-
-def _velocity(times_s: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def _line_speeds(times_s: NDArray[np.float64], xyz: NDArray[np.float64], _pieces: object) -> NDArray[np.float64]:
     """Velocity f64[T, 3] by a straight line through the neighbouring keys; zero where there is one key only.
 
     Times of neighbouring keys may be equal: an object that passes behind the LiDAR is seen at the end of one turn and
@@ -139,11 +100,6 @@ def _velocity(times_s: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray
         if spread > 1e-4:
             velocity[index] = time @ (xyz[near] - xyz[near].mean(0)) / spread
     return velocity
-
-
-def _names(members: Mapping[str, object]) -> dict[str, str]:
-    """Ids as names of tracks; those that begin with a sign, as the data set's random ones may, get a letter in front."""
-    return {box_id: box_id if box_id[0].isalnum() else f"t{box_id}" for box_id in members}
 
 
 def points_inside(

@@ -9,7 +9,7 @@ Source: the protocol-buffer encoding guide; the field numbers of the Waymo Open 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -61,100 +61,103 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
     Raises:
         InputError: cut off, a wire type that does not fit, or text that is not UTF-8.
     """
-    view = memoryview(data)
+    reader = _MessageReader(data, message, where)
     values: dict[str, Any] = {}
     parts: dict[int, list[Any]] = {
         n: [] for n, f in message.fields.items() if f.kind in ("doubles", "floats", "ints", "messages")
     }
-    place, end, seen = 0, len(view), 0
-    while place < end:
-        start = place
-        key, place = _varint(view, place, end, message, where)
-        number, wire = key >> 3, key & 7
-        seen += 1
-        if number == 0 or seen > _MAX_FIELDS:
-            raise _broken(
-                message, where, start, f"field number {number}" if number == 0 else f"more than {_MAX_FIELDS} fields"
-            )
-        raw, place = _value(view, place, end, wire, message, where)
+    for start, number, wire, raw in reader.fields():
         field = message.fields.get(number)
         if field is None:
             continue
         packed = wire == _BYTES and field.kind in ("doubles", "floats", "ints")
         if wire != _WIRE[field.kind] and not packed:
-            raise _broken(
-                message, where, start, f"field {field.name} ({number}) has wire type {wire}, not {_WIRE[field.kind]}"
-            )
-        value = _decode(field, raw, packed, message, where, start)
+            expected = _WIRE[field.kind]
+            raise reader.broken(start, f"field {field.name} ({number}) has wire type {wire}, not {expected}")
+        value = reader.decode(field, raw, packed, start)
         if number in parts:
             parts[number].append(value)
         else:
             values[field.name] = value
     for number, found in parts.items():
         field = message.fields[number]
-        values[field.name] = found if field.kind == "messages" else _joined(field.kind, found)
+        values[field.name] = found if field.kind == "messages" else _concatenated(field.kind, found)
     return values
 
 
-def _varint(view: memoryview, place: int, end: int, message: Message, where: str) -> tuple[int, int]:
-    start, value, shift = place, 0, 0
-    while place < end:
-        byte = view[place]
-        place += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value & 0xFFFFFFFFFFFFFFFF, place
-        shift += 7
-        if shift > 63:
-            raise _broken(message, where, start, "a number of more than ten bytes")
-    raise _broken(message, where, start, "it ends inside a number")
+class _MessageReader:
+    """The fields of one message; what is wrong is said with its name and the byte."""
+
+    def __init__(self, data: bytes | memoryview, message: Message, where: str) -> None:
+        self._view, self._message, self._where = memoryview(data), message, where
+        self._place = 0
+
+    def broken(self, place: int, got: str) -> InputError:
+        return InputError("message cannot be decoded", where=f"{self._where}: {self._message.name}, byte {place}",
+            expected="a protocol-buffer message of the Waymo Open Dataset", got=got,
+            remedy="is this a file of another data set, or of the motion data?")  # fmt: skip
+
+    def fields(self) -> Iterator[tuple[int, int, int, Any]]:
+        """Place, number, wire type and raw value (an int, or a view) of every field."""
+        seen = 0
+        while self._place < len(self._view):
+            start, key = self._place, self._varint()
+            seen += 1
+            if key >> 3 == 0 or seen > _MAX_FIELDS:
+                raise self.broken(start, "field number 0" if key >> 3 == 0 else f"more than {_MAX_FIELDS} fields")
+            yield start, key >> 3, key & 7, self._value(key & 7)
+
+    def _varint(self) -> int:
+        start, value, shift = self._place, 0, 0
+        for place in range(start, len(self._view)):
+            byte = self._view[place]
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                self._place = place + 1
+                return value & 0xFFFFFFFFFFFFFFFF
+            shift += 7
+            if shift > 63:
+                raise self.broken(start, "a number of more than ten bytes")
+        raise self.broken(start, "it ends inside a number")
+
+    def _value(self, wire: int) -> Any:
+        if wire == _VARINT:
+            return self._varint()
+        if wire not in (_BYTES, _FIXED32, _FIXED64):
+            raise self.broken(self._place, f"wire type {wire}")
+        length = self._varint() if wire == _BYTES else 4 if wire == _FIXED32 else 8
+        left = len(self._view) - self._place
+        if length > left:
+            raise self.broken(self._place, f"a field of {length} bytes where {left} are left")
+        self._place += length
+        return self._view[self._place - length : self._place]
+
+    def decode(self, field: Field, raw: Any, packed: bool, start: int) -> Any:
+        """The value of a field from its raw one."""
+        if field.message is not None:
+            return parse_message(raw, field.message, self._where)
+        if field.kind in _DTYPE:
+            size = np.dtype(_DTYPE[field.kind]).itemsize
+            if len(raw) % size:
+                raise self.broken(start, f"field {field.name} holds {len(raw)} bytes, no multiple of {size}")
+            return np.frombuffer(raw, _DTYPE[field.kind])
+        if field.kind == "ints" and packed:
+            return unpack_varints(raw, f"{self._where}: {self._message.name}.{field.name}")
+        if field.kind in ("int", "ints"):
+            value = raw - (1 << 64) if raw >= 1 << 63 else raw
+            return np.array([value]) if field.kind == "ints" else value
+        if field.kind == "text":
+            try:
+                return bytes(raw).decode("utf-8")
+            except UnicodeDecodeError as error:
+                raise self.broken(start, f"field {field.name} is no text") from error
+        return raw if field.kind == "bytes" else struct.unpack("<d" if field.kind == "double" else "<f", raw)[0]
 
 
-def _value(view: memoryview, place: int, end: int, wire: int, message: Message, where: str) -> tuple[Any, int]:
-    """The raw value at ``place`` (an int, or a view) and where the next field begins."""
-    if wire == _VARINT:
-        return _varint(view, place, end, message, where)
-    if wire == _BYTES:
-        length, place = _varint(view, place, end, message, where)
-    elif wire in (_FIXED32, _FIXED64):
-        length = 4 if wire == _FIXED32 else 8
-    else:
-        raise _broken(message, where, place, f"wire type {wire}")
-    if length > end - place:
-        raise _broken(message, where, place, f"a field of {length} bytes where {end - place} are left")
-    return view[place : place + length], place + length
-
-
-def _decode(field: Field, raw: Any, packed: bool, message: Message, where: str, start: int) -> Any:
-    if field.message is not None:
-        return parse_message(raw, field.message, where)
-    if field.kind in _DTYPE:
-        size = np.dtype(_DTYPE[field.kind]).itemsize
-        if len(raw) % size:
-            raise _broken(message, where, start, f"field {field.name} holds {len(raw)} bytes, no multiple of {size}")
-        return np.frombuffer(raw, _DTYPE[field.kind])
-    if field.kind == "ints":
-        return unpack_varints(raw, f"{where}: {message.name}.{field.name}") if packed else np.array([_signed(raw)])
-    if field.kind == "int":
-        return _signed(raw)
-    if field.kind == "text":
-        try:
-            return bytes(raw).decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise _broken(message, where, start, f"field {field.name} is no text") from error
-    if field.kind == "bytes":
-        return raw
-    return struct.unpack("<d" if field.kind == "double" else "<f", raw)[0]
-
-
-def _joined(kind: Kind, found: list[NDArray[Any]]) -> NDArray[Any]:
+def _concatenated(kind: Kind, found: list[NDArray[Any]]) -> NDArray[Any]:
     if len(found) == 1:
         return found[0]
     return np.concatenate(found) if found else np.zeros(0, _DTYPE.get(kind, np.int64))
-
-
-def _signed(value: int) -> int:
-    return value - (1 << 64) if value >= 1 << 63 else value
 
 
 def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
@@ -177,16 +180,6 @@ def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
         return codes.astype(np.int64)
     shift = (np.arange(len(codes)) - np.repeat(first, lengths)).astype(np.uint64) * np.uint64(7)
     return np.add.reduceat((codes & np.uint8(0x7F)).astype(np.uint64) << shift, first).view(np.int64)
-
-
-def _broken(message: Message, where: str, place: int, got: str) -> InputError:
-    return InputError(
-        "message cannot be decoded",
-        where=f"{where}: {message.name}, byte {place}",
-        expected="a protocol-buffer message of the Waymo Open Dataset",
-        got=got,
-        remedy="is this a file of another data set, or of the motion data?",
-    )
 
 
 # --- the messages of the data set -----------------------------------------------------------------------------------

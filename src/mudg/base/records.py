@@ -1,0 +1,147 @@
+"""Records from JSON and YAML files, checked by pydantic; what is wrong with one becomes an error that names its place.
+
+A record is a subclass of ``StrictRecord``: no unknown fields, no conversion of types. ``parse_record`` makes one. Checks of
+single fields are plain functions that raise ``InputError`` and are attached with ``checked_by``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import functools
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import Annotated, Any, Final, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mudg.base.errors import InputError, MudgError
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+"""A finite number; whole numbers are accepted, texts and booleans are not."""
+
+Value = TypeVar("Value")
+RecordType = TypeVar("RecordType", bound="StrictRecord")
+ErrorType = TypeVar("ErrorType", bound=MudgError)
+
+_MEANINGS: Final = {
+    "float_type": ("value is not a number", "a number"),
+    "finite_number": ("value is not finite", "a finite number"),
+    "int_type": ("value is not a whole number", "an integer"),
+    "string_type": ("value is not a text", "a text"),
+    "bool_type": ("value is neither true nor false", "true or false"),
+    "list_type": ("value is not a list", "[...]"),
+    "dict_type": ("value is not an object", "{...}"),
+    "model_type": ("record is not an object", "{...}"),
+}
+"""Pydantic's name of a problem -> what is wrong, what was expected."""
+
+
+class StrictRecord(BaseModel):
+    """A JSON object with known fields: types are not converted, unknown fields are refused and the nearest name suggested."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_fields(cls, value: Any) -> Any:
+        if isinstance(value, dict) and not value.keys() <= _field_names(cls).keys():
+            checked_by(functools.partial(refuse_unknown, known=_field_names(cls)))(value)
+        return value
+
+
+@functools.cache
+def _field_names(record: type[BaseModel]) -> dict[str, None]:
+    return {field.alias or name: None for name, field in record.model_fields.items()}
+
+
+def refuse_unknown(names: Iterable[str], known: Collection[str]) -> None:
+    """InputError for the first of ``names`` that is not ``known``, with the nearest known one."""
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            remedy = f"did you mean {near[0]!r}?" if near else "remove it"
+            raise InputError(f"unknown field {name!r}", expected=f"one of {', '.join(known)}", remedy=remedy)
+
+
+class _FieldProblem(ValueError):
+    """Carries an error of our own through pydantic, which adds the place of the field."""
+
+    def __init__(self, problem: MudgError) -> None:
+        super().__init__(problem.what)
+        self.problem = problem
+
+
+def checked_by(check: Callable[..., Value]) -> Callable[..., Value]:
+    """``check`` as the function of a pydantic validator: an ``InputError`` it raises gets the place of the field."""
+
+    @functools.wraps(check)  # pydantic reads the signature
+    def validate(*values: Any) -> Value:
+        try:
+            return check(*values)
+        except MudgError as problem:
+            raise _FieldProblem(problem) from problem
+
+    return validate
+
+
+def after(check: Callable[[Any], Any]) -> AfterValidator:
+    """``check`` as a validator of values that have the annotated type already."""
+    return AfterValidator(checked_by(check))
+
+
+def parse_record(record: type[RecordType], value: object, where: str) -> RecordType:
+    """Check a JSON value.
+
+    Args:
+        where: place of the value, e.g. ``scene.json: frames[3]``; of a file's top-level object, its path and ``": "``.
+
+    Raises:
+        InputError: the value is no such record; the first problem is described, further ones are counted.
+    """
+    try:
+        return record.model_validate(value)
+    except ValidationError as error:
+        raise first_problem(error, where) from error
+
+
+def first_problem(error: ValidationError, where: str, error_type: type[ErrorType] = InputError) -> ErrorType:
+    """The first problem that pydantic found, as an error of our own; ``where`` as in ``parse_record``."""
+    first, count = error.errors(include_url=False)[0], error.error_count()
+    kind, loc, value = first["type"], first["loc"], first["input"]
+    if kind == "missing":
+        got = ", ".join(value) if isinstance(value, dict) else ""
+        return error_type(
+            f"the field {loc[-1]!r} is missing", where=place(where, *loc[:-1]), got=got or "an empty object"
+        )
+    where = place(where, *loc)
+    own = first.get("ctx", {}).get("error")
+    if isinstance(own, _FieldProblem):
+        problem = own.problem
+        where = place(where, problem.where) if problem.where else where
+        return error_type(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=problem.remedy)
+    kind = "finite_number" if kind == "float_type" and type(value) is int else kind  # a whole number beyond 1e308
+    what, expected = _MEANINGS.get(kind, ("value is not valid", first["msg"].removeprefix("Input should be ")))
+    got = repr(value)[:80] + (f" (and {count - 1} more problems)" if count > 1 else "")
+    return error_type(what, where=where, expected=expected, got=got)
+
+
+def place(where: str, *steps: str | int) -> str:
+    """``place("scene.json: ", "frames", 3, "image")`` is ``scene.json: frames[3].image``."""
+    for step in steps:
+        if isinstance(step, int):
+            where += f"[{step}]"
+        else:
+            where += step if not where or where.endswith(": ") or step.startswith("[") else f".{step}"
+    return where.removesuffix(": ")
+
+
+@contextlib.contextmanager
+def named_by(where: str) -> Iterator[None]:
+    """Replace the owner that a type of ``base/types.py`` names by the record it was read from.
+
+    A refused field has the place ``view of 'front': world_from_cam`` in a constructor; ``WHERE.world_from_cam`` comes out.
+    """
+    try:
+        yield
+    except InputError as problem:
+        raise problem.located(place(where, problem.where.rpartition(": ")[2])) from problem

@@ -1,0 +1,408 @@
+"""The output folder of a verb: made, continued, reused, or replaced, and never at the cost of anything else.
+
+A folder is finished when its manifest verifies and its key (verb, version, configuration, hashes of the inputs) is the one
+asked for. A finished folder of another key is replaced only on demand, and only when the new result is finished: until then that
+is made in a folder beside it (see ``replacement.py``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import os
+import re
+import socket
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from mudg.base import log, store
+from mudg.base.config import differences
+from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.processes import process_alive
+from mudg.base.replacement import Replacement, all_names, remove_files
+
+_STATE, _SETTINGS, _LOCK, _LOG = "run.json", "run.yaml", "lock", "log.jsonl"
+_BEGUN = frozenset({_STATE, _SETTINGS, _LOCK})
+"""What a run folder holds before anything is made."""
+_BOOKKEEPING = _BEGUN | {_LOG, store.MANIFEST}
+_TEMPORARY = re.compile(r"\..+\.([a-z0-9_]{8}\.part(\..*)?|\d+-\d+\.part)")
+"""Names under which files and scenes are written before they get their own; a killed run leaves some."""
+
+
+# inputs and outputs apart ---------------------------------------------------------------------------------------------
+
+
+def refuse_overlap(out: Path | str, inputs: Mapping[str, Path | str | None]) -> None:
+    """Refuse an output that is, holds or lies in an input. To be called before anything is written.
+
+    Links, ``..`` and, where the file system does not tell them apart, upper and lower case make no difference.
+
+    Args:
+        out: folder to write; it need not exist.
+        inputs: name for messages -> file or folder that is read (None or empty: not given).
+
+    Raises:
+        UsageError: they overlap.
+    """
+    refuse_overlaps([out], inputs)
+
+
+def refuse_overlaps(outs: Sequence[Path | str], inputs: Mapping[str, Path | str | None]) -> None:
+    """``refuse_overlap`` for many outputs; every input may be read for each of them."""
+    lines_out = {str(out): _line_of(Path(out)) for out in outs}
+    heads_out = {line[0]: out for out, line in lines_out.items()}
+    heads_in: dict[object, tuple[str, Path | str]] = {}
+    for name, given in inputs.items():
+        if given is None or not str(given):
+            continue
+        line = _line_of(Path(given))
+        heads_in[line[0]] = (name, given)
+        for head in line:
+            if head in heads_out:
+                _refuse("is also" if head == line[0] else "holds", heads_out[head], name, given)
+    for out, line in lines_out.items():
+        for head in line:
+            if head in heads_in:
+                _refuse("lies in", out, *heads_in[head])
+
+
+def _refuse(relation: str, out: str, name: str, given: Path | str) -> None:
+    raise UsageError(f"the output {relation} an input", where=f"output: {out}", got=f"{name}: {given}",
+                     remedy="choose an output apart from everything that is read")  # fmt: skip
+
+
+def _line_of(path: Path) -> list[object]:
+    """What identifies a path, then each folder above it: the file system's own number, or the name of what does not exist."""
+    real = Path(os.path.realpath(path))
+    return [_identity(one) for one in (real, *real.parents)]
+
+
+def _identity(path: Path) -> object:
+    try:
+        found = path.stat()
+    except OSError:
+        return os.path.normcase(path)
+    return (found.st_dev, found.st_ino) if found.st_ino else os.path.normcase(path)
+
+
+# what is in a folder --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class VerbOutput:
+    """What a verb writes.
+
+    Args:
+        verb: its name. version: counts up when its rules change; older results are then made again.
+        files: names of its files, relative to the folder, as patterns: ``*`` stands for any part of one name, and a ``/`` at the
+            end for everything below. A file that matches none belongs to somebody else: it is not listed and never removed.
+    """
+
+    verb: str
+    version: int
+    files: tuple[str, ...]
+
+
+def below(folder: str, patterns: Sequence[str]) -> tuple[str, ...]:
+    """The patterns for a sub-folder (itself a pattern)."""
+    return tuple(f"{folder}/{pattern}" for pattern in patterns)
+
+
+def _matches(name: str, patterns: Sequence[str]) -> bool:
+    parts = name.split("/")
+    for pattern in patterns:
+        wanted = pattern.rstrip("/").split("/")
+        fits = len(parts) > len(wanted) if pattern.endswith("/") else len(parts) == len(wanted)
+        if fits and all(map(fnmatchcase, parts, wanted)):
+            return True
+    return False
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a relative name is one that this program gives while it writes."""
+    return any(_TEMPORARY.fullmatch(part) for part in name.split("/"))
+
+
+def run_state(folder: Path) -> dict[str, Any]:
+    """What ``run.json`` says; empty if the folder is missing or holds nothing.
+
+    Raises:
+        UsageError: the folder holds something else than a run.
+    """
+    refused = UsageError(
+        "the output folder holds files of something else", where=str(folder), remedy="choose an empty --out"
+    )
+    if not folder.is_dir():
+        if os.path.lexists(folder):
+            raise refused
+        return {}
+    if not (folder / _STATE).is_file():
+        if any(not is_temporary(entry.name) and not _is_lock(entry) for entry in folder.iterdir()):
+            raise refused
+        return {}
+    try:
+        state = store.read_json(folder / _STATE)
+    except InputError as error:
+        raise refused from error
+    known = isinstance(state, dict) and state.get("schema") == 1
+    if not known or not all(isinstance(state.get(name), str) for name in ("verb", "key", "state")):
+        raise refused
+    return state
+
+
+def _is_lock(path: Path) -> bool:
+    """Whether this is the lock of a run that was killed before it wrote anything else."""
+    return path.name == _LOCK and _owner(path) is not None
+
+
+def _owner(lock: Path) -> tuple[int, str] | None:
+    """Process and machine that hold a lock."""
+    try:
+        owner = store.read_json(lock)
+        return int(owner["pid"]), str(owner["host"])
+    except (InputError, KeyError, TypeError, ValueError):
+        return None
+
+
+def own_names(output: VerbOutput, folder: Path) -> list[str]:
+    """Names of the files in a run folder that the run made, the bookkeeping last: those that its manifest lists, of an unfinished
+    one those that its verb may write.
+
+    Args:
+        output: speaks for an unfinished run of its verb that did not note what it may write.
+    """
+    try:
+        state = run_state(folder)
+    except UsageError:
+        return []
+    try:
+        listed: Collection[str] = store.read_json(folder / store.MANIFEST)["files"]
+    except (InputError, KeyError, TypeError):
+        listed = ()
+    patterns = state.get("files", output.files if state.get("verb") == output.verb else ())
+    finished = state.get("state") == "complete" and listed
+
+    def is_own(name: str) -> bool:
+        if name in _BOOKKEEPING or name in listed or is_temporary(name):
+            return True
+        return (not finished or ".part" in name) and _matches(name, patterns)  # no manifest lists temporary folders
+
+    own = [name for name in all_names(folder) if is_own(name)]
+    return sorted(own, key=lambda name: (name in _BOOKKEEPING, name == _STATE))
+
+
+def _is_finished(folder: Path) -> bool:
+    try:
+        if run_state(folder).get("state") != "complete":
+            return False
+        store.verify_manifest(folder)
+    except (UsageError, IntegrityError):
+        return False
+    return True
+
+
+# a verb's output folder -----------------------------------------------------------------------------------------------
+
+
+class RunDir:
+    """The output folder of one verb: resolved configuration, state, log, manifest, lock.
+
+    ``run.yaml`` is enough to repeat the run; ``run.json`` names verb, key, inputs and state. A verb writes below ``path``. That is
+    ``out``, or a folder beside it while ``out`` still holds the result that is to be replaced; from ``finish`` on it is ``out``.
+    """
+
+    def __init__(
+        self, out: Path, path: Path, output: VerbOutput, key: str, inputs: Mapping[str, str], *, complete: bool = False
+    ) -> None:
+        self.out = out
+        self.path = path
+        self.verb = output.verb
+        self.key = key
+        self.inputs = dict(inputs)
+        self.complete = complete
+        self.fresh = not path.is_dir() or not any(path.iterdir())
+        """Whether nothing was in the folder when it was opened."""
+        self._output = output
+        self._made_folder = path != out or not path.is_dir()
+        self._started_s = time.monotonic()
+
+    @classmethod
+    def open(
+        cls,
+        path: Path,
+        output: VerbOutput,
+        config: Mapping[str, Any],
+        inputs: Mapping[str, str],
+        overwrite: bool = False,
+    ) -> RunDir:
+        """Open ``path`` for this verb, configuration and inputs. Call ``refuse_overlap`` first.
+
+        ``complete`` is True when an earlier run with the same key finished and its manifest verifies: the verb then
+        returns at once. An unfinished run with the same key is continued, also one that is to replace another result.
+
+        Args:
+            inputs: name -> digest of what is read.
+            overwrite: replace a result of another key, or one that was altered, as soon as the new one is finished.
+
+        Raises:
+            UsageError: the folder holds the output of another verb or configuration, or files of somebody else.
+            IntegrityError: the finished result was altered. ResourceError: it cannot be written, or another live process is
+                working in it.
+        """
+        out, values = Path(path), [output.verb, output.version, dict(config), dict(inputs)]
+        key = hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()
+        own, replacement = functools.partial(own_names, output), Replacement.at(out)
+        replacement.recover(_is_finished, own)
+        state, staged = run_state(out), run_state(replacement.staging)
+        same = state.get("key") == key
+        if same and state["state"] == "complete" and _verified(out, overwrite):
+            if staged:
+                log.info(f"{output.verb}: {replacement.staging} holds an unfinished replacement of {out}")
+            return cls(out, out, output, key, inputs, complete=True)
+        in_the_way = (not same or state["state"] == "complete") and _has_made_something(out)
+        if in_the_way and not overwrite:
+            _refuse_other(out, output.verb, config, inputs, state)
+        work = out
+        if in_the_way or (staged.get("key") == key and not same):
+            work = replacement.staging
+            for folder in (out, work):
+                _refuse_while_others_work(folder / _LOCK)
+            if staged and staged["key"] != key:
+                log.info(f"{output.verb}: the unfinished replacement of {out} with other settings is given up")
+                remove_files(work, own(work))
+            replacement.begin()
+        run = cls(out, work, output, key, inputs)
+        if work != out and staged.get("key") == key and _is_finished(work):
+            run._take_place()
+            run.complete = True
+            return run
+        run._begin(config)
+        if work != out:
+            log.info(f"{output.verb}: {out} stays as it is until the new result is finished; that is made in {work}")
+        return run
+
+    def _begin(self, config: Mapping[str, Any]) -> None:
+        """Lock the folder and write down what is made in it."""
+        import yaml
+
+        _refuse_while_others_work(self.path / _LOCK)
+        store.write_json(self.path / _LOCK, {"pid": os.getpid(), "host": socket.gethostname()})
+        self._write_state("running", {})
+        values = {"verb": self.verb, **json.loads(store.json_text(dict(config)))}
+        store.write_text(self.path / _SETTINGS, yaml.safe_dump(values, sort_keys=False))
+
+    def _write_state(self, state: str, summary: Mapping[str, Any]) -> None:
+        from mudg.base.versions import environment
+
+        seconds = self.seconds_before() + time.monotonic() - self._started_s
+        values = {
+            "schema": 1, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state, "seconds": round(seconds, 3),
+            "files": list(self._output.files), "environment": environment(), "summary": dict(summary),
+        }  # fmt: skip
+        store.write_json(self.path / _STATE, values)
+
+    def seconds_before(self) -> float:
+        """Seconds that earlier, interrupted runs of this same key have taken."""
+        if not hasattr(self, "_seconds_before"):
+            state = run_state(self.path)
+            self._seconds_before = float(state.get("seconds", 0.0)) if state.get("key") == self.key else 0.0
+        return self._seconds_before
+
+    def log(self, **fields: Any) -> None:
+        """Append one JSON line to log.jsonl."""
+        store.append_line(self.path / _LOG, store.json_text(fields, indent=None))
+
+    def pause(self, summary: Mapping[str, Any] | None = None) -> None:
+        """Record an interruption: time spent so far is kept, the lock released; the same command continues."""
+        self._write_state("interrupted", summary or {})
+        (self.path / _LOCK).unlink(missing_ok=True)
+
+    def discard(self) -> None:
+        """Remove what this unfinished run made, and the folder if the run made it and nothing else is in it."""
+        with contextlib.suppress(OSError):  # an error brought us here, and that one is to be told
+            remove_files(self.path, own_names(self._output, self.path))
+            if self._made_folder:
+                self.path.rmdir()
+
+    def finish(self, summary: Mapping[str, Any] | None = None) -> None:
+        """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the place of the
+        result that is to be replaced."""
+        names = [name for name in store.list_files(self.path) if name not in (_LOG, _STATE)]
+        own = [name for name in names if name == _SETTINGS or _matches(name, self._output.files)]
+        if len(own) < len(names):
+            log.warn(
+                f"{self.path} holds files that {self.verb} did not make: {', '.join(sorted(set(names) - set(own))[:8])}"
+            )
+        store.write_manifest(self.path, own)
+        self._write_state("complete", summary or {})
+        (self.path / _LOCK).unlink(missing_ok=True)
+        if self.path != self.out:
+            self._take_place()
+        self.complete = True
+
+    def _take_place(self) -> None:
+        Replacement.at(self.out).swap(functools.partial(own_names, self._output))
+        self.path = self.out
+
+    def summary(self) -> dict[str, Any]:
+        """The summary that ``finish`` recorded."""
+        return store.read_json(self.path / _STATE).get("summary", {})
+
+    def reused(self) -> Path:
+        """Say that an earlier result is used again, and return its path."""
+        log.info(f"{self.verb}: reused {self.path} (verified)")
+        return self.path
+
+
+def _has_made_something(folder: Path) -> bool:
+    """Whether a run left more than its bookkeeping; one that failed before (a mistyped flag) is in nobody's way."""
+    return folder.is_dir() and any(e.name not in _BEGUN and not is_temporary(e.name) for e in folder.iterdir())
+
+
+def _verified(path: Path, overwrite: bool) -> bool:
+    try:
+        store.verify_manifest(path)
+    except IntegrityError as error:
+        if overwrite:
+            return False
+        remedy = "add --overwrite to make it again, or choose another --out"
+        raise IntegrityError(
+            error.what, where=error.where, expected=error.expected, got=error.got, remedy=remedy
+        ) from error
+    return True
+
+
+def _refuse_other(
+    path: Path, verb: str, config: Mapping[str, Any], inputs: Mapping[str, str], state: Mapping[str, Any]
+) -> None:
+    import yaml
+
+    found = [] if state["verb"] == verb else [f"verb {state['verb']!r} instead of {verb!r}"]
+    old_inputs = state.get("inputs", {})
+    found += [f"input {name!r} changed" for name in inputs if old_inputs.get(name) != inputs[name]]
+    with contextlib.suppress(OSError, yaml.YAMLError):
+        old = yaml.safe_load((path / _SETTINGS).read_text()) or {}
+        found += differences(old, {"verb": verb, **json.loads(store.json_text(dict(config)))})
+    raise UsageError(
+        "the output folder holds the result of another configuration", where=str(path),
+        got="; ".join(found[:8]) or "another program version",
+        remedy="choose another --out, or add --overwrite to replace it",
+    )  # fmt: skip
+
+
+def _refuse_while_others_work(lock: Path) -> None:
+    owner = _owner(lock) if lock.is_file() else None
+    if owner is None:
+        return
+    pid, host = owner
+    if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
+        raise ResourceError(
+            "another process is working in this folder", where=str(lock.parent), got=f"pid {pid} on {host}",
+            remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}",
+        )  # fmt: skip

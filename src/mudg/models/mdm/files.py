@@ -1,0 +1,123 @@
+"""Folders that hold a small diffusion model, and what every diffusion model's folder has in common.
+
+model.json                configuration, sha256 of the weight files, facts (recipe, scores); of published-type models also their kind
+weights_NN.safetensors    weights in fp16
+MODEL_CARD.md             for people
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mudg.base import shards, store
+from mudg.base.errors import InputError
+from mudg.core.noise import ScheduleConfig
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, MDMConfig
+
+MODEL_FILE = "model.json"
+_ASSETS = Path(__file__).resolve().parents[2] / "assets"
+EMBEDDED: dict[str, Path] = {"embedded": _ASSETS / "mdm_small", "embedded-tiny": _ASSETS / "mdm_tiny"}
+"""Models that come with the package, by the names that stand for their folders."""
+SHARD_BYTES = 15 * 1024 * 1024
+
+FORMER_FIELDS: dict[str, dict[str, Any]] = {
+    "top": {
+        "joint": True, "head": "x0", "copy_condition": True, "backdrop": True, "mask_planes": "valid_image", "reference": "warped",
+        "given_classes": True,
+    },
+    "codec": {"kind": "patch", "depth_code": "log", "semantics_code": "shares"},
+}  # fmt: skip
+"""Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is still built."""
+
+
+def folder_of(path: Path | str) -> Path:
+    """The folder that a name of `EMBEDDED` stands for; any other text is a folder itself."""
+    return EMBEDDED.get(str(path), Path(path))
+
+
+def read_description(path: Path | str) -> dict[str, Any]:
+    """The content of a diffusion model's `model.json`, of whichever kind.
+
+    Raises:
+        InputError: no model there, or not a description of this version.
+    """
+    where = folder_of(path) / MODEL_FILE
+    if not where.is_file():
+        raise InputError("no diffusion model here", where=str(where.parent), expected=f"a file {MODEL_FILE}")
+    content = store.read_json(where)
+    if not isinstance(content, dict) or content.get("schema") != 1 or not isinstance(content.get("files"), dict):
+        raise InputError("not a model description of this version", where=str(where))
+    return content
+
+
+def facts(path: Path | str) -> dict[str, Any]:
+    """The facts (recipe, scores) that `save` was given for a model folder or "embedded"."""
+    return dict(read_description(path).get("facts", {}))
+
+
+def digest(path: Path | str) -> str:
+    """Digest of a model's description, which holds the hashes of its weights."""
+    return store.digest(folder_of(path) / MODEL_FILE)
+
+
+def config_from_dict(values: Any, where: str = "model configuration") -> MDMConfig:
+    """Inverse of `dataclasses.asdict`.
+
+    Raises:
+        InputError: names unknown or missing fields, a value of a wrong type, and a variant that is no longer built.
+    """
+
+    def strict(cls: Any, given: Any, path: str) -> dict[str, Any]:
+        known, former = {f.name for f in dataclasses.fields(cls)}, FORMER_FIELDS.get(path, {})
+        names = set(given) - set(former) if isinstance(given, Mapping) else set()
+        if names != known:
+            raise InputError(
+                "a model configuration has other fields than this version knows",
+                where=f"{where}: {path}", expected=", ".join(sorted(known)),
+                got="missing " + ", ".join(sorted(known - names)) + "; unknown " + ", ".join(sorted(names - known)),
+            )  # fmt: skip
+        for name, value in former.items():
+            if given.get(name, value) != value:
+                raise InputError("the model is of a variant that this version no longer has", where=f"{where}: {path}.{name}",
+                                 expected=repr(value), got=repr(given[name]), remedy="train it anew with mudg learn")  # fmt: skip
+        return {name: tuple(given[name]) if isinstance(given[name], list) else given[name] for name in known}
+
+    top = strict(MDMConfig, values, "top")
+    top["codec"] = CodecConfig(**strict(CodecConfig, top["codec"], "codec"))
+    top["schedule"] = ScheduleConfig(**strict(ScheduleConfig, top["schedule"], "schedule"))
+    try:
+        return MDMConfig(**top)
+    except TypeError as error:
+        raise InputError("a model configuration has a value of a wrong type", where=where, got=str(error)) from error
+
+
+def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
+    """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and MODEL_CARD.md."""
+    with store.atomic_directory(folder) as partial:
+        files = shards.write_shards(partial, model.state_dict(), SHARD_BYTES, torch.float16)
+        store.write_text(partial / "MODEL_CARD.md", card)
+        description = {"schema": 1, "config": dataclasses.asdict(model.config), "files": files, "facts": dict(facts)}
+        store.write_json(partial / MODEL_FILE, description)
+        store.sync_tree(partial)
+
+
+def load(path: Path | str = "embedded") -> MDM:
+    """Read a model folder written by `save`; the names of `EMBEDDED` stand for those shipped with the package.
+
+    Raises:
+        InputError: no model there, other fields or other weights than the configuration implies.
+        IntegrityError: a weight file does not match its recorded hash.
+    """
+    folder = folder_of(path)
+    content = read_description(folder)
+    model = MDM(config_from_dict(content.get("config"), str(folder / MODEL_FILE)))
+    state, wanted = shards.read_shards(folder, content["files"]), model.state_dict()
+    shards.check_fit(state, wanted, folder)
+    model.load_state_dict({name: value.to(wanted[name].dtype) for name, value in state.items()})
+    return model.eval()

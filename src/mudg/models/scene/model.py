@@ -1,0 +1,203 @@
+"""The scene model: one table of Gaussians, the nodes they belong to, a sky; and how they become what is rendered at a time.
+
+All Gaussians live in **one** row-aligned ``Table`` whose rows are ordered by node, so that composing a moment touches only what
+moves. Everything else is passed to the renderer as it is.
+
+Columns of the table (raw, unactivated):
+
+    means [N, 3]      metres, in the node's own frame (world for static, box for rigid)
+    quats [N, 4]      (w, x, y, z), any length
+    log_scales [N, 3] natural logarithm of metres
+    logits [N]        opacity = sigmoid
+    sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0)
+    semantics [N, C]  class logits of the classes in ``SceneModel.classes``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import CLASSES, ID
+from mudg.base.types import Gaussians, View
+from mudg.core import native_ops
+from mudg.core.table import Table
+from mudg.models.scene.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
+from mudg.models.scene.sky import SkyNode
+
+NODES: Final[dict[str, Any]] = {"static": StaticNode, "rigid": RigidNode, "deformable": DeformableNode, "sky": SkyNode}
+COLUMNS: Final = frozenset({"means", "quats", "log_scales", "logits", "sh_dc", "sh_rest", "semantics"})
+"""Columns that every scene may have; others belong to a kind of node (``NodeRows.own``)."""
+SKY_LOGIT: Final = 10.0
+"""Logit of the sky class where nothing covers it; large beside what a Gaussian learns."""
+
+
+@dataclass
+class SceneModel:
+    """A fitted, or to be fitted, scene.
+
+    Args:
+        table: all Gaussians, rows ordered by node; label column ``node`` i32 is the index into ``nodes``.
+        nodes: static node first.
+        sky: or None (background black).
+        classes: train ids of the semantic channels, in channel order; empty = no semantics.
+        sh_degree: of the colour columns.
+        facts: JSON values kept with the model (method, scene id, ...).
+    """
+
+    table: Table
+    nodes: tuple[StaticNode | RigidNode, ...]
+    sky: SkyNode | None
+    classes: tuple[int, ...]
+    sh_degree: int
+    facts: dict[str, Any] = field(default_factory=dict)
+    _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
+
+    def counts(self) -> list[int]:
+        """Rows of each node, in order; counted again only when rows were taken or appended."""
+        owner = self.table.labels["node"]
+        if self._counted is None or self._counted[0] is not owner:
+            self._counted = owner, torch.bincount(owner.long(), minlength=len(self.nodes)).tolist()
+        return list(self._counted[1])
+
+    def sort_rows(self) -> None:
+        """Bring rows back into node order after rows were appended (stable)."""
+        self.table.take(torch.argsort(self.table.labels["node"], stable=True))
+
+    def node_tables(self) -> dict[str, Table]:
+        """The optimisable tables beside the shared one, by name (pose offsets; the sky's panorama)."""
+        tables = {f"node.{node.name}": own for node in self.nodes if (own := node.parameters()) is not None}
+        return tables | ({"sky": self.sky.table} if self.sky is not None else {})
+
+    def node_names(self) -> tuple[str, ...]:
+        """Names of the dynamic objects."""
+        return tuple(node.name for node in self.nodes if node.kind != "static")
+
+    def without_nodes(self, names: Sequence[str]) -> SceneModel:
+        """A copy without the named dynamic objects (the rest keeps its parameters, not its moments).
+
+        Raises:
+            UsageError: an object that the scene has no node for (it may be parked, and so part of the background).
+        """
+        known = self.node_names()
+        for name in names:
+            if name not in known:
+                raise UsageError(f"the fitted scene has no dynamic object {name!r}",
+                                 expected="one of " + ", ".join(known) if known else "a scene with dynamic objects")  # fmt: skip
+        kept = [index for index, node in enumerate(self.nodes) if node.name not in names or node.kind == "static"]
+        renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
+        renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
+        owner = renumber[self.table.labels["node"].long()]
+        rows = (owner >= 0).nonzero()[:, 0]
+        table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]})
+        return SceneModel(
+            table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts)
+        )
+
+    # -- state ------------------------------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+        """JSON values and named groups of tensors (``gaussians``, ``nodes``) that rebuild the model with its moments."""
+        nodes, tensors = [], {}
+        for index, node in enumerate((*self.nodes, *(() if self.sky is None else (self.sky,)))):
+            facts, own = node.state()
+            nodes.append({"kind": node.kind, **facts})
+            tensors |= {f"{index}/{name}": value for name, value in own.items()}
+        tensors.setdefault("none", torch.zeros(1))
+        values = {"nodes": nodes, "classes": list(self.classes), "sh_degree": self.sh_degree, "facts": self.facts}
+        return values, {"gaussians": self.table.state(), "nodes": tensors}
+
+    @classmethod
+    def from_state(cls, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]) -> SceneModel:
+        """Inverse of ``state``.
+
+        Raises:
+            InputError: an unknown node kind, a class that does not exist, or rows that belong to no node.
+        """
+        nodes: list[StaticNode | RigidNode] = []
+        sky: SkyNode | None = None
+        for index, facts in enumerate(values["nodes"]):
+            if facts["kind"] not in NODES:
+                raise InputError("unknown kind of scene node", expected=", ".join(NODES), got=str(facts["kind"]))
+            own = {
+                key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")
+            }
+            node = NODES[facts["kind"]].from_state(facts, own)
+            if isinstance(node, SkyNode):
+                sky = node
+            else:
+                nodes.append(node)
+        table = Table.from_state(groups["gaussians"])
+        owner = table.labels["node"]
+        if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
+            raise InputError(
+                "a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}"
+            )
+        classes = tuple(int(value) for value in values["classes"])
+        if any(not 0 <= value < len(CLASSES) for value in classes):
+            raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
+        return cls(table, tuple(nodes), sky, classes, int(values["sh_degree"]), dict(values["facts"]))
+
+
+def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussians:
+    """All Gaussians of the scene in the world at a time, activated, differentiable in every column.
+
+    Objects that do not exist at that time stay in the rows with opacity 0, so that rows always match the table.
+
+    Args:
+        semantics: add the class logits as ``extra`` channels.
+    """
+    table, counts = model.table, model.counts()
+    whole = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
+    blocks = zip(*(column.split(counts) for column in (whole.means, whole.quats, whole.opacity, whole.sh_dc)))
+    own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
+    given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
+    found = []
+    for node, rows in zip(model.nodes, given):
+        now = node.at_time(rows, time_s)
+        found.append(replace(rows, opacity=rows.opacity * 0.0) if now is None else now)
+
+    def column(name: str) -> Tensor:
+        """One column of all nodes; a column that no node changed is passed on without a copy."""
+        parts = [getattr(rows, name) for rows in found]
+        changed = any(part is not getattr(rows, name) for part, rows in zip(parts, given))
+        return torch.cat(parts) if changed else getattr(whole, name)
+
+    return Gaussians(
+        means=column("means"),
+        quats=column("quats"),
+        scales=torch.exp(table["log_scales"]),
+        opacity=column("opacity"),
+        sh=column("sh_dc"),
+        sh_rest=table["sh_rest"] if model.sh_degree > 0 else None,
+        extra=table["semantics"] if semantics and model.classes else None,
+        node=table.labels["node"],
+    )
+
+
+def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> Tensor:
+    """Colours ``[3, H, W]`` over the sky: ``rgb + (1 - alpha) * sky``."""
+    return rgb if model.sky is None else native_ops.over(rgb, alpha, model.sky.coarse_picture(view))
+
+
+def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
+    """Channel of the sky among the class logits and what it gains ``[H, W]`` where nothing covers it; None without that class.
+
+    The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
+    """
+    return (
+        None
+        if ID["sky"] not in model.classes
+        else (model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0]))
+    )
+
+
+def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
+    """Rendered class logits ``[C, H, W]`` with the sky's logit added where nothing covers it (``sky_lift``)."""
+    lift = sky_lift(model, alpha)
+    return extra if lift is None else extra.index_add(0, torch.tensor([lift[0]], device=extra.device), lift[1][None])

@@ -1,0 +1,104 @@
+"""The sky of a scene: a picture of all directions, seen wherever nothing covers it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base.types import View
+from mudg.core.table import Table
+
+
+class SkyNode:
+    """Colour of the sky by direction: a longitude-latitude panorama, seen wherever nothing covers it.
+
+    Column ``panorama`` ``[1, 3, Hs, 2 Hs]``, colours around [0, 1] (raw; clamped when an image is written). Row 0 looks
+    straight up, the last row straight down; the columns run from longitude -pi to pi (world x axis in the middle).
+    """
+
+    kind = "sky"
+
+    def __init__(self, panorama: Table) -> None:
+        self.table = panorama
+
+    @classmethod
+    def uniform(cls, rows: int, rgb: Sequence[float] = (0.6, 0.7, 0.8)) -> SkyNode:
+        """A sky of one colour with ``rows`` rows of texels."""
+        color = torch.tensor(list(rgb), dtype=torch.float32)
+        return cls(Table({"panorama": color.view(1, 3, 1, 1).expand(1, 3, rows, 2 * rows).contiguous()}))
+
+    @property
+    def rows(self) -> int:
+        """Rows of the panorama."""
+        return int(self.table["panorama"].shape[2])
+
+    def coarse_picture(self, view: View) -> Tensor:
+        """Sky colour ``[3, h, w]`` on a coarse grid of a view's pixels; differentiable in the panorama.
+
+        The panorama is far coarser than an image, so it is sampled for every s-by-s block of pixels (s chosen such that samples
+        stay denser than texels), to be interpolated between them.
+        """
+        camera = view.camera
+        texel_rad = np.pi / self.rows
+        stride = int(np.clip(0.7 * texel_rad * min(camera.fx, camera.fy), 1, 8))
+        height, width = -(-camera.height // stride), -(-camera.width // stride)
+        grid = torch.from_numpy(self._grid(view, height, width)).to(self.table["panorama"])
+        padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
+        return F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)[0]
+
+    def _grid(self, view: View, height: int, width: int) -> NDArray[np.float32]:
+        """Sampling positions in the padded panorama, ``f32[height, width, 2]`` in [-1, 1]."""
+        camera = view.camera.resized(width, height)
+        x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
+        # Written out: a matrix product of this shape wakes the threads of BLAS at every step of a fit.
+        right, down, ahead = view.world_from_cam[:3, 0], view.world_from_cam[:3, 1], view.world_from_cam[:3, 2]
+        rays = x[None, :, None] * right + (y[:, None, None] * down + ahead)
+        return self.panorama_grid(rays, padding=1)
+
+    def panorama_grid(self, directions_world: NDArray[np.float64], padding: int = 0) -> NDArray[np.float32]:
+        """Directions ``[..., 3]`` to panorama positions ``[..., 2]`` in [-1, 1] (x: longitude, y: from up to down)."""
+        longitude = np.arctan2(directions_world[..., 1], directions_world[..., 0])
+        elevation = np.arctan2(directions_world[..., 2], np.hypot(directions_world[..., 0], directions_world[..., 1]))
+        columns = 2 * self.rows
+        x = (longitude / np.pi) * columns / (columns + 2 * padding)
+        return np.stack([x, -2 * elevation / np.pi], -1).astype(np.float32)
+
+    def fill(self, directions_world: NDArray[np.float64], rgb: NDArray[np.float32]) -> None:
+        """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
+
+        Args:
+            directions_world: ``[M, 3]``. rgb: f32[M, 3] in [0, 1].
+        """
+        if len(rgb) == 0:
+            return
+        from scipy.ndimage import distance_transform_edt
+
+        rows, columns = self.rows, 2 * self.rows
+        grid = self.panorama_grid(directions_world)
+        column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
+        row = np.clip(((grid[:, 1] + 1) / 2 * rows).astype(np.int64), 0, rows - 1)
+        texel = row * columns + column
+        count = np.bincount(texel, minlength=rows * columns).astype(np.float64)
+        mean = np.stack([np.bincount(texel, rgb[:, c], rows * columns) for c in range(3)]) / np.maximum(count, 1)
+        seen = (count > 0).reshape(rows, columns)
+        tiled = np.concatenate([seen, seen, seen], 1)  # longitude wraps round
+        nearest = distance_transform_edt(~tiled, return_distances=False, return_indices=True)
+        rows_of, columns_of = nearest[0][:, columns : 2 * columns], nearest[1][:, columns : 2 * columns] % columns
+        filled = mean.reshape(3, rows, columns)[:, rows_of, columns_of]
+        self.table.columns["panorama"].detach().copy_(torch.from_numpy(filled).float()[None])
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``Node``."""
+        return {"name": "sky"}, self.table.state()
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SkyNode:
+        """Inverse of ``state``."""
+        return cls(Table.from_state(tensors))

@@ -1,0 +1,14 @@
+"""Short settings of a fit for tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mudg.base import config as configuration
+from mudg.stages.config import FitConfig
+
+
+def fit_config(**changes: Any) -> FitConfig:
+    """A configuration with some fields changed; two underscores stand between a group and its field: ``densify__kind="none"``."""
+    dotted = {name.replace("__", "."): value for name, value in changes.items()}
+    return configuration.load(FitConfig, overrides=configuration.nested(dotted))

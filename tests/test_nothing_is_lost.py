@@ -1,0 +1,458 @@
+"""Every verb: an output that touches an input is refused, and a result is replaced only by a finished one."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import kitti_folders
+import pytest
+import torch
+import toy_views
+from fit_settings import fit_config
+from toy_clips import tiny, write_clips
+from toy_published import TINY, tiny_checkpoint
+from toy_scene import ToyStreet
+
+from mudg import cli
+from mudg.base import store
+from mudg.base.errors import UsageError
+from mudg.bench import run as bench
+from mudg.bench import shift, shift_page
+from mudg.core import trajectory
+from mudg.data.city import CityConfig
+from mudg.data.scene import read_scene, write_zip
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.stages import (
+    annotate,
+    batch,
+    convert,
+    fit,
+    fuse,
+    ingest,
+    learn,
+    render,
+    run,
+    score,
+    score_truth,
+    synthesize,
+)
+from mudg.stages.config import (
+    AnnotateConfig,
+    BenchConfig,
+    ConvertConfig,
+    FuseConfig,
+    IngestConfig,
+    RenderConfig,
+    RunConfig,
+    ScoreConfig,
+    SynthesizeConfig,
+)
+
+SMALL = MDMConfig(
+    widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4, embed_width=16,
+    codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(8, 16), refine_blocks=(1, 1), area_px=24576,
+)  # fmt: skip
+CITY = CityConfig(seed=3, n_frames=3, width=48, height=32, cameras=("front",), lidar_beams=8, lidar_azimuth_step_deg=4)
+
+
+@dataclass(frozen=True)
+class Verb:
+    """One verb: ``call(given, out, variant, overwrite)``, with the inputs by name; variants 1 and 2 differ in the settings."""
+
+    call: Callable[[dict[str, Path], Path, int, bool], Any]
+    inputs: tuple[str, ...]
+
+
+def _ingest(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+    config = IngestConfig(test_every=v + 1, poses=str(g.get("poses", "")), workers=1, contact_sheet=False)
+    return ingest.run(config, g["log"], out, overwrite=o)
+
+
+def _annotate(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+    config = AnnotateConfig(labeller="geometry", sweeps=v, processes=1, weights=str(g.get("weights", "")))
+    return annotate.run(config, g["plain scene"], out, overwrite=o)
+
+
+def _synthesize(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+    config = SynthesizeConfig(
+        cameras=("front",), shifts_m=(1.0, -1.0), model=str(g["model"]), steps=v, width_px=48, full_size=False, precision="float32",
+        processes=1,
+    )  # fmt: skip
+    return synthesize.run(config, g["scene"], g["fused"], out, fitted=g["fitted"], overwrite=o)
+
+
+def _fit(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+    config = fit_config(method="mudg_s", iterations=6, seed=v, start__gaussians=200, checkpoint_every=2, preview_every=3)
+    return fit.run(config, g["scene"], g["fused"], out, observations=g["views"], overwrite=o)
+
+
+def _score(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+    config = ScoreConfig(width_px=24 * v, perceptual_views=0)
+    return score.run(config, g["scene"], {"a": g["views"]}, out, fused=g["fused"], truth=None, overwrite=o)
+
+
+def _bench(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+    return bench.run("mdm", BenchConfig(model=str(g["model"]), seed=v, precision="float32", threads=1), out, overwrite=o)
+
+
+def _paths(scene: Path, v: int) -> list[Any]:
+    loaded = read_scene(scene)
+    return [trajectory.recorded(loaded, "front"), trajectory.shifted(loaded, "front", float(v))]
+
+
+VERBS: dict[str, Verb] = {
+    "ingest a log": Verb(_ingest, ("log", "poses")),
+    "ingest a scene": Verb(lambda g, *rest: _ingest({"log": g["scene"]}, *rest), ("scene",)),
+    "ingest a zip": Verb(lambda g, *rest: _ingest({"log": g["zip"]}, *rest), ("zip",)),
+    "annotate": Verb(_annotate, ("plain scene", "weights")),
+    "fuse": Verb(lambda g, out, v, o: fuse.run(FuseConfig(voxel_m=0.1 * v), g["scene"], out, overwrite=o), ("scene",)),
+    "learn": Verb(
+        lambda g, out, v, o: learn.run(tiny(g["clips"], seed=v), out, overwrite=o), ("clips",)
+    ),
+    "synthesize": Verb(_synthesize, ("scene", "fused", "model", "fitted")),
+    "fit": Verb(_fit, ("scene", "fused", "views")),
+    "render": Verb(
+        lambda g, out, v, o: render.run(RenderConfig(shifts_m=(0.0, v)), g["scene"], g["fitted"], out, overwrite=o),
+        ("scene", "fitted"),
+    ),
+    "score": Verb(_score, ("scene", "views", "fused")),
+    "truth": Verb(
+        lambda g, out, v, o: score_truth.write_truth(g["city"], _paths(g["city"], v), out, overwrite=o), ("city",)
+    ),
+    "film": Verb(
+        lambda g, out, v, o: shift_page.film(
+            {"truth": g["views"], **({"b": g["views"]} if v == 2 else {})}, _paths(g["scene"], 1), out, overwrite=o
+        ),
+        ("views",),
+    ),
+    "fill": Verb(
+        lambda g, out, v, o: shift.write_fill(g["scene"], g["fused"], _paths(g["scene"], v), out, overwrite=o), ("scene", "fused")
+    ),
+    "exact": Verb(
+        lambda g, out, v, o: shift.write_exact(g["views"], _paths(g["scene"], 1)[: 3 - v], out, overwrite=o), ("views",)
+    ),
+    "bench": Verb(_bench, ("model",)),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One input of every kind, small."""
+    root = tmp_path_factory.mktemp("world")
+    given = {"scene": toy_views.write_scene(root / "scene", lidar=True), "zip": write_zip(root / "scene", root / "scene.zip")}
+    street = ToyStreet(times=[0.0, 0.1])
+    street.write(root / "plain", width=60, height=40, labels=False)
+    given |= {"plain scene": root / "plain", "log": kitti_folders.write_raw_drive(root / "day"), "clips": write_clips(root / "clips")}
+    given["fused"] = fuse.run(FuseConfig(), given["scene"], root / "fused")
+    given["views"] = toy_views.write_views(given["scene"], root / "views", "a", (0.0, 1.0))
+    config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
+    given["fitted"] = fit.run(config, given["scene"], given["fused"], root / "fitted")
+    torch.manual_seed(0)
+    mdm.save(MDM(SMALL), root / "model", "", {})
+    given["model"] = root / "model"
+    given["city"] = ingest.run(IngestConfig(city=CITY, contact_sheet=False), ingest.CITY, root / "city")
+    return given
+
+
+def tree(root: Path) -> dict[str, int]:
+    """Every file below a folder and when it was written."""
+    return {p.relative_to(root).as_posix(): p.lstat().st_mtime_ns for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def copied(world: dict[str, Path], names: tuple[str, ...], root: Path) -> dict[str, Path]:
+    """Copies of some inputs, each in a folder of its own; made-up files for those that the world lacks."""
+    given = {}
+    for name in names:
+        place = root / name.replace(" ", "_") / "input"
+        place.parent.mkdir(parents=True)
+        if name not in world:
+            place.write_text("made up")
+        elif world[name].is_dir():
+            shutil.copytree(world[name], place)
+        else:
+            place = place.with_suffix(world[name].suffix)
+            shutil.copy2(world[name], place)
+        given[name] = place
+    return given
+
+
+# ---- inputs and outputs apart ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_an_output_that_touches_an_input_is_refused(name: str, world: dict[str, Path], tmp_path: Path) -> None:
+    touched = copied(world, VERBS[name].inputs, tmp_path / "in")
+    given = {**world, **touched}
+    (tmp_path / "link").symlink_to("in")
+    before = tree(tmp_path)
+    for path in touched.values():
+        through_link = tmp_path / "link" / path.relative_to(tmp_path / "in")
+        places = [path, path.parent, through_link, path.parent / "x" / ".." / path.name, tmp_path / "in"]
+        for out in [*places, *([path / "inside", through_link / "deep" / "inside"] if path.is_dir() else [])]:
+            for overwrite in (False, True):
+                with pytest.raises(UsageError, match="an input") as refused:
+                    VERBS[name].call(given, out, 1, overwrite)
+                assert str(out) in refused.value.where
+                assert str(path) in refused.value.got or out == tmp_path / "in"
+    assert tree(tmp_path) == before
+
+
+def test_the_command_line_ends_with_code_2(world: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = copied(world, ("scene",), tmp_path)["scene"]
+    before = tree(tmp_path)
+    assert cli.main(["fuse", str(scene), "--out", str(scene), "--overwrite"]) == 2
+    said = capsys.readouterr().err
+    assert "is also an input" in said and "what to do" in said and "Traceback" not in said
+    assert tree(tmp_path) == before
+
+
+def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, Path], tmp_path: Path) -> None:
+    given = copied(world, ("scene", "plain scene"), tmp_path / "in")
+    scenes = tmp_path / "scenes"
+    for name, path in zip(("a", "b"), given.values(), strict=True):
+        shutil.copytree(path, scenes / name)
+    listed = tmp_path / "list.txt"
+    for text, out in (
+        ("scenes/a\nscenes/b\n", scenes), ("scenes/a name=b\n", scenes / "a"), ("scenes/a name=scenes\n", tmp_path),
+        ("scenes/a name=b\nscenes/b name=c\n", scenes),
+    ):  # fmt: skip
+        listed.write_text(text)
+        before = tree(tmp_path)
+        with pytest.raises(UsageError, match="an input"):
+            fuse.run_many(FuseConfig(), listed, out, jobs=1, overwrite=True)
+        assert tree(tmp_path) == before
+    with pytest.raises(UsageError, match="an input"):
+        fuse.run_many(FuseConfig(), scenes, scenes, jobs=1, overwrite=True)
+    (tmp_path / "status.json").write_text("scenes/a\n")
+    entries = [batch.Entry("c", str(scenes / "a"))]
+    for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status would replace")):
+        with pytest.raises(UsageError, match=words):
+            batch.run_batch("fuse", entries, tmp_path, fuse._one_of_many, jobs=1, listed=list_file)
+    assert (tmp_path / "status.json").read_text() == "scenes/a\n"
+
+
+def test_files_of_a_log_that_lie_beside_it_count(world: dict[str, Path], tmp_path: Path) -> None:
+    shutil.copytree(world["log"].parent, tmp_path / "day")
+    drive, calibration = tmp_path / "day" / world["log"].name, tmp_path / "day" / "calib_cam_to_cam.txt"
+    assert calibration.is_file()
+    with pytest.raises(UsageError, match="is also an input"):
+        ingest.run(IngestConfig(), drive, calibration, overwrite=True)
+
+
+def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(world: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(world["clips"], out / "clips")
+    for clips in (out, out / "steps", tmp_path, out / "clips" / "deep"):
+        with pytest.raises(UsageError, match="an input"):
+            learn.run(tiny(clips), out)
+    with pytest.raises(UsageError, match="an input"):
+        learn.run(tiny(out / "clips"), out, overwrite=True)
+    with pytest.raises(UsageError, match="something else"):  # they are not from here
+        learn.run(tiny(out / "clips"), out)
+    assert len(tree(out)) == len(tree(world["clips"]))
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_the_chain_never_writes_into_its_log(world: dict[str, Path], tmp_path: Path, overwrite: bool) -> None:
+    given = copied(world, ("log", "scene", "zip"), tmp_path)
+    before = tree(tmp_path)
+    for path in given.values():
+        for out in (path, path.parent, *([path / "out"] if path.is_dir() else [])):
+            with pytest.raises(UsageError, match="an input"):
+                run.run_chain(RunConfig(), str(path), out, overwrite=overwrite)
+    config = dataclasses.replace(RunConfig(), synthesize=SynthesizeConfig(model=str(given["scene"])))
+    with pytest.raises(UsageError, match=r"synthesize\.model"):
+        run.run_chain(config, "city", given["scene"].parent, overwrite=overwrite)
+    assert tree(tmp_path) == before
+
+
+def test_the_chain_takes_the_scene_in_its_own_folder_and_leaves_it_alone(
+    world: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(world["scene"], out / "scene")
+    before = tree(out)
+    reached: list[Path] = []
+
+    def stop(_config: RunConfig, scene: Path, *_: object) -> Any:
+        reached.append(scene)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "_steps", stop)
+    for overwrite in (False, True):
+        with pytest.raises(KeyboardInterrupt):
+            run.run_chain(RunConfig(), out / "scene", out, overwrite=overwrite)
+    assert reached == [out / "scene"] * 2
+    assert before.items() <= tree(out).items()
+    (out / "run.json").unlink()
+    (out / "mine.md").write_text("mine")
+    with pytest.raises(UsageError, match="something else"):
+        run.run_chain(RunConfig(), out / "scene", out, overwrite=True)
+    with pytest.raises(UsageError, match="an input"):
+        run.run_chain(RunConfig(), out / "scene", out / "scene", overwrite=True)
+
+
+def test_the_chain_does_not_take_the_folder_of_a_verb_for_its_own(world: dict[str, Path], tmp_path: Path) -> None:
+    folder = copied(world, ("fused",), tmp_path)["fused"]
+    before = tree(tmp_path)
+    for overwrite in (False, True):
+        with pytest.raises(UsageError, match="something else"):
+            run.run_chain(RunConfig(), "city", folder, overwrite=overwrite)
+    assert tree(tmp_path) == before
+
+
+def test_the_comparison_of_methods_leaves_other_folders_alone(tmp_path: Path) -> None:
+    for name in ("thesis.tex", "bench.md", "bench.json"):
+        folder = tmp_path / name.partition(".")[2]
+        folder.mkdir()
+        (folder / name).write_text("{}")
+        with pytest.raises(UsageError, match="something else"):
+            bench.run("shift", BenchConfig(), folder, overwrite=True)
+        assert (folder / name).read_text() == "{}"
+
+
+# ---- replaced by a finished result only --------------------------------------------------------------------------------
+
+
+@contextmanager
+def counted_writes(monkeypatch: pytest.MonkeyPatch, stop_at: int = 0) -> Iterator[list[Path]]:
+    """Note every file that is written; the ``stop_at``-th is not, as if Ctrl-C had come."""
+    written: list[Path] = []
+    atomic_path, write_in_tree = store.atomic_path, store.write_in_tree
+
+    def note(path: Path) -> None:
+        written.append(Path(path))
+        if len(written) == stop_at:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def path_noted(path: Path) -> Iterator[Path]:
+        note(path)
+        with atomic_path(path) as temporary:
+            yield temporary
+
+    def tree_noted(path: Path, content: bytes) -> None:
+        note(path)
+        write_in_tree(path, content)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "atomic_path", path_noted)
+        patched.setattr(store, "write_in_tree", tree_noted)
+        yield written
+
+
+def listed(folder: Path) -> dict[str, Any]:
+    return {n: f["sha256"] for n, f in store.read_json(folder / store.MANIFEST)["files"].items()}
+
+
+HISTORY = {"learn": {"loss.png"}}
+"""Files that show how a run went, interruptions included."""
+
+
+@pytest.fixture
+def quick_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A measurement that only writes some files."""
+
+    def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
+        for number in range(4):
+            store.write_text(out / "clips" / f"{number}.safetensors", f"{number} {config.seed}")
+        return {"seed": config.seed}, "table"
+
+    monkeypatch.setitem(bench.BENCHES, "mdm", measure)
+
+
+@pytest.mark.usefixtures("quick_bench")
+@pytest.mark.parametrize("name", VERBS)
+def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
+    name: str, world: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
+    call, out = VERBS[name].call, tmp_path / "out"
+    with counted_writes(monkeypatch) as written:
+        call(given, tmp_path / "whole", 2, False)
+    total = len(written)
+    call(given, out, 1, False)
+    made = {n for n in tree(out) if n not in ("run.json", "log.jsonl", "manifest.json")}
+    assert set(listed(out)) == made, "a file is missing among the names that the verb declares"
+    (out / "mine.md").write_text("mine")
+    before = tree(out)
+    with pytest.raises(UsageError, match="another configuration"):
+        call(given, out, 2, False)
+    with counted_writes(monkeypatch, stop_at=max(4, total // 2)), pytest.raises(KeyboardInterrupt):
+        call(given, out, 2, True)
+    assert tree(out) == before
+    store.verify_manifest(out)
+    call(given, out, 1, False)  # reused as ever
+    assert tree(out) == before
+    call(given, out, 2, True)
+    assert "mine.md" in capsys.readouterr().err
+    assert (out / "mine.md").read_text() == "mine"
+    store.verify_manifest(out)
+    found, whole = listed(out), listed(tmp_path / "whole")
+    assert found.keys() == whole.keys()
+    differing = {n for n in found if found[n] != whole[n] and Path(n).name != "state.json"} - HISTORY.get(name, set())
+    assert not differing
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "whole"]
+    assert not [p for p in out.rglob("*") if p.is_file() and b".new.part" in p.read_bytes()]
+    call(given, out, 2, True)  # finished: reused
+
+
+def test_a_failed_import_over_another_scene_leaves_that(world: dict[str, Path], tmp_path: Path) -> None:
+    out = ingest.run(IngestConfig(test_every=2, contact_sheet=False), world["log"], tmp_path / "out")
+    before = tree(out)
+    with pytest.raises(UsageError, match="no such camera"):
+        ingest.run(IngestConfig(cameras=("frnt",), contact_sheet=False), world["log"], out, overwrite=True)
+    assert tree(tmp_path / "out") == before
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_user_file_in_the_folder_of_a_failing_import_stays(
+    world: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+
+    def fail(_kind: str, _config: IngestConfig, _source: Path, folder: Path) -> Any:
+        (folder / "mine.md").write_text("mine")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ingest, "_make", fail)
+    with pytest.raises(KeyboardInterrupt):
+        ingest.run(IngestConfig(), world["log"], out)
+    assert [p.name for p in out.iterdir()] == ["mine.md"]
+
+
+def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512.ckpt")
+
+    def converted(dtype: str, *, overwrite: bool) -> Path:
+        config = ConvertConfig(dtype=dtype, resolution="320x512")
+        return convert.run(config, tmp_path / "512.ckpt", tmp_path / "to", overwrite=overwrite, network=TINY)
+
+    monkeypatch.setattr(convert.processes, "run_limited", lambda work, *_: work() or 0)
+    to = converted("float32", overwrite=False)
+    (to / "mine.md").write_text("mine")
+    before = tree(to)
+    for out in (tmp_path, tmp_path / "512.ckpt"):
+        with pytest.raises(UsageError, match="an input"):
+            convert.run(ConvertConfig(), tmp_path / "512.ckpt", out, overwrite=True)
+    (tmp_path / "fit").mkdir()
+    store.write_json(tmp_path / "fit" / "model.json", {"schema": 1, "nodes": []})
+    with pytest.raises(UsageError, match="something else"):
+        convert.run(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "fit", overwrite=True)
+    with counted_writes(monkeypatch, stop_at=2), pytest.raises(KeyboardInterrupt):
+        converted("float16", overwrite=True)
+    assert tree(to) == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["512.ckpt", "fit", "to"]
+    converted("float16", overwrite=True)
+    assert (to / "mine.md").read_text() == "mine"
+    assert store.read_json(to / "model.json")["files"] != {}
+    assert tree(to).keys() == before.keys()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["512.ckpt", "fit", "to"]

@@ -1,0 +1,459 @@
+"""A verb's output folder: reused, continued, replaced when the new result is finished; nobody else's files are touched."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mudg.base import store
+from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.replacement import Replacement
+from mudg.base.run_folder import RunDir, VerbOutput, is_temporary, refuse_overlap, run_state
+
+OUTPUT = VerbOutput("fit", 1, ("out.txt", "rows/*.txt", "steps/"))
+SETTINGS = {"nested": {"x": 0.5}}
+
+
+def run(path: Path, value: int = 1, **named: Any) -> RunDir:
+    return RunDir.open(path, OUTPUT, {"value": value, **SETTINGS}, {"scene": "abc"}, **named)
+
+
+def finished(path: Path, value: int = 1, **named: Any) -> RunDir:
+    made = run(path, value, **named)
+    store.write_text(made.path / "out.txt", f"result {value}")
+    store.write_text(made.path / "rows" / f"{value}.txt", "row")
+    made.finish({"value": value})
+    return made
+
+
+def contents(folder: Path) -> dict[str, str]:
+    found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
+    return {name: path.read_text() for name, path in sorted(found.items()) if name != "run.json"}
+
+
+# reused, continued, refused -------------------------------------------------------------------------------------------
+
+
+def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
+    made = run(tmp_path / "r")
+    assert not made.complete
+    store.write_text(made.path / "out.txt", "result")
+    made.log(step=1, loss=0.5)
+    made.finish({"psnr": 30.0})
+    again = run(tmp_path / "r")
+    assert again.complete
+    assert again.summary() == {"psnr": 30.0}
+    (made.path / "out.txt").write_text("altered")
+    with pytest.raises(IntegrityError, match="--overwrite"):
+        run(tmp_path / "r")
+    assert not run(tmp_path / "r", overwrite=True).complete
+    assert (made.path / "out.txt").read_text() == "altered"
+
+
+def test_run_folder_refuses_another_configuration_and_names_the_difference(tmp_path: Path) -> None:
+    run(tmp_path / "r").finish()
+    with pytest.raises(UsageError, match="value: 1 there, 2 asked"):
+        run(tmp_path / "r", value=2)
+    with pytest.raises(UsageError, match="scene"):
+        RunDir.open(tmp_path / "r", OUTPUT, {"value": 1, **SETTINGS}, {"scene": "xyz"})
+
+
+def test_a_run_that_failed_before_it_made_anything_is_in_nobodys_way(tmp_path: Path) -> None:
+    run(tmp_path / "r")
+    corrected = run(tmp_path / "r", value=2)
+    assert not corrected.complete
+    store.write_text(corrected.path / "out.txt", "half")
+    with pytest.raises(UsageError, match="value: 2 there, 1 asked"):
+        run(tmp_path / "r")
+
+
+def test_interrupted_run_continues_and_a_crash_before_the_state_is_not_complete(tmp_path: Path) -> None:
+    made = run(tmp_path / "r")
+    store.write_text(made.path / "out.txt", "half")
+    made.pause()
+    assert json.loads((tmp_path / "r" / "run.json").read_text())["state"] == "interrupted"
+    again = run(tmp_path / "r", overwrite=True)  # the same command continues, whatever else it says
+    assert not again.complete
+    assert (again.path / "out.txt").read_text() == "half"
+    store.write_manifest(again.path)  # a crash between manifest and state
+    assert not run(tmp_path / "r").complete
+
+
+def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_path: Path) -> None:
+    made = run(tmp_path / "r")
+    store.write_json(made.path / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
+    with pytest.raises(ResourceError, match=str(os.getppid())):
+        run(tmp_path / "r")
+    store.write_text(made.path / "out.txt", "half")
+    for value in (1, 2):
+        with pytest.raises(ResourceError, match="another process"):
+            run(tmp_path / "r", value, overwrite=True)
+    assert (made.path / "out.txt").is_file()
+    store.write_json(made.path / "lock", {"pid": 2**22 + 1, "host": socket.gethostname()})
+    assert not run(tmp_path / "r").complete
+
+
+# somebody else's files ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "state", [None, "{", "[]", '{"schema": 1}', '{"schema": 2, "verb": "fit", "key": "k", "state": "complete"}',
+              '{"schema": 1, "state": "complete", "asked": {"verb": "run"}}'],
+)  # fmt: skip
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_of_somebody_elses_files_is_refused(tmp_path: Path, state: str | None, overwrite: bool) -> None:
+    folder = tmp_path / "r"
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("precious")
+    if state is not None:
+        (folder / "run.json").write_text(state)
+    before = sorted(p.name for p in tmp_path.rglob("*"))
+    with pytest.raises(UsageError, match="something else"):
+        run(folder, overwrite=overwrite)
+    assert sorted(p.name for p in tmp_path.rglob("*")) == before
+    with pytest.raises(UsageError, match="something else"):
+        run(folder / "thesis.tex", overwrite=overwrite)
+
+
+def test_a_run_killed_before_its_first_record_is_in_nobodys_way(tmp_path: Path) -> None:
+    folder = tmp_path / "r"
+    store.write_json(folder / "lock", {"pid": 2**22 + 1, "host": socket.gethostname()})
+    (folder / ".run.abcdefgh.part.json").write_text("{")
+    finished(folder)
+    assert run(folder).complete
+    (folder / "lock").write_text("a key, and not ours")
+    (folder / "run.json").unlink()
+    with pytest.raises(UsageError, match="something else"):
+        run(folder)
+
+
+@pytest.mark.parametrize("done", [True, False])
+def test_only_files_of_the_old_result_are_removed_and_others_named_and_kept(
+    tmp_path: Path, done: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "r"
+    old = run(folder)
+    for name in ("out.txt", "rows/1.txt", "rows/a b.txt", "steps/step_01/weights", "steps/x.part/y"):
+        store.write_text(old.path / name, "old")
+    (folder / "rows" / ".1.abcdefgh.part.txt").write_text("left by a killed writer")
+    (folder / "rows" / "mine.md").write_text("mine")  # while the run goes on
+    (folder / "photos" / "2024").mkdir(parents=True)
+    (folder / "photos" / "2024" / "a.jpg").write_text("mine, too")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "b.jpg").write_text("far away")
+    (folder / "link").symlink_to(tmp_path / "elsewhere")
+    if done:
+        old.finish()
+        assert "rows/mine.md" not in store.read_json(folder / "manifest.json")["files"]
+        (folder / "rows" / "9.txt").write_text("added to a finished result")
+        (folder / "out.txt.kept1").write_text("mine by chance")
+    capsys.readouterr()
+    new = finished(folder, 2, overwrite=True)
+    said = capsys.readouterr().err.replace("\n", " ")
+    kept = ["link", "photos/2024/a.jpg", "rows/mine.md", *(["out.txt.kept1", "rows/9.txt"] if done else [])]
+    assert all(name in said for name in kept)
+    assert {name for name in contents(folder) if "link" not in name} == {
+        "manifest.json", "out.txt", "rows/2.txt", "run.yaml", *kept[1:]
+    }  # fmt: skip
+    assert (folder / "link" / "b.jpg").read_text() == "far away"
+    assert new.path == new.out == folder
+    store.verify_manifest(folder)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["elsewhere", "r"]
+    assert run(folder, 2).complete
+
+
+def test_a_file_of_somebody_else_with_the_name_of_a_new_one_gets_another(tmp_path: Path) -> None:
+    folder = finished(tmp_path / "r").path
+    (folder / "rows" / "2.txt").write_text("mine")
+    finished(folder, 2, overwrite=True)
+    assert (folder / "rows" / "2.txt").read_text() == "row"
+    assert (folder / "rows" / "2.txt.kept1").read_text() == "mine"
+
+
+def test_a_manifest_names_nothing_outside_its_folder(tmp_path: Path) -> None:
+    folder = finished(tmp_path / "r").path
+    (tmp_path / "precious").write_text("x")
+    manifest = store.read_json(folder / "manifest.json")
+    manifest["files"] |= {"../precious": {"bytes": 1, "sha256": "0"}, str(tmp_path / "precious"): {"bytes": 1, "sha256": "0"}}
+    store.write_json(folder / "manifest.json", manifest)
+    finished(folder, 2, overwrite=True)
+    assert (tmp_path / "precious").read_text() == "x"
+
+
+def test_an_older_unfinished_run_that_did_not_note_its_files_is_known_by_its_verb(tmp_path: Path) -> None:
+    folder = run(tmp_path / "r").path
+    store.write_text(folder / "rows" / "1.txt", "half")
+    store.write_text(folder / "mine.md", "mine")
+    state = store.read_json(folder / "run.json")
+    state.pop("files")
+    store.write_json(folder / "run.json", state)
+    finished(folder, 2, overwrite=True)
+    assert set(contents(folder)) == {"manifest.json", "mine.md", "out.txt", "rows/2.txt", "run.yaml"}
+
+
+@pytest.mark.parametrize(
+    ("name", "temporary"),
+    [(".run.abcd_f12.part.json", True), (".scene.123-456.part/images/a.png", True), (".r.new.part", False), ("a.part", False),
+     (".bashrc", False), ("film.part.mp4", False)],
+)  # fmt: skip
+def test_names_of_temporary_files(name: str, temporary: bool) -> None:
+    assert is_temporary(name) is temporary
+
+
+def test_names_that_writers_give_are_known_as_temporary(tmp_path: Path) -> None:
+    with store.atomic_path(tmp_path / "picture.png") as path:
+        assert is_temporary(path.name)
+
+
+# replaced when the new result is finished -----------------------------------------------------------------------------
+
+
+def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> None:
+    folder = finished(tmp_path / "r").path
+    before = contents(folder)
+    new = run(folder, 2, overwrite=True)
+    assert new.path != folder
+    assert new.path.parent == folder.parent
+    store.write_text(new.path / "out.txt", "half")
+    new.log(step=1)
+    assert contents(folder) == before
+    assert run(folder).complete  # the old result is reused as ever
+    with pytest.raises(UsageError, match="another configuration"):
+        run(folder, 2)
+    again = run(folder, 2, overwrite=True)
+    assert (again.path / "out.txt").read_text() == "half"
+    other = run(folder, 3, overwrite=True)
+    assert not (other.path / "out.txt").exists()
+    assert contents(folder) == before
+    finished(folder, 3, overwrite=True)
+    assert contents(folder)["out.txt"] == "result 3"
+    assert [p.name for p in tmp_path.iterdir()] == ["r"]
+    assert ".part" not in "".join(contents(folder).values())
+
+
+def test_a_finished_result_of_the_same_settings_is_reused_with_overwrite_too(tmp_path: Path) -> None:
+    folder = finished(tmp_path / "r").path
+    assert run(folder, overwrite=True).complete
+    (folder / "out.txt").write_text("altered")
+    assert finished(folder, overwrite=True).path == folder
+    assert (folder / "out.txt").read_text() == "result 1"
+
+
+def test_a_replacement_goes_on_when_the_old_result_was_taken_away(tmp_path: Path) -> None:
+    folder = finished(tmp_path / "r").path
+    store.write_text(run(folder, 2, overwrite=True).path / "out.txt", "half")
+    folder.rename(tmp_path / "away")
+    again = run(folder, 2)
+    assert (again.path / "out.txt").read_text() == "half"
+    finished(folder, 2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["away", "r"]
+
+
+def test_a_link_to_a_folder_stays_a_link(tmp_path: Path) -> None:
+    finished(tmp_path / "real")
+    (tmp_path / "r").symlink_to("real")
+    finished(tmp_path / "r", 2, overwrite=True)
+    assert (tmp_path / "r").is_symlink()
+    assert (tmp_path / "real" / "out.txt").read_text() == "result 2"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r", "real"]
+
+
+def test_seconds_of_an_interrupted_replacement_count(tmp_path: Path) -> None:
+    folder = finished(tmp_path / "r").path
+    new = run(folder, 2, overwrite=True)
+    new.pause()
+    state = store.read_json(new.path / "run.json")
+    store.write_json(new.path / "run.json", {**state, "seconds": 40.0})
+    assert run(folder, 2, overwrite=True).seconds_before() == 40.0
+
+
+def test_a_folder_that_cannot_be_renamed_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = finished(tmp_path / "r").path
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == folder)
+    with pytest.raises(ResourceError, match="mount point"):
+        run(folder, 2, overwrite=True)
+    monkeypatch.undo()
+    monkeypatch.setattr(Path, "mkdir", _refuse)
+    with pytest.raises(ResourceError, match="beside the old one"):
+        run(folder, 2, overwrite=True)
+    assert contents(folder)["out.txt"] == "result 1"
+
+
+def _refuse(*_: object, **__: object) -> None:
+    raise PermissionError("read-only")
+
+
+# crashes --------------------------------------------------------------------------------------------------------------
+
+
+class Crash(BaseException):
+    """The process ends here."""
+
+
+def crashed(folder: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int]) -> None:
+    """Replace result 1 by result 2, and crash before the n-th call of a method of ``Path`` below ``folder``'s parent."""
+    new = run(folder, 2, overwrite=True)
+    store.write_text(new.path / "out.txt", "result 2")
+    store.write_text(new.path / "rows" / "2.txt", "row")
+    method, count = stop
+    real, calls = getattr(Path, method), []
+
+    def once(self: Path, *arguments: Any, **named: Any) -> Any:
+        if self == folder or ".part" in str(self.relative_to(folder.parent)):
+            calls.append(self)
+            if len(calls) == count:
+                raise Crash
+        return real(self, *arguments, **named)
+
+    state = RunDir._take_place
+
+    def take_place(self: RunDir) -> None:
+        monkeypatch.setattr(Path, method, once)
+        state(self)
+
+    monkeypatch.setattr(RunDir, "_take_place", take_place)
+    with pytest.raises(Crash):
+        new.finish()
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize("stop", [("rename", n) for n in (1, 2, 3)] + [("unlink", n) for n in range(1, 6)] + [("rmdir", 1)])
+@pytest.mark.parametrize(("value", "overwrite"), [(2, True), (1, False)])
+def test_a_crash_at_any_point_of_the_exchange_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int], value: int, overwrite: bool
+) -> None:
+    folder = finished(tmp_path / "r").path
+    (folder / "mine.md").write_text("mine")
+    crashed(folder, monkeypatch, stop)
+    assert "mine" in "".join(p.read_text() for p in tmp_path.rglob("mine.md*"))
+    before_exchange = stop == ("rename", 1)
+    if value == 1 and not before_exchange:  # the command for the old settings meets the new result
+        with pytest.raises(UsageError, match="value: 2 there, 1 asked"):
+            run(folder, value, overwrite=overwrite)
+    else:
+        assert run(folder, value, overwrite=overwrite).complete
+    assert (folder / "mine.md").read_text() == "mine"
+    store.verify_manifest(folder)
+    if not (before_exchange and value == 1):
+        assert [p.name for p in tmp_path.iterdir()] == ["r"]
+        assert set(contents(folder)) == {"manifest.json", "mine.md", "out.txt", "rows/2.txt", "run.yaml"}
+
+
+def test_a_reader_between_the_renames_is_told_what_happened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = finished(tmp_path / "r").path
+    crashed(folder, monkeypatch, ("rename", 2))
+    assert not folder.exists()
+    with pytest.raises(InputError, match="repeat the command that wrote it"):
+        store.digest(folder)
+
+
+def test_the_old_result_comes_back_where_the_new_one_does_not_verify(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = finished(tmp_path / "r").path
+    crashed(folder, monkeypatch, ("rename", 2))
+    (store.staging_path(folder) / "out.txt").write_text("damaged")
+    assert run(folder).complete
+    assert contents(folder)["out.txt"] == "result 1"
+
+
+def test_a_folder_made_by_hand_between_the_renames_is_not_mistaken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = finished(tmp_path / "r").path
+    crashed(folder, monkeypatch, ("rename", 2))
+    folder.mkdir()
+    (folder / "mine.md").write_text("mine")
+    with pytest.raises(UsageError, match="in each other's way") as refused:
+        run(folder, 2, overwrite=True)
+    assert str(store.retired_path(folder)) in refused.value.got
+    (folder / "mine.md").unlink()
+    assert run(folder, 2).complete
+
+
+def test_a_failed_second_rename_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = finished(tmp_path / "r").path
+    new = run(folder, 2, overwrite=True)
+    store.write_text(new.path / "out.txt", "result 2")
+    real = Path.rename
+
+    def refuse(self: Path, target: Path) -> Path:
+        if self == new.path:
+            raise OSError("busy")
+        return real(self, target)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(ResourceError, match="it is finished and lies in"):
+        new.finish()
+    monkeypatch.undo()
+    assert run(folder).complete
+    assert run(folder, 2, overwrite=True).complete
+    assert contents(folder)["out.txt"] == "result 2"
+
+
+def test_a_reader_of_a_folder_of_results_does_not_see_staging_folders(tmp_path: Path) -> None:
+    finished(tmp_path / "root" / "a")
+    before = store.digest(tmp_path / "root")
+    run(tmp_path / "root" / "a", 2, overwrite=True).log(step=1)
+    assert store.digest(tmp_path / "root") == before
+    assert run_state(tmp_path / "nothing there") == {}
+    assert Replacement.at(tmp_path / "root" / "a").staging.is_dir()
+
+
+# inputs and outputs apart ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder data/scene with a file in it, links to both and one through another folder, and the current folder."""
+    (tmp_path / "data" / "scene" / "images").mkdir(parents=True)
+    (tmp_path / "data" / "scene" / "weights").write_text("w")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "link").symlink_to("data/scene")
+    (tmp_path / "other" / "up").symlink_to("../data")
+    (tmp_path / "weights_link").symlink_to("data/scene/weights")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+OVERLAPS = [
+    ("data/scene", "data/scene", "is also"), ("data/scene/", "link", "is also"), ("link", "data/scene", "is also"),
+    ("data/../data/scene", "data/scene", "is also"), ("other/up/scene", "data/scene", "is also"),
+    ("data", "data/scene", "holds"), (".", "link", "holds"), ("data/scene/new", "data/scene", "lies in"),
+    ("link/a/b/c", "data/scene", "lies in"), ("other/../link/new", "data/scene", "lies in"),
+    ("other/up/scene/new", "link", "lies in"), ("data/scene", "data/scene/weights", "holds"),
+    ("data/scene/weights", "data/scene/weights", "is also"), ("data/scene", "weights_link", "holds"),
+    ("link/images", "data", "lies in"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("out", "given", "relation"), OVERLAPS)
+def test_overlaps_are_found_through_links_and_dots(places: Path, out: str, given: str, relation: str) -> None:
+    for base in (Path(), places):
+        with pytest.raises(UsageError, match=relation) as refused:
+            refuse_overlap(base / out, {"nothing": None, "none": "", "scene": base / given})
+        assert str(base / out) in str(refused.value)
+        assert str(base / given) in str(refused.value)
+        assert refused.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("out", "given"),
+    [("other", "data/scene"), ("data/scene2", "data/scene"), ("data/new/deep", "link"), ("data/scene/images", "data/scene/weights"),
+     ("data/sc", "data/scene"), ("nowhere", "nothing there")],
+)  # fmt: skip
+def test_neighbours_do_not_overlap(places: Path, out: str, given: str) -> None:
+    refuse_overlap(out, {"scene": given})
+
+
+def test_upper_and_lower_case_are_one_where_the_file_system_says_so(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Path.stat
+
+    def careless(self: Path, **named: Any) -> os.stat_result:
+        return real(Path(str(places) + str(self).removeprefix(str(places)).lower()), **named)
+
+    monkeypatch.setattr(Path, "stat", careless)
+    for out in ("Data/Scene", "DATA/SCENE/new", "Data"):
+        with pytest.raises(UsageError):
+            refuse_overlap(places / out, {"scene": places / "data" / "scene"})
