@@ -62,7 +62,7 @@ class HidingRule:
 
 RULES: Final[Mapping[str, HidingRule]] = {
     "sweep": HidingRule(
-        ratio=0.075, slack_m=0.32, sides="opposite", reach_px=(2, 2), reach_beams=(0.23, 1.4), widen=(0.5, 0.0),
+        ratio=0.075, slack_m=0.32, sides="opposite", reach_px=(2, 2), reach_beams=(0.23, 1.0), widen=(0.5, 0.0),
     ),
     "condition": HidingRule(ratio=0.176, slack_m=0.59, sides="opposite", reach_px=(3, 3)),
     "colour": HidingRule(ratio=0.053, slack_m=0.21, reach_beams=(0.1, 0.6)),
@@ -104,6 +104,11 @@ def hidden_pixels(depth: NDArray[np.float32], rule: HidingRule, reach: tuple[int
     hidden = np.zeros(depth.shape, bool)
     hidden[known] = rule.hides(nearer[known], depth[known])
     return hidden
+
+
+def seen_pixels(depth: NDArray[np.float32], valid: NDArray[np.bool_], rule: HidingRule) -> NDArray[np.bool_]:
+    """Valid pixels of a depth map f32[H, W] that others of it do not hide by a rule whose reach is in pixels, bool[H, W]."""
+    return valid & ~hidden_pixels(np.where(valid, depth, np.float32(np.inf)), rule, rule.reach_px)
 
 
 def nearer_depth(nearest: NDArray[np.float32], rule: HidingRule, reach: tuple[int, int]) -> NDArray[np.float32]:
