@@ -39,7 +39,8 @@ class HidingRule:
         reach_px: (horizontal, vertical) distance within which nearer points are looked for; those of an image when the angle between
             beams is not given, and at least this far when it is.
         reach_beams: (horizontal degrees, vertical share of the angle between beams): reach that follows from the scanner; 0 = none.
-        widen: "opposite": how far across its direction a side is looked at, as a share of the other direction's reach.
+        widen: "opposite": how far across its direction a side is looked at, as a share of the other direction's reach, at least a
+            pixel; 0 = not at all.
     """
 
     ratio: float
@@ -62,7 +63,12 @@ class HidingRule:
 
 RULES: Final[Mapping[str, HidingRule]] = {
     "sweep": HidingRule(
-        ratio=0.075, slack_m=0.32, sides="opposite", reach_px=(2, 2), reach_beams=(0.23, 1.0), widen=(0.5, 0.0),
+        ratio=0.075,
+        slack_m=0.32,
+        sides="opposite",
+        reach_px=(2, 2),
+        reach_beams=(0.23, 1.0),
+        widen=(0.5, 0.15),
     ),
     "condition": HidingRule(ratio=0.176, slack_m=0.59, sides="opposite", reach_px=(3, 3)),
     "colour": HidingRule(ratio=0.053, slack_m=0.21, reach_beams=(0.1, 0.6)),
@@ -120,9 +126,10 @@ def nearer_depth(nearest: NDArray[np.float32], rule: HidingRule, reach: tuple[in
                 found = _minimum(found, 2 * cells + 1, axis, 0)
         return found
     found = np.full(nearest.shape, np.inf, np.float32)
-    for axis, cells, across in ((0, reach[1], int(rule.widen[0] * reach[0])), (1, reach[0], int(rule.widen[1] * reach[1]))):
+    for axis, cells, share, other in ((0, reach[1], rule.widen[0], reach[0]), (1, reach[0], rule.widen[1], reach[1])):
         if cells == 0:
             continue
+        across = max(1, int(share * other)) if share else 0
         wide = _minimum(nearest, 2 * across + 1, 1 - axis, 0) if across else nearest
         before, after = (_minimum(wide, cells + 1, axis, shift) for shift in (cells // 2, -((cells + 1) // 2)))
         found = np.minimum(found, np.maximum(before, after))
