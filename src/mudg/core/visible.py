@@ -39,6 +39,7 @@ class HidingRule:
         reach_px: (horizontal, vertical) distance within which nearer points are looked for; those of an image when the angle between
             beams is not given, and at least this far when it is.
         reach_beams: (horizontal degrees, vertical share of the angle between beams): reach that follows from the scanner; 0 = none.
+        inside: the reach that follows from the scanner ends a pixel short of the next beam.
         widen: "opposite": how far across its direction a side is looked at, as a share of the other direction's reach, at least a
             pixel; 0 = not at all.
     """
@@ -48,13 +49,14 @@ class HidingRule:
     sides: Literal["any", "opposite"] = "any"
     reach_px: tuple[int, int] = (0, 0)
     reach_beams: tuple[float, float] = (0.0, 0.0)
+    inside: bool = False
     widen: tuple[float, float] = (0.0, 0.0)
 
     def reach(self, camera: Camera, gap_deg: float) -> tuple[int, int]:
         """Horizontal and vertical reach in pixels, for an angle ``gap_deg`` between beams (0 = unknown)."""
         across = round(float(np.deg2rad(self.reach_beams[0])) * camera.fx)
         along = round(float(np.deg2rad(self.reach_beams[1] * gap_deg)) * camera.fy)
-        return max(self.reach_px[0], across), max(self.reach_px[1], along)
+        return max(self.reach_px[0], across - self.inside), max(self.reach_px[1], along - self.inside)
 
     def hides(self, nearer: NDArray[np.floating], depth: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Whether depths ``nearer`` hide depths ``depth`` (metres, any one shape)."""
@@ -66,8 +68,9 @@ RULES: Final[Mapping[str, HidingRule]] = {
         ratio=0.075,
         slack_m=0.32,
         sides="opposite",
-        reach_px=(2, 2),
+        reach_px=(1, 1),
         reach_beams=(0.23, 1.0),
+        inside=True,
         widen=(0.5, 0.15),
     ),
     "condition": HidingRule(ratio=0.176, slack_m=0.59, sides="opposite", reach_px=(3, 3)),
