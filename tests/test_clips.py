@@ -8,6 +8,7 @@ import torch
 
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, Track, View
+from mudg.core import visible
 from mudg.data.clips import condition as clips
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
@@ -80,7 +81,7 @@ def test_shine_through_is_removed_and_edges_stay():
     valid = np.ones((20, 20), bool)
     depth[10, 10] = 30.0  # a far point seen through a near wall
     depth[:, :6] = 30.0  # an ordinary edge: far on one side only
-    kept = clips.remove_shine_through(depth, valid)
+    kept = visible.seen_pixels(depth, valid, visible.RULES["condition"])
     assert not kept[10, 10]
     assert int((~kept).sum()) == 1
 

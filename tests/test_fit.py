@@ -386,8 +386,8 @@ def test_lidar_pixels_agree_with_exact_depth(world):
 def test_a_point_behind_a_nearer_one_is_no_depth_of_this_camera():
     view = View(camera(width=SIZE[0], height=SIZE[1]), geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
     points = np.array([[5.0, 0.0, 0.0], [20.0, 0.02, 0.0], [20.0, -6.0, 0.0]], np.float32)
-    assert sorted(fit_views.visible_lidar(view, points).depth_m.tolist()) == [5.0, 20.0]
-    assert len(fit_views.visible_lidar(view, points[:0]).pixel) == 0
+    assert sorted(fit_views.lidar_pixels(view, points, 0.6).depth_m.tolist()) == [5.0, 20.0]
+    assert len(fit_views.lidar_pixels(view, points[:0], 0.6).pixel) == 0
 
 
 def test_what_only_virtual_views_see():

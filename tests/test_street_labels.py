@@ -17,7 +17,9 @@ from toy_scene import ToyStreet
 from mudg.base import checkpoint, geometry
 from mudg.base.errors import InputError, IntegrityError, ResourceError
 from mudg.base.palette import CLASSES, ID
-from mudg.core.complete import ray_elevation, visible_depth
+from mudg.core.complete import ray_elevation
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.labels import street_net
 from mudg.models.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
 from mudg.models.labels.inputs import TRAIN_ID_OF
@@ -53,7 +55,7 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     assert np.median(found.upwards[wall]) < 0.1
     assert np.median(found.height_m[wall]) > 0.5
     assert (found.elevation_rad == ray_elevation(given.view)).all()
-    measured = np.isfinite(visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg))
+    measured = np.isfinite(visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg))
     assert ((found.away_deg == 0) == measured).all()
     car = truth == ID["car"]
     inside = (found.box == 1) & found.in_box

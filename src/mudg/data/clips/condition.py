@@ -3,7 +3,7 @@
 `build_condition` turns a fused cloud and recorded images into what the model is given for a path of views:
 
 1. the cloud is projected into every view (z-buffer);
-2. far points that shine through gaps between near ones are removed (`remove_shine_through`);
+2. far points that shine through gaps between near ones are removed (`core.visible`, rule `condition`);
 3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
    falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
@@ -33,6 +33,8 @@ from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import seen_pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,31 +112,6 @@ def fill_beyond(measured: ProjectedPoints, other: ProjectedPoints, reach_px: int
         pick(measured.rgb, other.rgb), pick(measured.depth, other.depth), measured.valid | taken, pick(measured.moving, other.moving),
         pick(measured.semantics, other.semantics),
     )  # fmt: skip
-
-
-def remove_shine_through(depth: NDArray[np.float32], valid: NDArray[np.bool_], reach_px: int = 3) -> NDArray[np.bool_]:
-    """Valid pixels that are not seen through a gap in a nearer surface, bool[H,W].
-
-    A pixel is dropped when clearly nearer (by 15 % and 0.5 m) measured pixels lie within `reach_px` on two opposite
-    sides of it, left and right or above and below. One-sided neighbours are an ordinary edge and stay.
-    """
-    nearest = np.where(valid, depth, np.inf).astype(np.float32)
-    sides = []
-    for axis in (0, 1):
-        for direction in (1, -1):
-            lowest = np.full_like(nearest, np.inf)
-            for step in range(1, reach_px + 1):
-                moved = np.full_like(nearest, np.inf)
-                source = [slice(None), slice(None)]
-                target = [slice(None), slice(None)]
-                source[axis] = slice(None, -step) if direction > 0 else slice(step, None)
-                target[axis] = slice(step, None) if direction > 0 else slice(None, -step)
-                moved[tuple(target)] = nearest[tuple(source)]
-                lowest = np.minimum(lowest, moved)
-            sides.append(lowest)
-    limit = 0.85 * depth - 0.5
-    through = (np.maximum(sides[0], sides[1]) < limit) | (np.maximum(sides[2], sides[3]) < limit)
-    return valid & ~through
 
 
 def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -398,7 +375,7 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
     seen = project_cloud(cloud, placed, view, config)
     valid = seen.valid[0]
     if not rules.published:
-        valid = torch.from_numpy(remove_shine_through(seen.depth[0].numpy(), valid.numpy()))
+        valid = torch.from_numpy(seen_pixels(seen.depth[0].numpy(), valid.numpy(), HIDING_RULES["condition"]))
     clouds = [cloud.static, *(points for _, points in drawn_objects(cloud, placed))]
     unknown = np.uint8(palette.UNLABELLED)
     ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]

@@ -32,12 +32,13 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointCloud, Scene, Sweep, View
 from mudg.core.pictures import resize_area
 from mudg.core.project import project_points
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import seen_pixels
 from mudg.data.clips.condition import (
     ConditionRules,
     WarpSource,
     build_condition,
     nearest_valid,
-    remove_shine_through,
 )
 from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
@@ -280,7 +281,7 @@ def _measured(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np
     places = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in nearest.values()]
     seen = project_points(np.concatenate(places).astype(np.float32), None, view, near_m=1.0, far_m=100.0)
     depth = seen.depth[0].numpy()
-    return depth, remove_shine_through(depth, seen.valid[0].numpy())
+    return depth, seen_pixels(depth, seen.valid[0].numpy(), HIDING_RULES["condition"])
 
 
 # files ----------------------------------------------------------------------------------------------------------------

@@ -24,8 +24,10 @@ from scipy import ndimage
 from mudg.base import geometry
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Track, View
-from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation, visible_depth
+from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation
 from mudg.core.fusion import points_in_box
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.labels.ground import above_plane, beside_path, map_ground
 from mudg.models.labels.inputs import (
     FLOOR_M,
@@ -120,7 +122,7 @@ def _with_surface(
 
 def _measure(given: LabelInput) -> _Measured:
     gap_px = max(1.5, float(np.deg2rad(given.beam_gap_deg)) * given.view.camera.fy)
-    depth = visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg)
+    depth = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
     known = np.isfinite(depth)
     away = ndimage.distance_transform_edt(~known) if known.any() else np.full(depth.shape, np.inf)
     return _Measured(depth, np.asarray(away, np.float32), gap_px)

@@ -20,8 +20,10 @@ from scipy import ndimage
 from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import View
-from mudg.core.complete import beyond_reach, complete_depth, ray_elevation, visible_depth
+from mudg.core.complete import beyond_reach, complete_depth, ray_elevation
 from mudg.core.fusion import points_in_box
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.labels.ground import GroundMap, above_plane, beside_path, map_ground
 from mudg.models.labels.inputs import FLOOR_M, GROWTH_M, TRAIN_ID_OF, LabelInput, box_outline, far_to_near
 
@@ -87,7 +89,7 @@ class Evidence:
 def gather(given: LabelInput) -> Evidence:
     """Facts at every pixel of ``given.view``; works, with less, without returns, path or boxes."""
     view, gap_deg = given.view, given.beam_gap_deg
-    measured = visible_depth(view, given.xyz_world, gap_deg=gap_deg)
+    measured = visible_depth(view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg)
     known = np.isfinite(measured)
     shape = measured.shape
     elevation = ray_elevation(view)

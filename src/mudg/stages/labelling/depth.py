@@ -16,7 +16,8 @@ import numpy as np
 
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
-from mudg.core.complete import visible_depth
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions
 from mudg.models.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.models.folders import Place, find, title
@@ -77,7 +78,7 @@ def load(config: AnnotateConfig) -> DepthNetwork | None:
 
 def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame_id: str, aside: Path) -> Labels:
     """Labels with the network's depth, aligned to the frame's LiDAR, or as they are if it cannot be."""
-    measured = visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg)
+    measured = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
     asked = DepthInput(given.rgb, measured, labels.depth, labels.sky)
     reason = "too few LiDAR returns"
     if enough_returns(asked):

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.types import Frame, Scene, Sweep
-from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, measure_beam_gap, separate
+from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, largest_beam_gap, separate
 from mudg.data.scene import read_points
 
 MAX_GAP_S = 2.0
 """Sweeps farther in time than this from an image do not help: what moves without a track has gone elsewhere."""
-_GAP_SPREAD = 1.4
-"""Beams lie unevenly: the largest gap beside the median one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +78,7 @@ class NearbyReturns:
             owner, owned = separate(shots, self._movers, self._rules)
             world = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
             self._kept[sweep.id] = _Separated(
-                world[owner == STATIC], owned, _GAP_SPREAD * measure_beam_gap(points.xyz), _highest(sweep, world)
+                world[owner == STATIC], owned, largest_beam_gap(points.xyz), _highest(sweep, world)
             )
         return self._kept[sweep.id]
 
