@@ -99,10 +99,6 @@ def latest(folder: Path) -> Checkpoint | None:
             problems.append(str(error))
             log.warn(f"checkpoint {path} does not verify and is skipped:\n{error}")
     if problems:
-        raise IntegrityError(
-            "no checkpoint verifies",
-            where=str(folder),
-            got=f"{len(problems)} damaged",
-            remedy="restore the folder from a copy, or delete it to start again",
-        )
+        raise IntegrityError("no checkpoint verifies", where=str(folder), got=f"{len(problems)} damaged",
+            remedy="restore the folder from a copy, or delete it to start again")  # fmt: skip
     return None

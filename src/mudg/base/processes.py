@@ -183,10 +183,8 @@ def run_in_processes(
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
-            raise ResourceError(
-                "a process ended without a word, most likely for want of memory", got=str(error),
-                remedy="take fewer processes, or a machine with more memory; repeat the command to resume",
-            ) from error  # fmt: skip
+            raise ResourceError("a process ended without a word, most likely for want of memory", got=str(error),
+                remedy="take fewer processes, or a machine with more memory; repeat the command to resume") from error  # fmt: skip
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -224,11 +222,10 @@ def run_limited(
         try:
             return pool.submit(_limited, work, limit_bytes, where, out_of_memory).result()
         except BrokenProcessPool as error:
-            raise ResourceError(
-                "the converting process was ended from outside, most likely for want of memory", where=str(where),
+            raise ResourceError("the converting process was ended from outside, most likely for want of memory",
+                where=str(where),
                 expected=f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most",
-                remedy="close other programs, or convert on a machine with more memory",
-            ) from error  # fmt: skip
+                remedy="close other programs, or convert on a machine with more memory") from error  # fmt: skip
 
 
 def _limited(
@@ -247,10 +244,9 @@ def _limited(
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and not out_of_memory(error):
             raise
-        raise ResourceError(
-            "conversion needs more memory than it may take", where=str(where), expected=f"<= {limit_bytes / 1e9:.1f} GB",
-            got=(str(error).splitlines() or [""])[0][:200], remedy="raise --memory-gb, unless the file should be small",
-        ) from error  # fmt: skip
+        raise ResourceError("conversion needs more memory than it may take", where=str(where),
+            expected=f"<= {limit_bytes / 1e9:.1f} GB", got=(str(error).splitlines() or [""])[0][:200],
+            remedy="raise --memory-gb, unless the file should be small") from error  # fmt: skip
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
@@ -372,10 +368,9 @@ def _raise(child: _Child) -> None:
     code = child.process.exitcode
     if code == 1:
         raise RuntimeError(f"{child.task.name} failed; what went wrong is written above")
-    raise ResourceError(
-        f"the process of {child.task.name} ended without a word", got=f"exit code {code}" + (", killed" if code == -9 else ""),
-        remedy="repeat the command to continue; MUDG_THREADS=1 does one thing at a time and takes less memory",
-    )  # fmt: skip
+    raise ResourceError(f"the process of {child.task.name} ended without a word",
+        got=f"exit code {code}" + (", killed" if code == -9 else ""),
+        remedy="repeat the command to continue; MUDG_THREADS=1 does one thing at a time and takes less memory")  # fmt: skip
 
 
 # ---- in the child --------------------------------------------------------------------------------------------------

@@ -47,9 +47,8 @@ def _make_parent(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ResourceError(
-            "cannot create a folder", where=str(path.parent), got=str(error), remedy="choose another --out"
-        ) from error
+        raise ResourceError("cannot create a folder", where=str(path.parent), got=str(error),
+            remedy="choose another --out") from error  # fmt: skip
 
 
 _umask_lock = threading.Lock()
@@ -77,9 +76,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     try:
         fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
     except OSError as error:
-        raise ResourceError(
-            "cannot write here", where=str(path), got=str(error), remedy="choose another --out"
-        ) from error
+        raise ResourceError("cannot write here", where=str(path), got=str(error),
+            remedy="choose another --out") from error  # fmt: skip
     os.close(fd)
     temporary = Path(name)
     try:
@@ -90,9 +88,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.replace(path)
         fsync_directory(path.parent)
     except OSError as error:
-        raise ResourceError(
-            "writing failed", where=str(path), got=str(error), remedy="free disk space or choose another --out"
-        ) from error
+        raise ResourceError("writing failed", where=str(path), got=str(error),
+            remedy="free disk space or choose another --out") from error  # fmt: skip
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -112,9 +109,8 @@ def write_in_tree(path: Path, content: bytes) -> None:
     try:
         Path(path).write_bytes(content)
     except OSError as error:
-        raise ResourceError(
-            "writing failed", where=str(path), got=str(error), remedy="free disk space or choose another --out"
-        ) from error
+        raise ResourceError("writing failed", where=str(path), got=str(error),
+            remedy="free disk space or choose another --out") from error  # fmt: skip
 
 
 def sync_tree(folder: Path) -> None:
@@ -133,9 +129,8 @@ def sync_tree(folder: Path) -> None:
                 with path.open("rb+") as handle:
                     os.fsync(handle.fileno())
     except OSError as error:
-        raise ResourceError(
-            "writing failed", where=str(folder), got=str(error), remedy="free disk space or choose another --out"
-        ) from error
+        raise ResourceError("writing failed", where=str(folder), got=str(error),
+            remedy="free disk space or choose another --out") from error  # fmt: skip
     fsync_directory(folder)
 
 
@@ -186,9 +181,8 @@ def _no_constants(name: str) -> Any:
 def parse_json(text: str | bytes, where: str) -> Any:
     """Parse strict JSON (no NaN, no duplicate keys, bounded size and nesting); InputError names ``where``."""
     if len(text) > _MAX_JSON_BYTES:
-        raise InputError(
-            "JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes", got=f"{len(text)}"
-        )
+        raise InputError("JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes",
+            got=f"{len(text)}")  # fmt: skip
     try:
         return json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constants)
     except (ValueError, RecursionError) as error:
@@ -268,9 +262,8 @@ def atomic_directory(path: Path) -> Iterator[Path]:
     try:
         partial.mkdir(parents=True)
     except OSError as error:
-        raise ResourceError(
-            "cannot create a folder", where=str(partial), got=str(error), remedy="choose another --out"
-        ) from error
+        raise ResourceError("cannot create a folder", where=str(partial), got=str(error),
+            remedy="choose another --out") from error  # fmt: skip
     try:
         yield partial
     except BaseException:
@@ -335,9 +328,8 @@ def verify_manifest(folder: Path) -> str:
         if not file.is_file():
             raise IntegrityError("a file is missing", where=str(file))
         if file.stat().st_size != size or sha256_file(file) != expected:
-            raise IntegrityError(
-                "a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}..."
-            )
+            raise IntegrityError("a file was altered after it was written", where=str(file),
+                expected=f"sha256 {expected[:16]}...")  # fmt: skip
     return sha256_file(path)
 
 

@@ -148,8 +148,8 @@ def _refuse_foreign(out: Path) -> None:
         except (InputError, KeyError, TypeError):
             foreign = [name for name in names if name in _PAGES]
     if foreign:
-        raise UsageError("the output folder holds files of something else", where=str(out), got=", ".join(sorted(foreign)[:8]),
-                         remedy="choose an empty --out")  # fmt: skip
+        raise UsageError("the output folder holds files of something else", where=str(out),
+            got=", ".join(sorted(foreign)[:8]), remedy="choose an empty --out")  # fmt: skip
 
 
 # ---- what is compared ----
@@ -164,9 +164,8 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     known = (FILL, "gs3d", WITHOUT, DIFFUSION, WITH)
     wanted = set(config.methods) | ({WITHOUT, WITH} if config.ablation else set())
     if not wanted or wanted - set(known):
-        raise UsageError(
-            "unknown method", where="--methods", expected=", ".join(known), got=", ".join(sorted(wanted - set(known)))
-        )
+        raise UsageError("unknown method", where="--methods", expected=", ".join(known),
+            got=", ".join(sorted(wanted - set(known))))  # fmt: skip
     plain = FitConfig(method=WITH, iterations=config.iterations, seed=config.seed)
     rows = [
         Row(name, title_of(name), None if name in GENERATED else _with_method(plain, name))

@@ -37,7 +37,7 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     """
     if prediction.shape != target.shape or prediction.ndim != 3:
         raise InputError("photometric: images must be [C, H, W] of one shape", expected=str(tuple(prediction.shape)),
-                         got=str(tuple(target.shape)))  # fmt: skip
+            got=str(tuple(target.shape)))  # fmt: skip
     if not 0 <= ssim_weight <= 1:
         raise UsageError("the weight of SSIM must lie in [0, 1]", got=str(ssim_weight))
     if weight is not None and weight.shape != prediction.shape[1:]:
@@ -67,10 +67,10 @@ def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lif
     size = logits.shape[1:]
     if logits.ndim != 3 or not len(logits) or target.shape != size or weight.shape != size:
         raise InputError("class loss: logits must be [C, H, W], target and weight [H, W]", expected=str(tuple(size)),
-                         got=str([tuple(t.shape) for t in (logits, target, weight)]))  # fmt: skip
+            got=str([tuple(t.shape) for t in (logits, target, weight)]))  # fmt: skip
     if lift is not None and (lift[1].shape != size or not 0 <= lift[0] < len(logits)):
-        raise InputError("class loss: the lift must be of one channel and [H, W]", expected=f"0..{len(logits) - 1}, {tuple(size)}",
-                         got=f"{lift[0]}, {tuple(lift[1].shape)}")  # fmt: skip
+        raise InputError("class loss: the lift must be of one channel and [H, W]",
+            expected=f"0..{len(logits) - 1}, {tuple(size)}", got=f"{lift[0]}, {tuple(lift[1].shape)}")  # fmt: skip
     library = _library_for((logits, weight))
     if library is None or logits.numel() == 0 or target.dtype != torch.int64:
         return losses.class_loss(logits, target, weight, total, lift)
@@ -91,7 +91,7 @@ def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
     """
     if rgb.ndim != 3 or coarse.ndim != 3 or len(rgb) != len(coarse) or alpha.shape != (1, *rgb.shape[1:]):
         raise InputError("over: pictures must be [C, H, W] and [C, h, w], alpha [1, H, W]",
-                         got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]))  # fmt: skip
+            got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]))  # fmt: skip
     library = _library_for((rgb, alpha, coarse))
     if library is None or rgb.numel() == 0 or coarse.numel() == 0:
         return torch_over(rgb, alpha, coarse)
@@ -198,10 +198,10 @@ def _check_column(column: AdamColumn, first: Tensor, visible: Tensor | None) -> 
     tensors = (parameter, column.gradient, column.moment1, column.moment2)
     if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0 or parameter.shape[0] != first.shape[0]:
         raise InputError("adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
-                         got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
+            got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
     if visible is not None and (visible.shape != parameter.shape[:1] or visible.dtype != torch.bool):
         raise InputError("adam: visible must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
-                         got=f"{visible.dtype}{list(visible.shape)}")  # fmt: skip
+            got=f"{visible.dtype}{list(visible.shape)}")  # fmt: skip
 
 
 class _Photometric(torch.autograd.Function):

@@ -75,11 +75,8 @@ class Table:
     def append(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor]) -> None:
         """Add rows with zero moments. Every column and label of the table must be given."""
         if set(columns) != set(self.columns) or set(labels) != set(self.labels):
-            raise InputError(
-                "appended rows must fill every column",
-                expected=str(sorted(set(self.columns) | set(self.labels))),
-                got=str(sorted(set(columns) | set(labels))),
-            )
+            raise InputError("appended rows must fill every column",
+                expected=str(sorted(set(self.columns) | set(self.labels))), got=str(sorted(set(columns) | set(labels))))  # fmt: skip
         fresh = {name: value.detach() for name, value in columns.items()}
         self.columns = {name: _leaf(torch.cat([value.detach(), fresh[name]])) for name, value in self.columns.items()}
         for moments in (self.moment1, self.moment2):
@@ -140,8 +137,8 @@ class Table:
         for key, value in flat.items():
             group, _, name = key.partition(".")
             if group == "partial":
-                raise InputError("this scene's objects change colour over time, which is not supported any more", where=key,
-                                 remedy="fit it again, or render it with the version that fitted it")  # fmt: skip
+                raise InputError("this scene's objects change colour over time, which is not supported any more",
+                    where=key, remedy="fit it again, or render it with the version that fitted it")  # fmt: skip
             if group not in groups or not name:
                 raise InputError("not a tensor of a parameter table", where=key)
             groups[group][name] = value

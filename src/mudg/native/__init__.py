@@ -119,7 +119,7 @@ def _load() -> tuple[ctypes.CDLL | None, str]:
     wanted = os.environ.get("MUDG_ISA", "").strip()
     if wanted and found.mudg_set_isa(wanted.encode()) != 0:
         raise UsageError("MUDG_ISA names an instruction set that cannot run here", got=wanted,
-                         expected="avx512, avx2, portable")  # fmt: skip
+            expected="avx512, avx2, portable")  # fmt: skip
     return found, ""
 
 

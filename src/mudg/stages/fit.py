@@ -370,10 +370,9 @@ def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
     """NumericsError naming term, view and step if a loss term is not finite; nothing has been changed by then."""
     for name, value in terms.items():
         if not math.isfinite(value.item()):
-            raise NumericsError(
-                f"the loss term {name!r} is not finite", where=f"view {view}, step {step}", got=str(value.item()),
-                remedy="check this view's image and labels; the parameters are those of the step before",
-            )  # fmt: skip
+            raise NumericsError(f"the loss term {name!r} is not finite", where=f"view {view}, step {step}",
+                got=str(value.item()),
+                remedy="check this view's image and labels; the parameters are those of the step before")  # fmt: skip
 
 
 def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
@@ -383,11 +382,9 @@ def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
             # A sum is the cheapest pass over memory there is; it may overflow, so what it finds is counted.
             if not math.isfinite(gradient.sum().item()) and (count := int((~torch.isfinite(gradient)).sum())):
                 table.clear_gradients()
-                raise NumericsError(
-                    "a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
+                raise NumericsError("a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
                     got=f"{count} values",
-                    remedy="the parameters are those of the step before; report the scene, or leave this view out",
-                )  # fmt: skip
+                    remedy="the parameters are those of the step before; report the scene, or leave this view out")  # fmt: skip
 
 
 # ---- schedules -----------------------------------------------------------------------------------------------------

@@ -169,13 +169,11 @@ _SCENE = "scene"
 def _kind(config: IngestConfig, source: Path) -> str:
     """Which format ``source`` has, or ``scene``."""
     if config.format not in ("auto", *IMPORTERS):
-        raise UsageError(
-            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format
-        )
+        raise UsageError("there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)),
+            got=config.format)  # fmt: skip
     if not source.exists():
-        raise InputError(
-            "driving log does not exist", where=str(source), expected=f"a folder, a scene zip, or the word {CITY}"
-        )
+        raise InputError("driving log does not exist", where=str(source),
+            expected=f"a folder, a scene zip, or the word {CITY}")  # fmt: skip
     if config.format != "auto":
         return config.format
     if is_scene(source):
@@ -187,13 +185,9 @@ def _kind(config: IngestConfig, source: Path) -> str:
     inside = "a file"
     if source.is_dir():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-    raise InputError(
-        "the log's format was not recognised",
-        where=str(source),
-        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
-        got=inside,
-        remedy="give the folder of one drive or sequence, or name the format with --format",
-    )
+    raise InputError("the log's format was not recognised", where=str(source),
+        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}", got=inside,
+        remedy="give the folder of one drive or sequence, or name the format with --format")  # fmt: skip
 
 
 def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:

@@ -240,11 +240,9 @@ class _Ledger:
             elif overwrite:
                 before = {}
             else:
-                raise UsageError(
-                    "the output folder holds a run of other settings", where=str(out),
+                raise UsageError("the output folder holds a run of other settings", where=str(out),
                     got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
-                    remedy="choose another --out, or add --overwrite to replace it",
-                )  # fmt: skip
+                    remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
         elif out.exists():
             own = {"scene"} if _is_own_scene(source, out) else set()
             if not out.is_dir() or any(entry.name not in own and not is_temporary(entry.name) for entry in out.iterdir()):

@@ -188,10 +188,8 @@ def _trajectories(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]
     }
     names = sorted({name for found in sets.values() for name in found}, key=_order)
     if not names:
-        raise InputError(
-            "none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
-            expected="output of mudg render or mudg synthesize",
-        )  # fmt: skip
+        raise InputError("none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
+            expected="output of mudg render or mudg synthesize")  # fmt: skip
     return [_matched(config, scene, name, {m: found[name] for m, found in sets.items() if name in found}) for name in names]
 
 
@@ -213,7 +211,7 @@ def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Ob
             distance_m = apart_m(sets[method].views[index], view)
             if distance_m > SAME_PLACE_M:
                 raise InputError("two methods rendered one trajectory from different places",
-                                 where=f"{name}: {method}, view {index}", got=f"{distance_m:.3f} m apart")  # fmt: skip
+                    where=f"{name}: {method}, view {index}", got=f"{distance_m:.3f} m apart")  # fmt: skip
             indices[method].append(index)
         camera = scene.cameras.get(view.camera.name, view.camera)
         width = config.width_px or camera.width

@@ -36,8 +36,7 @@ def starting(config: LearnConfig) -> PublishedMDM:
             "a published-type model is trained on clips of exactly the length that its image tokens are made for",
             where="--data.window, --optimizer.full-window-share", expected=f"{frames} frames in all steps",
             got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
-            remedy=f"--data.window {frames} --optimizer.full-window-share 1",
-        )  # fmt: skip
+            remedy=f"--data.window {frames} --optimizer.full-window-share 1")  # fmt: skip
     model.check_size(config.data.height, config.data.width)
     with torch.no_grad():  # out of the mapped files: training writes in place
         for value in (*model.parameters(), *model.buffers()):
