@@ -2,6 +2,7 @@
 
     run_side_by_side    named tasks at the same time, each with its own progress, stopped and resumed like a verb
     run_in_processes    one function over many arguments, several processes at a time
+    computed_ahead      one function over numbers in order, several threads at a time
     run_limited         one call on a foreign file, under a limit of address space
     Interruption        Ctrl-C and SIGTERM wait for the end of a step
     one_torch_thread    results that do not depend on how many cores are free
@@ -24,6 +25,7 @@ import sys
 import threading
 import time
 import types
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -165,7 +167,7 @@ def error_from_record(record: Mapping[str, Any]) -> MudgError:
 def run_in_processes(
     function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[tuple[int, Result]]:
-    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each.
+    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each; ``processes`` = 1 is this one.
 
     Yields:
         Index of the arguments and the result, as they come.
@@ -173,6 +175,11 @@ def run_in_processes(
     Raises:
         ResourceError: a process ended from outside. Whatever the function raises; calls that have not begun are dropped.
     """
+    if processes == 1:
+        with one_torch_thread():
+            for index, items in enumerate(arguments):
+                yield index, function(*items)
+        return
     context = multiprocessing.get_context("spawn")
     with (
         child_environment(1),
@@ -195,6 +202,18 @@ def _prepare_child() -> None:
 
     log.set_quiet(True)
     torch.set_num_threads(1)
+
+
+def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Iterator[Result]:
+    """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads, each with one torch thread."""
+    with one_torch_thread(), concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        waiting: deque[concurrent.futures.Future[Result]] = deque()
+        for number in range(count):
+            waiting.append(pool.submit(compute, number))
+            if len(waiting) > 2 * threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 # ---- one call under a limit of memory --------------------------------------------------------------------------------

@@ -350,10 +350,6 @@ class RunDir:
         Replacement.at(self.out).swap(functools.partial(own_names, self._output))
         self.path = self.out
 
-    def summary(self) -> dict[str, Any]:
-        """The summary that ``finish`` recorded."""
-        return store.read_json(self.path / _STATE).get("summary", {})
-
     def reused(self) -> Path:
         """Say that an earlier result is used again, and return its path."""
         log.info(f"{self.verb}: reused {self.path} (verified)")

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError, IntegrityError, ResourceError
 
 if TYPE_CHECKING:
+    from PIL import Image
     from torch import Tensor
 
 MANIFEST = "manifest.json"
@@ -98,6 +99,14 @@ def atomic_write(path: Path, content: bytes) -> None:
     """Write ``content`` to ``path`` completely or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options: Any) -> None:
+    """Write a picture, u8[H, W, 3] or Pillow's, completely or not at all; the suffix names the format, ``options`` are Pillow's."""
+    from PIL import Image
+
+    with atomic_path(path) as temporary:
+        (Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture).save(temporary, **options)
 
 
 def write_in_tree(path: Path, content: bytes) -> None:

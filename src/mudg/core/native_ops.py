@@ -126,32 +126,16 @@ def torch_box_mean(values: Tensor, size: int) -> Tensor:
     return functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False).reshape(values.shape)
 
 
-def adam(
-    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int,
-    visible: Tensor | None = None,
-) -> None:  # fmt: skip
-    """One Adam step in place: betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
+def adam_columns(columns: Sequence[AdamColumn], step: int) -> None:
+    """One Adam step in place on several columns with the same rows (the kernel of ``Table.adam_step``).
 
-    Args:
-        parameter, gradient, moment1, moment2: one shape ``[N, ...]``; contiguous for the native path.
-        visible: bool[N]: only these rows move, parameters and moments; None = all.
-
-    Raises:
-        InputError: shapes differ, or ``visible`` is not bool[N].
-        UsageError: ``step`` below 1.
-    """
-    adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, visible)
-
-
-def adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | None = None) -> None:
-    """``adam`` on several columns with the same rows in one pass (the kernel of ``Table.adam_step``).
+    Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
 
     Args:
         columns: any number, N rows each; contiguous for the native path.
-        visible: bool[N]: only these rows move, parameters and moments; None = all.
 
     Raises:
-        InputError: shapes differ, or ``visible`` is not bool[N].
+        InputError: shapes differ.
         UsageError: ``step`` below 1.
     """
     if step < 1:
@@ -159,13 +143,13 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | Non
     if not columns:
         return
     for one in columns:
-        _check_column(one, columns[0].parameter, visible)
+        _check_column(one, columns[0].parameter)
     tensors = tuple(t for one in columns for t in (one.parameter, one.gradient, one.moment1, one.moment2))
     in_place = tuple(t for one in columns for t in (one.parameter, one.moment1, one.moment2))
     library = _library_for(tensors)
     if library is None or not all(t.is_contiguous() for t in in_place):
         with torch.no_grad():
-            torch_adam_columns(columns, step, visible)
+            torch_adam_columns(columns, step)
         return
     rows = columns[0].parameter.shape[0]
     gradients = [one.gradient.detach().contiguous() for one in columns]
@@ -174,10 +158,9 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | Non
                 one.parameter.numel() // rows if rows else 0, one.rate)
         for one, gradient in zip(columns, gradients, strict=True)
     ))  # fmt: skip
-    mask = None if visible is None else visible.contiguous()
     real, integer = ctypes.c_double, ctypes.c_int64
     library.mudg_adam(
-        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None if mask is None else mask.data_ptr()),
+        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None),
         real(BETA1), real(BETA2), real(EPSILON), integer(step),
     )  # fmt: skip
     # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
@@ -193,15 +176,12 @@ class _Column(ctypes.Structure):
     ]  # fmt: skip
 
 
-def _check_column(column: AdamColumn, first: Tensor, visible: Tensor | None) -> None:
+def _check_column(column: AdamColumn, first: Tensor) -> None:
     parameter = column.parameter
     tensors = (parameter, column.gradient, column.moment1, column.moment2)
     if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0 or parameter.shape[0] != first.shape[0]:
         raise InputError("adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
             got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
-    if visible is not None and (visible.shape != parameter.shape[:1] or visible.dtype != torch.bool):
-        raise InputError("adam: visible must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
-            got=f"{visible.dtype}{list(visible.shape)}")  # fmt: skip
 
 
 class _Photometric(torch.autograd.Function):

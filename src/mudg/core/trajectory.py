@@ -7,7 +7,7 @@ of ``world_from_ego(time)`` with its vertical part removed, normalised. That is 
 driving forwards. It is not the x axis of the camera (a side camera's x axis points along the road) and not a finite
 difference of positions (which has no direction while the car stands, and turns round when it reverses: here, left stays
 the vehicle's left). Where the vehicle's heading and the tangent of its path differ (sideslip, a pose origin far from the
-rear axle in a tight turn), the heading wins; ``heading_against_path_rad`` tells by how much they differ.
+rear axle in a tight turn), the heading wins.
 """
 
 from __future__ import annotations
@@ -88,23 +88,6 @@ def shifted(
     if yaw_rad:
         name += f"_yaw{np.degrees(yaw_rad):+.0f}"
     return Trajectory(name, tuple(views), "shifted")
-
-
-def heading_against_path_rad(path: EgoPath) -> NDArray[np.float64]:
-    """Angle from the path's tangent to the vehicle's heading at each ego pose, ``f64[T]`` radians in (-pi, pi].
-
-    The tangent is a central difference of positions (one-sided at the ends); where the vehicle moves less than 1 cm
-    between the neighbours the angle is reported as 0, for want of a tangent. Near pi means reversing.
-    """
-    position = path.world_from_ego[:, :2, 3]
-    count = len(position)
-    angles = np.zeros(count)
-    for i in range(count):
-        step = position[min(i + 1, count - 1)] - position[max(i - 1, 0)]
-        if np.hypot(*step) >= 0.01:
-            difference = geometry.yaw_of(path.world_from_ego[i]) - np.arctan2(step[1], step[0])
-            angles[i] = np.pi - (np.pi - difference) % (2 * np.pi)
-    return angles
 
 
 def _frames(scene: Scene, camera: str) -> tuple:

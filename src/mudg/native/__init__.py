@@ -10,10 +10,12 @@ instruction set instead of the best one.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -84,6 +86,19 @@ def threads() -> int:
     """Number of threads the native loops use; 1 when there is no library."""
     found = library()
     return 1 if found is None else int(found.mudg_threads())
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread of the native loops in this block: threads inside threads only wait for each other."""
+    found, before = library(), threads()
+    if found is not None:
+        found.mudg_set_threads(1)
+    try:
+        yield
+    finally:
+        if found is not None:
+            found.mudg_set_threads(before)
 
 
 def default_threads() -> int:

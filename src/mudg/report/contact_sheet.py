@@ -47,9 +47,7 @@ Floats = NDArray[np.float64]
 
 def write_contact_sheet(scene: Scene, path: Path) -> Path:
     """Draw the scene's contact sheet as a JPEG at ``path``."""
-    sheet = contact_sheet(scene)
-    with store.atomic_path(path) as temporary:
-        sheet.save(temporary, "JPEG", quality=88)
+    store.write_image(path, contact_sheet(scene), quality=88)
     return path
 
 

@@ -44,17 +44,12 @@ class Columns:
     has_truth: bool
 
 
-def write_report(out: Path) -> Path:
-    """Write ``OUT/report.html`` from what the chain left in ``out`` (see ``stages.run``).
+def film(out: Path) -> list[TrajectoryVideo]:
+    """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see ``stages.run``).
 
     Raises:
         InputError: the run is not scored yet, or a folder of views is damaged.
     """
-    return write_page(out, film(out))
-
-
-def film(out: Path) -> list[TrajectoryVideo]:
-    """The costly half of a report: one video per trajectory. Raises as ``write_report``."""
     out = Path(out)
     scores = store.read_json(out / "score" / "metrics.json")
     folders = _folders(out, scores)

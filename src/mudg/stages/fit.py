@@ -12,29 +12,26 @@ loss), ``models.scene.densify``. Nothing else touches the parameters.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shutil
-import signal
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import losses, metrics, native_ops
-from mudg.core.pictures import class_colors, depth_colors, to_bytes
+from mudg.core.pictures import panels_of
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet
@@ -110,7 +107,7 @@ def run(
     folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    with _one_torch_thread():
+    with one_torch_thread():
         state = _prepare(config, Path(scene), Path(fused), virtual, folder.path)
         optimise(state, config, folder)
     save_model(state.model, folder.path)
@@ -186,11 +183,11 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``VirtualConfig.beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
-    that changes. Ctrl-C is taken at the end of a step: checkpoint, then KeyboardInterrupt.
+    that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
     raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
-    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, _interrupt_at_end_of_step() as interrupted:
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
@@ -216,12 +213,12 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
                 write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
-            if step % config.checkpoint_every == 0 or interrupted.is_set():
+            if step % config.checkpoint_every == 0 or interruption.requested:
                 save_checkpoint(state, folder.path / "steps")
             bar.advance()
-            if interrupted.is_set():
+            if interruption.requested:
                 folder.pause(state.summary())
-                raise KeyboardInterrupt
+                interruption.stop_now()
 
 
 def _learn_from(
@@ -549,41 +546,4 @@ def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
     """A picture: truth, render, depth, semantics of the middle recorded view."""
     stored = state.views.recorded[len(state.views.recorded) // 2]
     seen = render_view(state.model, stored.view, raster)
-    panels = [stored.rgb, to_bytes(seen.rgb), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
-    if seen.semantics is not None:
-        panels.append(class_colors(seen.semantics.numpy()))
-    with store.atomic_path(path) as temporary:
-        Image.fromarray(np.concatenate(panels, 1)).save(temporary)
-
-
-@contextlib.contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Results must not depend on how many cores are free; the native library's do not, torch's do. Its short loops gain nothing
-    from a second thread."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def _interrupt_at_end_of_step() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into a flag, so that a step is never cut in half; a second one interrupts at once."""
-    flag = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def note(number: int, frame: Any) -> None:
-        if flag.is_set() and callable(before):
-            before(number, frame)
-        flag.set()
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, before)
+    store.write_image(path, np.concatenate([stored.rgb, *panels_of(seen)], 1))

@@ -55,8 +55,7 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
     for words in describe(report):
         log.info(f"fuse: {words}")
     write_fused(folder.path, cloud, report_record(report, rules))
-    with store.atomic_path(folder.path / "top.png") as temporary:
-        top_view(loaded, cloud, report).save(temporary)
+    store.write_image(folder.path / "top.png", top_view(loaded, cloud, report))
     folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
     return folder.path
 

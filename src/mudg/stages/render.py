@@ -15,8 +15,9 @@ from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
+from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.exporters.video import panels_of, side_by_side, write_mp4
+from mudg.data.exporters.video import write_mp4
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel

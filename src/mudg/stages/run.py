@@ -54,6 +54,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         InputError: no such log. UsageError: ``out`` holds a run of other settings or files of something else, or touches what is
             read. Whatever a verb raises.
     """
+    import torch
+
     from mudg import native
     from mudg.report import run_report
 
@@ -61,7 +63,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     if str(source) != CITY and not Path(source).exists():
         raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
     _refuse_overlap(config, source, out)
-    _use_all_threads(native.default_threads())
+    torch.set_num_threads(native.default_threads())
     ledger = _Ledger.open(out, config, str(source), overwrite)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
@@ -198,12 +200,6 @@ def _digests(out: Path) -> dict[str, str]:
     """Hash of each artefact's manifest."""
     names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
     return {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
-
-
-def _use_all_threads(count: int) -> None:
-    import torch
-
-    torch.set_num_threads(count)
 
 
 def _closing_words(out: Path, report: Path, ledger: _Ledger) -> str:

@@ -10,9 +10,7 @@ OUT/<trajectory>/state/  what an interrupted run needs to continue after the las
 
 from __future__ import annotations
 
-import concurrent.futures
 import math
-import multiprocessing
 import os
 import shutil
 import time
@@ -22,13 +20,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
 from mudg.base import log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
+from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
@@ -109,58 +107,15 @@ def run(
 def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
     """Make the trajectories, each in one thread, several processes at a time; returns the number of views."""
     processes = min(processes, len(jobs))
+    if processes > 1:
+        log.info_once(f"synthesize: {processes} processes with one thread each")
     made = 0
     with log.task("synthesize", len(jobs)) as bar:
-        if processes == 1:
-            threads = torch.get_num_threads()
-            torch.set_num_threads(1)
-            try:
-                for job, name in zip(jobs, names):
-                    bar.update(name)
-                    made += make_trajectory(job)
-                    bar.advance()
-            finally:
-                torch.set_num_threads(threads)
-            return made
-        log.info_once(f"synthesize: {processes} processes with one thread each")
-        context = multiprocessing.get_context("spawn")
-        with quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
-            futures = {pool.submit(_make_in_process, job): name for job, name in zip(jobs, names)}
-            try:
-                for future in concurrent.futures.as_completed(futures):
-                    made += future.result()
-                    bar.update(futures[future])
-                    bar.advance()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+        for index, views in run_in_processes(make_trajectory, [(job,) for job in jobs], processes):
+            made += views
+            bar.update(names[index])
+            bar.advance()
     return made
-
-
-class quiet_openmp:
-    """Environment for child processes: one thread, and waiting without spinning."""
-
-    _wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": "1"}
-
-    def __enter__(self) -> None:
-        self._before = {name: os.environ.get(name) for name in self._wanted}
-        os.environ.update(self._wanted)
-
-    def __exit__(self, *_: object) -> None:
-        for name, value in self._before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _make_in_process(job: Job) -> int:
-    from mudg import native
-
-    log.set_quiet(True)
-    torch.set_num_threads(1)
-    native.set_threads(1)
-    return make_trajectory(job)
 
 
 # one trajectory -------------------------------------------------------------------------------------------------------
@@ -249,8 +204,7 @@ def make_trajectory(job: Job) -> int:
             store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
             (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
         if sheet:
-            with store.atomic_path(folder / "overview.png") as temporary:
-                Image.fromarray(np.concatenate(sheet)).save(temporary)
+            store.write_image(folder / "overview.png", np.concatenate(sheet))
         if fits:
             store.write_json(folder / FITS, fits)
         shutil.rmtree(state, ignore_errors=True)

@@ -293,12 +293,12 @@ def agreed_terms(
     Raises:
         NumericsError: in every process, if a term is not finite in any; names the terms, the step and the processes.
     """
-    bad = [float(not all(map(_finite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)]
+    bad = [float(not all(map(math.isfinite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)]
     sums = ranks.total([*terms.values(), float(stop), *bad])
     mean = {name: value / (ranks.size * portions) for name, value in zip(terms, sums)}
     flags = sums[len(terms) + 1 :]
-    if any(flags) or not all(map(_finite, mean.values())):
-        names = [name for name, value in mean.items() if not _finite(value)] or list(terms)
+    if any(flags) or not all(map(math.isfinite, mean.values())):
+        names = [name for name, value in mean.items() if not math.isfinite(value)] or list(terms)
         where = f"learn, step {step}"
         if ranks.size > 1:
             where += f", process {', '.join(str(n) for n, flag in enumerate(flags) if flag)} of {ranks.size}"
@@ -306,7 +306,3 @@ def agreed_terms(
             got=", ".join(str(mean[n]) for n in names),
             remedy="continue from the last checkpoint with a lower learning rate")  # fmt: skip
     return mean, sums[len(terms)] > 0
-
-
-def _finite(value: float) -> bool:
-    return math.isfinite(value)

@@ -188,8 +188,7 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
             gray(sample.confidence[t, 0].numpy()),
         ]  # fmt: skip
         rows.append(np.concatenate(cells, 1))
-    with store.atomic_path(path) as temporary:
-        Image.fromarray(np.concatenate(rows, 0)).save(temporary)
+    store.write_image(path, np.concatenate(rows, 0))
 
 
 def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420) -> None:
@@ -225,8 +224,7 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
         draw.line([place(s, v) for s, v in line], fill=color, width=2)
         draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=color)
     draw.text((50, height - 18), f"steps, logarithmic, 50 to {last}", fill="black")
-    with store.atomic_path(path) as temporary:
-        image.save(temporary)
+    store.write_image(path, image)
 
 
 # model card -----------------------------------------------------------------------------------------------------------
