@@ -2,6 +2,7 @@
 
     run_side_by_side    named tasks at the same time, each with its own progress, stopped and resumed like a verb
     run_in_processes    one function over many arguments, several processes at a time
+    process_pool        the processes themselves, for work that goes on beside other work
     computed_ahead      one function over numbers in order, several threads at a time
     run_limited         one call on a foreign file, under a limit of address space
     Interruption        Ctrl-C and SIGTERM wait for the end of a step
@@ -180,11 +181,7 @@ def run_in_processes(
             for index, items in enumerate(arguments):
                 yield index, function(*items)
         return
-    context = multiprocessing.get_context("spawn")
-    with (
-        child_environment(1),
-        concurrent.futures.ProcessPoolExecutor(processes, mp_context=context, initializer=_prepare_child) as pool,
-    ):
+    with child_environment(1), process_pool(processes) as pool:
         futures = {pool.submit(function, *items): index for index, items in enumerate(arguments)}
         try:
             for future in concurrent.futures.as_completed(futures):
@@ -195,6 +192,12 @@ def run_in_processes(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def process_pool(processes: int) -> concurrent.futures.ProcessPoolExecutor:
+    """A pool of quiet processes of one torch thread each."""
+    context = multiprocessing.get_context("spawn")
+    return concurrent.futures.ProcessPoolExecutor(processes, mp_context=context, initializer=_prepare_child)
 
 
 def _prepare_child() -> None:
@@ -236,8 +239,7 @@ def run_limited(
     """
     if sys.platform != "linux":
         log.warn("this system has no limit of address space; a hostile file may take all memory")
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context, initializer=_prepare_child) as pool:
+    with process_pool(1) as pool:
         try:
             return pool.submit(_limited, work, limit_bytes, where, out_of_memory).result()
         except BrokenProcessPool as error:

@@ -52,11 +52,8 @@ class Replacement:
         if os.path.ismount(self.folder):
             raise ResourceError("a mount point cannot be replaced", where=str(self.folder),
                 remedy="choose an --out inside it")  # fmt: skip
-        try:
+        with store.disk_errors("the new result cannot be made beside the old one", self.folder.parent):
             self.staging.mkdir(exist_ok=True)
-        except OSError as error:
-            raise ResourceError("the new result cannot be made beside the old one", where=str(self.folder.parent),
-                got=str(error), remedy="choose another --out") from error  # fmt: skip
         return self.staging
 
     def swap(self, own_names: OwnNames) -> None:
@@ -108,13 +105,11 @@ class Replacement:
         if not self.retired.is_dir():
             return
         own = own_names(self.retired)
-        try:
+        remedy = f"the new one is in place; move what you need from here to {self.folder}"
+        with store.disk_errors("the old result cannot be removed", self.retired, remedy):
             kept = [self._hand_over(name) for name in sorted(set(all_names(self.retired)) - set(own))]
             remove_files(self.retired, own)
             self.retired.rmdir()
-        except OSError as error:
-            raise ResourceError("the old result cannot be removed", where=str(self.retired), got=str(error),
-                remedy=f"the new one is in place; move what you need from here to {self.folder}") from error  # fmt: skip
         if kept:
             more = f" and {len(kept) - 8} more" if len(kept) > 8 else ""
             log.warn(f"{self.folder}: kept files that are not of the old result: {', '.join(kept[:8])}{more}")

@@ -44,12 +44,22 @@ def fsync_directory(path: Path) -> None:
             os.close(fd)
 
 
-def _make_parent(path: Path) -> None:
+@contextlib.contextmanager
+def disk_errors(what: str, where: Path, remedy: str = "choose another --out") -> Iterator[None]:
+    """Turn an OSError of this block into a ResourceError that says what could not be done, where, and what to do."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
     except OSError as error:
-        raise ResourceError("cannot create a folder", where=str(path.parent), got=str(error),
-            remedy="choose another --out") from error  # fmt: skip
+        raise ResourceError(what, where=str(where), got=str(error), remedy=remedy) from error
+
+
+def _writing(path: Path) -> contextlib.AbstractContextManager[None]:
+    return disk_errors("writing failed", path, "free disk space or choose another --out")
+
+
+def _make_parent(path: Path) -> None:
+    with disk_errors("cannot create a folder", path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
 
 
 _umask_lock = threading.Lock()
@@ -74,23 +84,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     _make_parent(path)
-    try:
+    with disk_errors("cannot write here", path):
         fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
-    except OSError as error:
-        raise ResourceError("cannot write here", where=str(path), got=str(error),
-            remedy="choose another --out") from error  # fmt: skip
     os.close(fd)
     temporary = Path(name)
     try:
-        yield temporary
-        with temporary.open("rb+") as handle:
-            os.fsync(handle.fileno())
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-        fsync_directory(path.parent)
-    except OSError as error:
-        raise ResourceError("writing failed", where=str(path), got=str(error),
-            remedy="free disk space or choose another --out") from error  # fmt: skip
+        with _writing(path):
+            yield temporary
+            with temporary.open("rb+") as handle:
+                os.fsync(handle.fileno())
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(path)
+            fsync_directory(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -115,11 +120,8 @@ def write_in_tree(path: Path, content: bytes) -> None:
     One journal flush for a thousand small files instead of a thousand.
     """
     _make_parent(path)
-    try:
+    with _writing(path):
         Path(path).write_bytes(content)
-    except OSError as error:
-        raise ResourceError("writing failed", where=str(path), got=str(error),
-            remedy="free disk space or choose another --out") from error  # fmt: skip
 
 
 def sync_tree(folder: Path) -> None:
@@ -130,16 +132,13 @@ def sync_tree(folder: Path) -> None:
     if hasattr(os, "sync"):
         os.sync()
         return
-    try:
+    with _writing(folder):
         for path in sorted(Path(folder).rglob("*")):
             if path.is_dir():
                 fsync_directory(path)
             elif path.is_file():
                 with path.open("rb+") as handle:
                     os.fsync(handle.fileno())
-    except OSError as error:
-        raise ResourceError("writing failed", where=str(folder), got=str(error),
-            remedy="free disk space or choose another --out") from error  # fmt: skip
     fsync_directory(folder)
 
 
@@ -229,9 +228,7 @@ def sha256_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def write_safetensors(
-    path: Path, tensors: Mapping[str, NDArray[Any] | Tensor], metadata: Mapping[str, str] | None = None
-) -> None:
+def write_safetensors(path: Path, tensors: Mapping[str, NDArray[Any] | Tensor]) -> None:
     """Write named arrays (numpy or torch, any device) as one safetensors file, atomically."""
     from safetensors.numpy import save as save_numpy
 
@@ -240,7 +237,7 @@ def write_safetensors(
         if not isinstance(value, np.ndarray):
             value = value.detach().cpu().numpy()
         arrays[name] = np.ascontiguousarray(value)
-    atomic_write(path, save_numpy(arrays, metadata=dict(metadata) if metadata else None))
+    atomic_write(path, save_numpy(arrays))
 
 
 def read_safetensors(path: Path) -> dict[str, NDArray[Any]]:
@@ -268,11 +265,8 @@ def atomic_directory(path: Path) -> Iterator[Path]:
     path = Path(path)
     partial = path.with_name(path.name + ".part")
     shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with disk_errors("cannot create a folder", partial):
         partial.mkdir(parents=True)
-    except OSError as error:
-        raise ResourceError("cannot create a folder", where=str(partial), got=str(error),
-            remedy="choose another --out") from error  # fmt: skip
     try:
         yield partial
     except BaseException:

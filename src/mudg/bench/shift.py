@@ -248,10 +248,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
         found[row.name] = _scores_of(job, row, views[row.name])
     films: list[str] = []
     if job.videos:
-        shown = {
-            "truth": truth,
-            **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN},
-        }
+        shown = {"truth": truth, **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN}}
         # With another method the old films are out of date, whatever was asked.
         _made(replace(job, overwrite=True), lambda o: shift_page.film(shown, paths, out / "film", overwrite=o))
         films = [path.name for path in paths]

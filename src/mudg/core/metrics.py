@@ -266,10 +266,7 @@ def _true_frame(pair: Pair) -> flicker.TrueFrame:
     view, depth, ids = pair.view, pair.truth_depth, pair.truth_semantics
     if view is None or depth is None or ids is None:
         raise InputError("flicker needs exact depth, classes and the view")
-    camera = view.camera
-    depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0)
-    lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-    return flicker.TrueFrame(depth, ids, torch.from_numpy(view.world_from_cam.copy()), lens)
+    return flicker.TrueFrame.of(view, torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0), ids)
 
 
 class Flicker:

@@ -214,12 +214,7 @@ def ddim(
 
 
 def dpm_solver(
-    denoise: Denoise,
-    start: Tensor,
-    schedule: Schedule,
-    step_indices: Sequence[int],
-    *,
-    prediction: Prediction = "x0",
+    denoise: Denoise, start: Tensor, schedule: Schedule, step_indices: Sequence[int], *, prediction: Prediction = "x0"
 ) -> Tensor:
     """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order from two consecutive estimates of x0, deterministic.
 

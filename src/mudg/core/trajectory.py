@@ -52,9 +52,7 @@ def recorded(scene: Scene, camera: str) -> Trajectory:
     return Trajectory(trajectory_name(camera), tuple(views), "recorded")
 
 
-def shifted(
-    scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0
-) -> Trajectory:
+def shifted(scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0) -> Trajectory:
     """The drive of one camera with the vehicle moved sideways; camera orientation kept (up to ``yaw_rad``).
 
     Args:

@@ -115,7 +115,6 @@ def frame_tile(scene: Scene, frame: Frame, width: int = TILE_WIDTH_PX) -> Image.
     return tile
 
 
-
 def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> None:
     """Colour the pixels u8[H, W, 3] that points fall on, nearer ones over farther ones; few points become dots of 2x2."""
     uv, z = geometry.project(view, xyz_world)

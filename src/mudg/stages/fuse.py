@@ -103,11 +103,7 @@ def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
     """The report as JSON values for ``fuse.json``."""
     values = dataclasses.asdict(report)
     tracks = {
-        track_id: {
-            **verdict,
-            "points": report.object_points.get(track_id),
-            "left_out": report.left_out.get(track_id),
-        }
+        track_id: {**verdict, "points": report.object_points.get(track_id), "left_out": report.left_out.get(track_id)}
         for track_id, verdict in values.pop("verdicts").items()
     }
     values.pop("object_points")

@@ -279,13 +279,7 @@ def _tensorboard(folder: Path) -> Any:
 
 
 def _score_watched(
-    model: Model,
-    weights: dict[str, Tensor],
-    config: LearnConfig,
-    run_dir: RunDir,
-    folder: Path,
-    step: int,
-    bf16: bool,
+    model: Model, weights: dict[str, Tensor], config: LearnConfig, run_dir: RunDir, folder: Path, step: int, bf16: bool
 ) -> None:
     """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
     made = kind_of(model).rebuilt(model, weights)

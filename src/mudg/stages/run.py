@@ -145,23 +145,18 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
     models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     renders = {name: out / "render" / name for name in models}
 
-    def fitted(name: str) -> Path:
-        settings, observations = (guided, virtual) if name == WITH_DIFFUSION else (plain, None)
-        return fit.run(settings, scene, fused, models[name], observations=observations, overwrite=overwrite)
-
     def fitted_both() -> None:
         """Side by side where there are two cores: they need nothing of each other, and much of a fit uses one core only."""
         threads = native.default_threads()
-        if threads < 2 or not all(overwrite or _unfinished(folder) for folder in models.values()):
-            for name in models:
-                fitted(name)
+        tasks = [
+            Task(name, fit.run, (settings, scene, fused, models[name]), {"observations": views, "overwrite": overwrite})
+            for name, settings, views in ((WITHOUT_DIFFUSION, plain, None), (WITH_DIFFUSION, guided, virtual))
+        ]
+        if threads >= 2 and all(overwrite or _unfinished(folder) for folder in models.values()):
+            run_side_by_side(tasks, threads // 2)
             return
-        inputs = {WITHOUT_DIFFUSION: (plain, None), WITH_DIFFUSION: (guided, virtual)}
-        run_side_by_side(
-            [Task(name, fit.run, (settings, scene, fused, models[name]), {"observations": views, "overwrite": overwrite})
-             for name, (settings, views) in inputs.items()],
-            threads // 2,
-        )  # fmt: skip
+        for task in tasks:
+            task.function(*task.arguments, **task.named)
 
     def rendered(name: str) -> Path:
         return render.run(config.render, scene, models[name], renders[name], overwrite=overwrite)

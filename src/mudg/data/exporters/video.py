@@ -23,20 +23,18 @@ _H264_ENCODERS = ("libx264", "h264_videotoolbox", "libopenh264")
 _CODECS = ("libx264", "h264", "mpeg4")
 
 
-def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 20) -> Path:
+def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 10.0) -> Path:
     """Encode frames u8[H, W, 3] to ``path`` atomically; odd sizes are padded by one pixel of the edge.
 
     Raises:
         InputError: no frames, or frames of different sizes. ResourceError: no usable encoder, or the disk is full.
     """
     with store.atomic_path(Path(path)) as temporary:
-        _encode(str(temporary), frames, fps, crf)
+        _encode(str(temporary), frames, fps, crf=20)
     return Path(path)
 
 
-def mp4_bytes(
-    frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 27, preset: str = "medium"
-) -> bytes:
+def mp4_bytes(frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 27, preset: str = "medium") -> bytes:
     """The same as bytes, for embedding in a page. ``preset``: x264's name for speed against size."""
     buffer = io.BytesIO()
     _encode(buffer, frames, fps, crf, preset)
@@ -71,9 +69,7 @@ def jpeg_bytes(picture: NDArray[np.uint8], quality: int) -> bytes:
     return target.getvalue()
 
 
-def _encode(
-    target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int, preset: str = "medium"
-) -> None:
+def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int, preset: str = "medium") -> None:
     container = stream = None
     size: tuple[int, ...] = ()
     try:

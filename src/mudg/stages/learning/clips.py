@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import concurrent.futures
-import multiprocessing
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.errors import InputError, ResourceError
-from mudg.base.processes import run_in_processes
+from mudg.base.processes import child_environment, process_pool, run_in_processes
 from mudg.base.types import Clip
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
@@ -67,9 +66,9 @@ class MakingClips:
         if not self._missing or self._workers == 0:
             return
         log.info(f"learn: {len(self._missing)} cities to generate into {self._folder}, {self._workers} processes")
-        context = multiprocessing.get_context("spawn")
-        self._pool = concurrent.futures.ProcessPoolExecutor(self._workers, mp_context=context)
-        self._futures = [self._pool.submit(from_city.write_city, self._rules, n, self._folder) for n in self._missing]
+        self._pool = process_pool(self._workers)
+        with child_environment(1):
+            self._futures = [self._pool.submit(from_city.write_city, self._rules, n, self._folder) for n in self._missing]
         for future in self._futures:
             future.add_done_callback(_stop_all_on_error(self._futures))
 
