@@ -32,11 +32,7 @@ class Checkpoint:
 
     def tensors(self, name: str) -> dict[str, Tensor]:
         """Load one named group of tensors (writable copies)."""
-        import torch
-
-        return {
-            k: torch.from_numpy(v.copy()) for k, v in store.read_safetensors(self.path / f"{name}.safetensors").items()
-        }
+        return store.read_tensors(self.path / f"{name}.safetensors")
 
 
 def save(

@@ -245,6 +245,13 @@ def read_safetensors(path: Path) -> dict[str, NDArray[Any]]:
     return parse_safetensors(read_bytes(path), str(path))
 
 
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """``read_safetensors`` as torch tensors that may be written to."""
+    import torch
+
+    return {name: torch.from_numpy(array.copy()) for name, array in read_safetensors(path).items()}
+
+
 def parse_safetensors(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     """Parse safetensors bytes; InputError names ``where``."""
     from safetensors import SafetensorError

@@ -145,7 +145,7 @@ def panels_of(observation: Observation) -> list[NDArray[np.uint8]]:
     return panels
 
 
-def side_by_side(panels: Sequence[NDArray[np.uint8]], gap_px: int = 2) -> NDArray[np.uint8]:
+def side_by_side(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Panels u8[H, W, 3] of one height in a row, with white between them.
 
     Raises:
@@ -153,5 +153,5 @@ def side_by_side(panels: Sequence[NDArray[np.uint8]], gap_px: int = 2) -> NDArra
     """
     if len({len(panel) for panel in panels}) != 1:
         raise InputError("panels must be of one size, at least one", got=str([panel.shape for panel in panels]))
-    white = np.full((len(panels[0]), gap_px, 3), 255, np.uint8)
+    white = np.full((len(panels[0]), 2, 3), 255, np.uint8)
     return np.concatenate([part for panel in panels for part in (white, panel)][1:], 1)

@@ -502,10 +502,7 @@ def load_model(folder: Path) -> SceneModel:
     values = store.read_json(folder / "model.json")
     if values.get("schema") != 1:
         raise InputError("unknown schema of a fitted scene", where=str(folder / "model.json"), expected="1", got=str(values.get("schema")))
-    groups = {}
-    for name in ("gaussians", "nodes"):
-        arrays = store.read_safetensors(folder / f"{name}.safetensors")
-        groups[name] = {key: torch.from_numpy(value.copy()) for key, value in arrays.items()}
+    groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
     return SceneModel.from_state(values, groups)
 
 

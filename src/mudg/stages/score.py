@@ -38,10 +38,11 @@ from mudg.data.observations import (
     read_observations,
 )
 from mudg.data.scene import read_scene
-from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
+from mudg.models.featnets import CodecFeatures, PerceptualDistance
 from mudg.models.mdm import files as mdm_files
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
+from mudg.stages.fitting.perception import lpips_network
 from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, Truth, ViewTruth, apart_m, stored_truth, truth_of
 
 BASELINE: Final = "nearest_fill"
@@ -164,8 +165,7 @@ def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     if config.perceptual_views:
         found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec))
     if config.lpips_weights:
-        state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
-        network = LpipsFeatures(state, config.lpips_weights)
+        network = lpips_network(config.lpips_weights)
         found["lpips"] = PerceptualDistance(network, network.channel_weights)
     return found
 

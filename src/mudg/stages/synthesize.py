@@ -216,8 +216,7 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     files = sorted(state.glob("[0-9]*.safetensors"))
     if not files:
         return 0, {}
-    arrays = store.read_safetensors(files[-1])
-    return int(files[-1].stem), {m: torch.from_numpy(a.copy()) for m, a in arrays.items()}  # type: ignore[misc]
+    return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
 
 
 class Renders:
