@@ -88,6 +88,15 @@ def shifted(scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0,
     return Trajectory(name, tuple(views), "shifted")
 
 
+def at_shift(
+    scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0
+) -> Trajectory:
+    """The recorded trajectory where nothing is shifted, else ``shifted``."""
+    if not shift_m and not height_m and not yaw_rad:
+        return recorded(scene, camera)
+    return shifted(scene, camera, shift_m, height_m=height_m, yaw_rad=yaw_rad)
+
+
 def _frames(scene: Scene, camera: str) -> tuple:
     if camera not in scene.cameras:
         raise UsageError(f"the scene has no camera named {camera!r}", where=f"scene {scene.id}",

@@ -74,12 +74,9 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     paths = []
     for camera in cameras:
         for shift_m in config.shifts_m:
-            if shift_m == 0 and not config.height_m and not config.yaw_deg:
-                path = trajectory.recorded(scene, camera)
-            else:
-                path = trajectory.shifted(
-                    scene, camera, shift_m, height_m=config.height_m, yaw_rad=math.radians(config.yaw_deg)
-                )
+            path = trajectory.at_shift(
+                scene, camera, shift_m, height_m=config.height_m, yaw_rad=math.radians(config.yaw_deg)
+            )
             paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
     return tuple(paths)
 
