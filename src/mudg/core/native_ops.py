@@ -46,7 +46,16 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     library = _library_for((prediction, target))
     if library is None or prediction.numel() == 0:
         return losses.photometric(prediction, target, ssim_weight, weight)
-    return _Photometric.apply(prediction, target.detach(), weight, ssim_weight, library)
+    image, wanted = prediction.detach().contiguous(), target.detach().contiguous()
+    gradient, status = torch.empty_like(image), ctypes.c_int(0)
+    library.mudg_photometric.restype = ctypes.c_double
+    value = library.mudg_photometric(
+        *map(_address, (image, wanted, weight)), *map(ctypes.c_int, image.shape), ctypes.c_float(ssim_weight), _address(gradient),
+        ctypes.byref(status),
+    )  # fmt: skip
+    if status.value != 0:
+        raise ResourceError("not enough memory for the photometric loss", where=f"image {tuple(image.shape)}")
+    return _WithGradient.apply(prediction, value, gradient)
 
 
 def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
@@ -75,7 +84,16 @@ def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lif
     if library is None or logits.numel() == 0 or target.dtype != torch.int64:
         return losses.class_loss(logits, target, weight, total, lift)
     channel, added = (-1, None) if lift is None else (lift[0], lift[1].detach().to(torch.float32).contiguous())
-    return _ClassLoss.apply(logits, target.contiguous(), weight.detach().contiguous(), 1.0 / total, channel, added, library)
+    values, ids, weight = logits.detach().contiguous(), target.contiguous(), weight.detach().contiguous()
+    gradient, status = torch.empty_like(values), ctypes.c_int(0)
+    library.mudg_class_loss.restype = ctypes.c_double
+    value = library.mudg_class_loss(
+        *map(_address, (values, ids, weight, added)), ctypes.c_int(channel), ctypes.c_int(len(values)),
+        ctypes.c_int64(ids.numel()), ctypes.c_float(1.0 / total), _address(gradient), ctypes.byref(status),
+    )  # fmt: skip
+    if status.value != 0:
+        raise ResourceError("not enough memory for the class loss", where=f"logits {tuple(values.shape)}")
+    return _WithGradient.apply(logits, value, gradient)
 
 
 def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
@@ -184,54 +202,20 @@ def _check_column(column: AdamColumn, first: Tensor) -> None:
             got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
 
 
-class _Photometric(torch.autograd.Function):
+class _WithGradient(torch.autograd.Function):
+    """A scalar whose gradient was worked out along with its value."""
+
     @staticmethod
-    def forward(
-        ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float, library: ctypes.CDLL
-    ) -> Tensor:
-        image, wanted = prediction.detach().contiguous(), target.contiguous()
-        gradient, status = torch.empty_like(image), ctypes.c_int(0)
-        library.mudg_photometric.restype = ctypes.c_double
-        value = library.mudg_photometric(
-            *map(_address, (image, wanted, weight)), *map(ctypes.c_int, image.shape), ctypes.c_float(ssim_weight), _address(gradient),
-            ctypes.byref(status),
-        )  # fmt: skip
-        if status.value != 0:
-            raise ResourceError("not enough memory for the photometric loss", where=f"image {tuple(image.shape)}")
+    def forward(ctx: Any, variable: Tensor, value: float, gradient: Tensor) -> Tensor:
         ctx.save_for_backward(gradient)
-        return prediction.new_tensor(value)
+        return variable.new_tensor(value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        # The usual case, a loss term of weight 1, needs no copy.
-        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None, None
-
-
-class _ClassLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, logits: Tensor, target: Tensor, weight: Tensor, scale: float, channel: int, added: Tensor | None, library: ctypes.CDLL
-    ) -> Tensor:
-        values = logits.detach().contiguous()
-        gradient, status = torch.empty_like(values), ctypes.c_int(0)
-        library.mudg_class_loss.restype = ctypes.c_double
-        value = library.mudg_class_loss(
-            *map(_address, (values, target, weight, added)), ctypes.c_int(channel), ctypes.c_int(len(values)),
-            ctypes.c_int64(target.numel()), ctypes.c_float(scale), _address(gradient), ctypes.byref(status),
-        )  # fmt: skip
-        if status.value != 0:
-            raise ResourceError("not enough memory for the class loss", where=f"logits {tuple(values.shape)}")
-        ctx.save_for_backward(gradient)
-        return logits.new_tensor(value)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = ctx.saved_tensors
-        # As above; callers put the weight of the term into ``total``.
-        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None, None, None, None
+        # The usual case, a loss term whose weight is in the value already, needs no copy.
+        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None
 
 
 class _Over(torch.autograd.Function):
