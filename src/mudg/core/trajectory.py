@@ -1,4 +1,4 @@
-"""Camera paths: the recorded one, the same drive on another line, another speed, or a spline through given poses.
+"""Camera paths: the recorded one, and the same drive shifted sideways, raised or turned.
 
 Which left is used
 ------------------
