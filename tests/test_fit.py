@@ -109,7 +109,7 @@ def test_same_in_same_out(world, tmp_path):
 
 @pytest.mark.parametrize("densify", ["gradient", "mcmc"])
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, densify):
-    """Ctrl-C before and after virtual views join, a densification and an opacity reset; learnt poses and all. Bit for bit."""
+    """Ctrl-C and SIGTERM before and after virtual views join, a densification and an opacity reset; learnt poses and all. Bit for bit."""
     config = settings("mudg_s", iterations=26, poses__learn=True, densify__kind=densify)
     schedule, stops = fit.densify_schedule(config), [3, 4, 9, 10, 11, 12, 21]
     if densify == "gradient":
@@ -126,7 +126,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     def ctrl_c(model, step, *rest):
         adam_step(model, step, *rest)
         if step == stops[0]:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM if step % 2 else signal.SIGINT)
 
     monkeypatch.setattr(fit, "adam_step", ctrl_c)
     while stops:

@@ -109,7 +109,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     @torch.no_grad()
     def losses(step, part):
         drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, step, 2, 4, "batch", part)]
-        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings())
+        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(None, 1.0, 0.2))
 
     for step in range(2):
         whole, parts = losses(step, slice(0, 2)), [losses(step, slice(n, n + 1)) for n in (0, 1)]
@@ -132,7 +132,7 @@ def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
         for clip in drawn
     ]
     with torch.no_grad():
-        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings()).terms for some in (drawn, nothing))
+        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings(None, 1.0, 0.2)).terms for some in (drawn, nothing))
     assert {"depth", "semantics"} & set(terms)
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 

@@ -128,11 +128,8 @@ def _moved_error(old: str, new: str | None, where: str, path: str) -> UsageError
     """What to say about a key that a class lists in ``MOVED``."""
     if new is None:
         return UsageError(f"the configuration key {old} was removed", where=where, remedy="leave it out")
-    return UsageError(
-        f"the configuration key {old} is now called {path}{new}",
-        where=where,
-        remedy="rename it (a dot is one level of YAML)",
-    )
+    return UsageError(f"the configuration key {old} is now called {path}{new}", where=where,
+        remedy="rename it (a dot is one level of YAML)")  # fmt: skip
 
 
 def differences(old: Any, new: Any, path: str = "") -> list[str]:

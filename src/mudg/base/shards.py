@@ -74,8 +74,8 @@ def read_shards(
     for name, digest in files.items():
         path = folder / Path(name).name
         if not path.is_file() or (verify and store.sha256_file(path) != digest):
-            raise IntegrityError("a weight file is missing or altered", where=str(path), expected=f"sha256 {digest[:16]}...",
-                                 remedy=remedy)  # fmt: skip
+            raise IntegrityError("a weight file is missing or altered", where=str(path),
+                expected=f"sha256 {digest[:16]}...", remedy=remedy)  # fmt: skip
         tensors |= read_tensors(path)
     return tensors
 

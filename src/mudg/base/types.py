@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Matrix = NDArray[np.float64]
-TrajectoryOrigin = Literal["recorded", "shifted", "planned"]
+TrajectoryOrigin = Literal["recorded", "shifted"]
 ObservationKind = Literal["recorded", "virtual"]
 
 
@@ -128,7 +128,7 @@ class Trajectory:
     Args:
         name: of the trajectory, e.g. ``left_2m``.
         views: in the order of their times.
-        origin: how it came about: recorded, a recorded one shifted, or planned anew.
+        origin: how it came about: recorded, or a recorded one shifted.
     """
 
     name: str

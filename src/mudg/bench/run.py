@@ -17,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from mudg.base import log, store
@@ -106,7 +105,8 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     rules = CityClipRules(window=model.config.window)
     record = from_city.make_log(rules, city, frames=SEAM_FRAMES)
     views = [from_city.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
-    truths = [record.world.render(v.resized(rules.width, rules.height)) for v in views]
+    small = [view.resized(rules.width, rules.height) for view in views]
+    truths = [record.world.render(view) for view in small]
     sizes = (rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
     sources: dict[int, WarpSource] = {}
     frames: list[torch.Tensor] = []
@@ -124,10 +124,8 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
     depth = torch.stack([torch.from_numpy(t.depth.copy())[None] for t in truths]).clamp(max=1000.0)
     ids = torch.stack([torch.from_numpy(t.semantics.astype("int64")) for t in truths])
-    poses = torch.from_numpy(np.stack([v.world_from_cam for v in views]))
-    camera = views[0].resized(rules.width, rules.height).camera
-    lens = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]] * len(views), dtype=torch.float64)
-    pairs = flicker.changes(torch.stack(frames), rgb, depth, ids, poses, lens)
+    true_frames = [flicker.TrueFrame.of(*one) for one in zip(small, depth, ids, strict=True)]
+    pairs = flicker.changes(torch.stack(frames), rgb, true_frames)
     ratios = [m / t if t > 0 else math.nan for m, t in pairs]
     seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
     mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731

@@ -89,10 +89,9 @@ def read_list(path: Path, settings: Sequence[str] = ()) -> list[Entry]:
     sources: dict[str, str] = {}
     for entry in entries:
         if entry.name in sources:
-            raise InputError(
-                "two entries would write one folder", where=str(path), got=f"{sources[entry.name]} and {entry.source}",
-                remedy=f"give one another name: SOURCE name={entry.name}-2",
-            )  # fmt: skip
+            raise InputError("two entries would write one folder", where=str(path),
+                got=f"{sources[entry.name]} and {entry.source}",
+                remedy=f"give one another name: SOURCE name={entry.name}-2")  # fmt: skip
         sources[entry.name] = entry.source
     return entries
 
@@ -108,11 +107,9 @@ def _entry(line: str, where: str, folder: Path, settings: Sequence[str]) -> Entr
     for word in words[1:]:
         key, separator, value = word.partition("=")
         if not separator or key not in ("name", *settings):
-            raise InputError(
-                "line holds what is no setting", where=where, got=word[:80],
+            raise InputError("line holds what is no setting", where=where, got=word[:80],
                 expected=", ".join(f"{key}=..." for key in ("name", *settings)),
-                remedy="put quotes around a path with spaces",
-            )  # fmt: skip
+                remedy="put quotes around a path with spaces")  # fmt: skip
         given[key] = value
     source = words[0] if words[0] == "city" else str(folder / Path(words[0]).expanduser())
     name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
@@ -131,9 +128,8 @@ def shard(entries: list[Entry], text: str) -> list[Entry]:
         return entries
     first, separator, count = text.partition("/")
     if not separator or not first.isdigit() or not count.isdigit() or not int(first) < int(count):
-        raise UsageError(
-            "shard makes no sense", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4", got=text
-        )
+        raise UsageError("shard makes no sense", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4",
+            got=text)  # fmt: skip
     return entries[int(first) :: int(count)]
 
 
@@ -206,9 +202,8 @@ def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: 
         except (InputError, TypeError):
             known = False
         if not known:
-            raise UsageError(
-                "the status would replace a file of something else", where=str(status), remedy="choose another --out"
-            )
+            raise UsageError("the status would replace a file of something else", where=str(status),
+                remedy="choose another --out")  # fmt: skip
 
 
 def _run_all(entries: list[Entry], out: Path, work: Work, jobs: int, overwrite: bool) -> Iterator[Outcome]:

@@ -55,8 +55,7 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
     for words in describe(report):
         log.info(f"fuse: {words}")
     write_fused(folder.path, cloud, report_record(report, rules))
-    with store.atomic_path(folder.path / "top.png") as temporary:
-        top_view(loaded, cloud, report).save(temporary)
+    store.write_image(folder.path / "top.png", top_view(loaded, cloud, report))
     folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
     return folder.path
 
@@ -104,11 +103,7 @@ def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
     """The report as JSON values for ``fuse.json``."""
     values = dataclasses.asdict(report)
     tracks = {
-        track_id: {
-            **verdict,
-            "points": report.object_points.get(track_id),
-            "left_out": report.left_out.get(track_id),
-        }
+        track_id: {**verdict, "points": report.object_points.get(track_id), "left_out": report.left_out.get(track_id)}
         for track_id, verdict in values.pop("verdicts").items()
     }
     values.pop("object_points")

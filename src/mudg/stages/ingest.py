@@ -6,7 +6,7 @@ import functools
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,17 +103,13 @@ def _alignment(scene: Scene) -> dict[str, Any]:
     return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What a command line asks for: settings, the log (empty with a list), and the folder to write."""
-
-    config: IngestConfig
-    log: str
-    out: Path
-
-
-def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False) -> Asked:
+def parse_words(
+    words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False
+) -> tuple[IngestConfig, str, Path]:
     """Understand ``[FORMAT] LOG [OUT]`` beside ``--out``; with a list, ``[FORMAT] [OUT]``.
+
+    Returns:
+        Settings, the log (empty with a list), and the folder to write.
 
     Raises:
         UsageError: words are missing or too many, or a format is given twice.
@@ -138,7 +134,7 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
         raise UsageError("there are too many words", expected=usage, got=" ".join([source, *left]))
     if out is None:
         raise UsageError("no folder to write was given", expected=usage)
-    return Asked(config, source, out)
+    return config, source, out
 
 
 _OF_A_LINE = ("format", "frames", "cameras", "sequence", "poses", "boxes")
@@ -169,13 +165,11 @@ _SCENE = "scene"
 def _kind(config: IngestConfig, source: Path) -> str:
     """Which format ``source`` has, or ``scene``."""
     if config.format not in ("auto", *IMPORTERS):
-        raise UsageError(
-            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format
-        )
+        raise UsageError("there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)),
+            got=config.format)  # fmt: skip
     if not source.exists():
-        raise InputError(
-            "driving log does not exist", where=str(source), expected=f"a folder, a scene zip, or the word {CITY}"
-        )
+        raise InputError("driving log does not exist", where=str(source),
+            expected=f"a folder, a scene zip, or the word {CITY}")  # fmt: skip
     if config.format != "auto":
         return config.format
     if is_scene(source):
@@ -187,13 +181,9 @@ def _kind(config: IngestConfig, source: Path) -> str:
     inside = "a file"
     if source.is_dir():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-    raise InputError(
-        "the log's format was not recognised",
-        where=str(source),
-        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
-        got=inside,
-        remedy="give the folder of one drive or sequence, or name the format with --format",
-    )
+    raise InputError("the log's format was not recognised", where=str(source),
+        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}", got=inside,
+        remedy="give the folder of one drive or sequence, or name the format with --format")  # fmt: skip
 
 
 def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:

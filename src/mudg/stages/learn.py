@@ -64,7 +64,7 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     """
     if config.compute.tensorboard and importlib.util.find_spec("tensorboard") is None:
         raise ResourceError("TensorBoard is not installed", where="--compute.tensorboard",
-                            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
+            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
@@ -279,13 +279,7 @@ def _tensorboard(folder: Path) -> Any:
 
 
 def _score_watched(
-    model: Model,
-    weights: dict[str, Tensor],
-    config: LearnConfig,
-    run_dir: RunDir,
-    folder: Path,
-    step: int,
-    bf16: bool,
+    model: Model, weights: dict[str, Tensor], config: LearnConfig, run_dir: RunDir, folder: Path, step: int, bf16: bool
 ) -> None:
     """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
     made = kind_of(model).rebuilt(model, weights)

@@ -208,9 +208,9 @@ def virtual_sets(path: Path) -> dict[str, ObservationSet]:
         raise InputError("no finished folders of observations here", where=str(path), remedy="run `mudg synthesize` first")
     for found in sets.values():
         if found.kind == "recorded":
-            raise InputError("recorded views among the virtual ones: held-out truth must not be learnt from", where=str(found.path),
-                             expected="views of kind virtual", got=f"kind recorded, source {found.source}",
-                             remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
+            raise InputError("recorded views among the virtual ones: held-out truth must not be learnt from",
+                where=str(found.path), expected="views of kind virtual", got=f"kind recorded, source {found.source}",
+                remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
     return sets
 
 

@@ -57,7 +57,7 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
     if config.depth_network:
         if not config.depth:
             raise UsageError("a depth network is named, but no depth is asked for", where="--depth-network",
-                             remedy="leave out --no-depth, or --depth-network")  # fmt: skip
+                remedy="leave out --no-depth, or --depth-network")  # fmt: skip
         kind_of(config.depth_network)
         found["depth_network"] = store.digest(find(config.depth_network))
     return found

@@ -65,7 +65,7 @@ def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
     saved = newest(out / "codec", ranks)
     if saved is None:
         raise ResourceError("the trained codec is not where the leader wrote it", where=str(out / "codec"),
-                            remedy="give an --out on a file system that all processes see")  # fmt: skip
+            remedy="give an --out on a file system that all processes see")  # fmt: skip
     read_rows(saved.path, "net", nn.ModuleDict({"codec": codec}).state_dict())
 
 

@@ -38,9 +38,8 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
     if published:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
     if config.memory_budget_gb:
-        raise UsageError(
-            "only the work of a published-type model is cut", where="--memory-budget-gb", remedy="leave it out"
-        )
+        raise UsageError("only the work of a published-type model is cut", where="--memory-budget-gb",
+            remedy="leave it out")  # fmt: skip
     mdm_files.load(config.model)  # fails now rather than in every process
     return config
 
@@ -84,10 +83,9 @@ def _fitting(model: PublishedMDM, budget_gb: float, bytes_per_value: int, guided
         memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=guided
     )
     if peak_bytes > budget_gb * 1e9:
-        raise ResourceError(
-            "the model does not fit into the memory budget however its work is cut", where="--memory-budget-gb",
-            expected=f">= {peak_bytes / 1e9:.1f} GB", got=f"{budget_gb} GB", remedy="use the 320x512 model, or bfloat16",
-        )  # fmt: skip
+        raise ResourceError("the model does not fit into the memory budget however its work is cut",
+            where="--memory-budget-gb", expected=f">= {peak_bytes / 1e9:.1f} GB", got=f"{budget_gb} GB",
+            remedy="use the 320x512 model, or bfloat16")  # fmt: skip
     log.info(
         f"synthesize: modalities {'together' if split.modalities_together else 'one by one'}, guidance "
         f"{'together' if split.guidance_together else 'in two passes'}, {split.frames_at_once} frames per decoding, "

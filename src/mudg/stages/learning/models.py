@@ -61,7 +61,7 @@ def kind_of(model: nn.Module) -> ModelKind:
     """The row of a model; UsageError if it cannot be trained."""
     if type(model) not in KINDS:
         raise UsageError("this kind of model cannot be trained here", got=type(model).__name__,
-                         expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
+            expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
     return KINDS[type(model)]
 
 
@@ -83,7 +83,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     if is_published(config.start):
         if not _network_is_default(config):
             raise UsageError("the network of a published-type model cannot be described", where="--start",
-                             remedy="leave out widths, blocks, attention, patch and refiner")  # fmt: skip
+                remedy="leave out widths, blocks, attention, patch and refiner")  # fmt: skip
         return learn_published.starting(config), set()
     before = mdm_files.load(config.start)
     if before.config.window != config.data.window:
@@ -133,9 +133,8 @@ def freeze(model: Model, what: str) -> int:
             parameter.requires_grad_(False)
             count += parameter.numel()
     if not count:
-        raise UsageError(
-            "there is nothing to freeze", where="--frozen", got=what, expected="a network with such layers"
-        )
+        raise UsageError("there is nothing to freeze", where="--frozen", got=what,
+            expected="a network with such layers")  # fmt: skip
     log.info(f"learn: {what.replace('_', ' ')} keep their weights ({count:,} parameters)")
     return count
 

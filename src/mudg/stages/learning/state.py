@@ -167,7 +167,7 @@ class RowFiles:
         piece, shape, start = local(value), tuple(value.shape), first_row(value)
         if self._shapes.get(name) != shape:
             raise IntegrityError("a checkpoint does not fit the model", where=f"{self._where}.{name}",
-                                 expected=str(shape), got=str(self._shapes.get(name, "no such tensor")))  # fmt: skip
+                expected=str(shape), got=str(self._shapes.get(name, "no such tensor")))  # fmt: skip
         if not shape:
             return self._open(self._index[name][0][1]).get_tensor(name)
         stop = start + len(piece)
@@ -179,7 +179,7 @@ class RowFiles:
                 rows.append((a, part[a - first : b - first]))
         if sum(len(r) for _, r in rows) != len(piece):
             raise IntegrityError("rows of a tensor are missing in a checkpoint", where=f"{self._where}.{name}",
-                                 expected=f"{start} to {stop}", got=str([(a, len(r)) for a, r in rows]))  # fmt: skip
+                expected=f"{start} to {stop}", got=str([(a, len(r)) for a, r in rows]))  # fmt: skip
         return torch.cat([r for _, r in rows]) if rows else torch.empty_like(piece)
 
     def _open(self, path: Path) -> Any:
