@@ -128,7 +128,7 @@ def test_the_order_of_returns_changes_nothing() -> None:
     one, other = (map_ground(points, path, path[0]) for points in (xyz, xyz[np.random.default_rng(1).permutation(len(xyz))]))
     assert one is not None
     assert other is not None
-    assert (one.joined == other.joined).mean() > 0.999
+    assert (one.reachable == other.reachable).mean() > 0.999
     assert above_plane(one.plane, path) == pytest.approx(above_plane(other.plane, path), abs=1e-3)
 
 

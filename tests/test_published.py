@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_published import TINY, fill, tiny_checkpoint, tiny_model
+from toy_published import TINY, choose_trainable, fill, tiny_checkpoint, tiny_model
 from toy_scene import ToyStreet
 
 from mudg.base import palette
 from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.records import parse_dataclass
 from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
@@ -22,7 +23,7 @@ from mudg.models.published import clip, files, video_unet
 from mudg.models.published import model as published
 from mudg.models.published.clip import ImageTower, TextTower, TowerConfig
 from mudg.models.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
-from mudg.models.published.model import PublishedConfig, WorkSplit, choose_trainable
+from mudg.models.published.model import PublishedConfig, WorkSplit
 from mudg.models.published.resampler import Resampler, ResamplerConfig
 from mudg.models.published.video_unet import VideoUNet, VideoUNetConfig
 from mudg.stages import convert, fuse, synthesize
@@ -435,11 +436,13 @@ def test_shares_of_modalities_and_missing_context(model):
 
 def test_configuration_is_strict():
     values = json.loads(json.dumps(asdict(TINY)))
-    assert files.config_from_dict(values) == TINY
-    with pytest.raises(InputError, match="unknown lens"):
-        files.config_from_dict({**values, "lens": 3})
-    with pytest.raises(InputError, match="wrong type"):
-        files.config_from_dict({**values, "fps": "ten"})
+    assert parse_dataclass(PublishedConfig, values, "model.json") == TINY
+    with pytest.raises(InputError, match="'lens' is unknown"):
+        parse_dataclass(PublishedConfig, {**values, "lens": 3}, "model.json")
+    with pytest.raises(InputError, match="'width' is missing"):
+        parse_dataclass(PublishedConfig, {**values, "net": {k: v for k, v in values["net"].items() if k != "width"}}, "model.json")
+    with pytest.raises(InputError, match="not a whole number"):
+        parse_dataclass(PublishedConfig, {**values, "fps": "10"}, "model.json")
     with pytest.raises(UsageError, match="context"):
         replace(TINY, text=TowerConfig(32, 2, 2))
 

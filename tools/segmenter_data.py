@@ -127,7 +127,7 @@ def _misplaced(track: Track, rng: np.random.Generator) -> Track:
 def save(path: Path, made: Sample) -> None:
     """Write a sample: measured planes in half precision."""
     arrays = {"rgb": made.rgb, "truth": made.truth}
-    for name, value in made.evidence.arrays().items():
+    for name, value in dataclasses.asdict(made.evidence).items():
         arrays[name] = value.astype(np.float16) if value.dtype == np.float32 else value
     store.write_safetensors(path, arrays)
 

@@ -127,7 +127,7 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
                          got=str(error)[:300]) from error  # fmt: skip
     file = sources.base / marigold.SCHEDULE_FILE
     schedule = folders.read_settings(file)
-    marigold.ddim_scheduler(folders.member(folders.package("diffusers"), "DDIMScheduler"), schedule, str(file))
+    marigold.ddim_scheduler(schedule, str(file))
     if schedule.get("rescale_betas_zero_snr"):
         raise InputError("this is the noise schedule of a later Marigold", where=str(file), got="rescale_betas_zero_snr: true",
                          expected="that of marigold-depth-v1-0, which DepthLab was made from",
@@ -190,7 +190,7 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
         store.write_text(partial / "MODEL_CARD.md", _card(facts))
         description = {
             "schema": depthlab.SCHEMA, "kind": depthlab.KIND, "parts": parts, "scheduler": schedule,
-            "sampling": asdict(depthlab.DepthLabSampling()), "facts": facts,
+            "sampling": asdict(depthlab.PUBLISHED_SAMPLING), "facts": facts,
         }  # fmt: skip
         store.write_json(partial / depthlab.DESCRIPTION, description)
         store.sync_tree(partial)

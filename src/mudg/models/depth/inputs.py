@@ -1,9 +1,10 @@
-"""What every depth network is given and gives."""
+"""Input, options and output of every depth network."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,4 +50,5 @@ class DepthOptions:
     steps: int = 0
 
 
+PLAIN: Final = DepthOptions()
 DepthNetwork = Callable[[DepthInput], Prediction]

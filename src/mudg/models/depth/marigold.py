@@ -1,4 +1,4 @@
-"""Depth by a latent diffusion model from a Marigold folder of diffusers, steered by LiDAR if asked.
+"""Depth by a latent diffusion model from a Marigold folder of diffusers, optionally guided by LiDAR.
 
 Ke et al., "Repurposing diffusion-based image generators for monocular depth estimation" (2024): a U-Net denoises the latent of a depth
 map beside the latent of the image; the decoder's mean over three channels, from -1 to 1, is depth up to scale and shift.
@@ -30,7 +30,7 @@ from mudg.base import seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.core.align import AffineFit, Space, fit_affine
 from mudg.models import folders
-from mudg.models.depth.inputs import DepthInput, Prediction
+from mudg.models.depth.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.models.folders import CPU, Place
 
 GUIDED_STEPS: Final = 50
@@ -79,8 +79,8 @@ class Marigold:
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
 
     @classmethod
-    def load(cls, folder: str | Path, place: Place = CPU, *, guided: bool = False, steps: int = 0) -> Marigold:
-        """Read the networks of a folder; ``steps`` 0 = as many as it says (50 with guidance).
+    def load(cls, folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> Marigold:
+        """Read the networks of a folder.
 
         Raises:
             ResourceError: a package or the device is missing. InputError: a part is missing or another kind. UsageError: too many steps.
@@ -95,13 +95,13 @@ class Marigold:
         parts = MarigoldParts(
             folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet"),
             folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae"),
-            ddim_scheduler(folders.member(diffusers, "DDIMScheduler"), folders.read_settings(schedule), str(schedule)),
+            ddim_scheduler(folders.read_settings(schedule), str(schedule)),
             empty_text,
         )  # fmt: skip
         space: Space = "disparity" if index.get("prediction_type") == "disparity" else "depth"
-        usual = GUIDED_STEPS if guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
+        usual = GUIDED_STEPS if options.guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
         longest_px = int(index.get("default_processing_resolution") or PROCESSING_PX)
-        return cls(parts, space=space, steps=steps or usual, guided=guided, longest_px=longest_px, place=place)
+        return cls(parts, space=space, steps=options.steps or usual, guided=options.guided, longest_px=longest_px, place=place)
 
     def __call__(self, given: DepthInput) -> Prediction:
         """Depth of one image at the image's size, up to scale and shift (to what is near the LiDAR's with guidance)."""
@@ -226,14 +226,18 @@ def _returns(given: DepthInput, space: Space, device: str) -> _Returns | None:
     )
 
 
-def ddim_scheduler(scheduler_class: Any, told: Mapping[str, Any], where: str) -> Any:
-    """The DDIM scheduler of diffusers that a description tells; InputError for another one."""
-    if told.get("_class_name") != "DDIMScheduler" or told.get("prediction_type", "epsilon") not in _PREDICTIONS:
-        raise InputError(
-            "the folder's noise schedule is of another kind", where=where, expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}",
-            got=f"{told.get('_class_name')}, {told.get('prediction_type')}",
-        )  # fmt: skip
-    return scheduler_class.from_config({name: value for name, value in told.items() if not name.startswith("_")})
+def ddim_scheduler(settings: Mapping[str, Any], where: str) -> Any:
+    """The DDIM scheduler of diffusers with the settings of a folder.
+
+    Raises:
+        InputError: the settings are of another scheduler. ResourceError: diffusers is missing.
+    """
+    kind, prediction = settings.get("_class_name"), settings.get("prediction_type", "epsilon")
+    if kind != "DDIMScheduler" or prediction not in _PREDICTIONS:
+        raise InputError("the folder's noise schedule is of another kind", where=where, got=f"{kind}, {prediction}",
+                         expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}")  # fmt: skip
+    scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
+    return scheduler_class.from_config({name: value for name, value in settings.items() if not name.startswith("_")})
 
 
 _PREDICTIONS: Final = ("v_prediction", "epsilon", "sample")

@@ -32,7 +32,7 @@ from mudg.core.complete import CompletionRules, DenseDepth
 from mudg.core.pictures import resize_bicubic
 from mudg.models import folders
 from mudg.models.depth.depthlab import DepthLab
-from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions, Prediction
+from mudg.models.depth.inputs import PLAIN, DepthInput, DepthNetwork, DepthOptions, Prediction
 from mudg.models.depth.marigold import Marigold
 from mudg.models.folders import CPU, Place
 
@@ -48,8 +48,7 @@ _SKY_CONFIDENCE: Final = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """How a folder wants its images: the size that a side shall get, the multiple that both sides shall have, mean and deviation of
-    colours in 0..1."""
+    """Preparation of images as a folder describes it: size in pixels, the multiple of both sides, mean and deviation of colours in 0..1."""
 
     height: int
     width: int
@@ -62,14 +61,14 @@ class Preparation:
     def read(cls, folder: Path, side_px: int, multiple: int) -> Preparation:
         """From ``preprocessor_config.json``; side and multiple where it is silent."""
         file = folder / "preprocessor_config.json"
-        told = folders.read_settings(file) if file.is_file() else {}
-        size = told.get("size") or {}
+        settings = folders.read_settings(file) if file.is_file() else {}
+        size = settings.get("size") or {}
         if not isinstance(size, dict):
             size = {"height": size, "width": size}
         return cls(
-            int(size.get("height", side_px)), int(size.get("width", side_px)), int(told.get("ensure_multiple_of") or multiple),
-            bool(told.get("keep_aspect_ratio", True)), tuple(told.get("image_mean") or _MEAN),
-            tuple(told.get("image_std") or _DEVIATION),
+            int(size.get("height", side_px)), int(size.get("width", side_px)), int(settings.get("ensure_multiple_of") or multiple),
+            bool(settings.get("keep_aspect_ratio", True)), tuple(settings.get("image_mean") or _MEAN),
+            tuple(settings.get("image_std") or _DEVIATION),
         )  # fmt: skip
 
     def size_for(self, height: int, width: int) -> tuple[int, int]:
@@ -136,44 +135,27 @@ def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     return small
 
 
-def _with_lidar(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    del options
-    network_class = folders.member(folders.package("transformers"), "PromptDepthAnythingForDepthEstimation")
+def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> TransformersDepth:
+    class_name = "PromptDepthAnythingForDepthEstimation" if with_lidar else "DepthAnythingForDepthEstimation"
+    network_class = folders.member(folders.package("transformers"), class_name)
     network: Any = folders.load_network(network_class, folder, place)
-    preparation = Preparation.read(folder, 756, int(network.config.patch_size))
-    return TransformersDepth(network, preparation, "depth", with_lidar=True, place=place)
-
-
-def _from_image(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    del options
-    network_class = folders.member(folders.package("transformers"), "DepthAnythingForDepthEstimation")
-    network: Any = folders.load_network(network_class, folder, place)
-    preparation = Preparation.read(folder, 518, int(network.config.patch_size))
-    space: Space = "depth" if network.config.depth_estimation_type == "metric" else "disparity"
-    return TransformersDepth(network, preparation, space, with_lidar=False, place=place)
-
-
-def _marigold(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    return Marigold.load(folder, place, guided=options.guided, steps=options.steps)
-
-
-def _depthlab(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    return DepthLab.load(folder, place, steps=options.steps)
+    preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
+    metric = with_lidar or network.config.depth_estimation_type == "metric"
+    return TransformersDepth(network, preparation, "depth" if metric else "disparity", with_lidar=with_lidar, place=place)
 
 
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
 KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] = {
-    "prompt_depth_anything": _with_lidar,
-    "depth_anything": _from_image,
-    "MarigoldDepthPipeline": _marigold,
-    "MarigoldPipeline": _marigold,
-    "depthlab": _depthlab,
+    "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
+    "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
+    "MarigoldDepthPipeline": Marigold.load,
+    "MarigoldPipeline": Marigold.load,
+    "depthlab": DepthLab.load,
 }
 """``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the ``model.json`` that
 ``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders have the shorter name."""
-PLAIN: Final = DepthOptions()
 _DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_class_name"), ("model.json", "kind"))
 
 

@@ -127,24 +127,24 @@ class GroundMap:
 
     Args:
         corner_m: world x and y, f64[2]. plane: of ``fit_ground``, f64[3].
-        joined: bool[N, N], reached from the driven path over known ground without a step.
+        reachable: bool[N, N], reached from the driven path over known ground without a step.
         direct: bool[N, N], and that without much of a detour: one lowered kerb joins a whole sidewalk, but not directly.
         raised_m: f32[N, N], height above the lowest ground within 3 m, 0 where unknown.
     """
 
     corner_m: NDArray[np.float64]
     plane: NDArray[np.float64]
-    joined: NDArray[np.bool_]
+    reachable: NDArray[np.bool_]
     direct: NDArray[np.bool_]
     raised_m: NDArray[np.float32]
 
     def at(self, xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-        """``joined``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for what is no ground."""
+        """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for what is no ground."""
         place = np.floor(np.nan_to_num((xyz_world[..., :2] - self.corner_m) / CELL_M, nan=-1.0)).astype(np.int64)
-        last = len(self.joined) - 1
+        last = len(self.reachable) - 1
         low = (place >= 0).all(-1) & (place <= last).all(-1) & (np.abs(above_plane(self.plane, xyz_world)) < LOW_M)
         i, j = np.moveaxis(np.clip(place, 0, last), -1, 0)
-        return self.joined[i, j] & low, self.direct[i, j] & low, np.where(low, self.raised_m[i, j], np.float32(0))
+        return self.reachable[i, j] & low, self.direct[i, j] & low, np.where(low, self.raised_m[i, j], np.float32(0))
 
 
 def map_ground(
@@ -168,13 +168,13 @@ def map_ground(
     behind = cKDTree(path_world[:, :2]).query(centres, distance_upper_bound=_BLIND_M)[0].reshape(side, side)
     passable = (known & (step < KERB_M)) | ((away_m > 2 * CELL_M) & (behind < _BLIND_M) & (step < KERB_M))
     way_m = _way(passable, beside)
-    joined, direct = np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1]
-    joined, direct = (
-        reached | (_grown(reached) & known) for reached in (joined, direct)
-    )  # a step takes a cell from the road, too
+    # a step takes a cell from the road, too: neighbours of cells that are reached count as reached
+    reachable, direct = (
+        cells | (_dilated(cells) & known) for cells in (np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1])
+    )
     floor = ndimage.minimum_filter(ndimage.uniform_filter(height, 3), 2 * round(_FLOOR_WINDOW_M / CELL_M) + 1)
     raised = np.where(known, np.maximum(height - floor, 0), 0).astype(np.float32)
-    return GroundMap(corner, plane, joined, direct, raised)
+    return GroundMap(corner, plane, reachable, direct, raised)
 
 
 def _way(passable: NDArray[np.bool_], beside_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -187,14 +187,14 @@ def _way(passable: NDArray[np.bool_], beside_m: NDArray[np.float64]) -> NDArray[
     count = idle = 0
     while idle < 2:  # neither four nor eight neighbours bring more
         count += 1
-        grown = _grown(reached, diagonally=count % 2 == 1) & passable
-        new = grown & ~reached
-        way[new], reached = count * CELL_M, grown
+        wider = _dilated(reached, diagonally=count % 2 == 1) & passable
+        new = wider & ~reached
+        way[new], reached = count * CELL_M, wider
         idle = 0 if new.any() else idle + 1
     return way
 
 
-def _grown(mask: NDArray[np.bool_], diagonally: bool = False) -> NDArray[np.bool_]:
+def _dilated(mask: NDArray[np.bool_], diagonally: bool = False) -> NDArray[np.bool_]:
     """A mask and the four, or eight, neighbours of its cells."""
     return np.asarray(ndimage.binary_dilation(mask, ndimage.generate_binary_structure(2, 1 + diagonally)), np.bool_)
 

@@ -86,7 +86,7 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known:
 
     No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface
     lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
-    Ground that is directly joined to the path is road rather than sidewalk; where the log has boxes (``boxes_known``), there is hardly
+    Ground that the path reaches directly is road rather than sidewalk; where the log has boxes (``boxes_known``), there is hardly
     anything outside them that boxes are drawn around.
     """
     found = probabilities.copy()
@@ -121,7 +121,7 @@ def settled_by_color(
     """Probabilities f32[19, H, W] without what the image u8[H, W, 3] speaks against, with sum 1.
 
     Hardly any sky where the image does not look like it (``labellers.find_sky``: bright or blue, smooth), unless nothing in it does,
-    as at night. Ground that is directly joined to the path and not green is road rather than terrain.
+    as at night. Ground that the path reaches directly and that is not green is road rather than terrain.
     """
     found = probabilities.copy()
     px_per_deg = 1 / max(1e-6, float(np.rad2deg(np.abs(np.diff(evidence.elevation_rad, axis=0)).max(initial=0))))

@@ -213,18 +213,6 @@ class Autoencoder(nn.Module):
         table[: len(palette.COLORS)] = torch.from_numpy(palette.COLORS.copy()).float()
         return (table.to(ids.device)[ids.clamp(0, 255)] / 127.5 - 1.0).movedim(-1, -3)
 
-    def encode_rgb(self, rgb: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Colour [..,3,H,W] in [0,1] -> scaled latent."""
-        return self.encode(rgb * 2 - 1, generator)
-
-    def encode_depth(self, depth_m: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Depth [..,1,H,W] metres -> scaled latent. The three channels being alike, it is one encoder pass."""
-        return self.encode(self.depth_image(depth_m), generator)
-
-    def encode_semantics(self, ids: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Train ids i64[..,H,W] -> scaled latent."""
-        return self.encode(self.semantic_image(ids), generator)
-
     def decode(self, latents: dict[Modality, Tensor], frames_at_once: int = 1) -> Decoded:
         """Pixels of scaled latents [..,4,h,w] of all modalities.
 

@@ -146,9 +146,7 @@ class ContextDropout:
 
 
 PAPER_DROPOUT = ContextDropout()
-"""The reference is missing in 20 % of the clips, as the paper says."""
-RELEASED_DROPOUT = ContextDropout(0.05, 0.05, 0.05)
-"""What the released training code does: each of the three in 5 % of the clips."""
+"""The reference is missing in 20 % of the clips, as the paper says; the released training code does each of the three in 5 %."""
 
 MODALITY_SHARES: dict[Modality, float] = {"rgb": 0.5, "semantics": 0.25, "depth": 0.25}
 """How often a training clip shows which modality."""
@@ -496,25 +494,3 @@ def _draw_modalities(count: int, generator: torch.Generator) -> list[Modality]:
     limits = torch.tensor(list(MODALITY_SHARES.values()), dtype=torch.float64).cumsum(0)[:-1]
     names = list(MODALITY_SHARES)
     return [names[int(place)] for place in torch.bucketize(u, limits, right=True)]
-
-
-def choose_trainable(
-    model: PublishedMDM, stage: Literal[1, 2], temporal: Literal["transformers", "all"] = "transformers"
-) -> list[nn.Parameter]:
-    """Switch gradients on for the parameters that a training stage moves, off for the rest; returns those that move.
-
-    Stage 1 (low resolution): the whole denoising network and the resampler. Stage 2 (high resolution): the same without the temporal
-    transformers of the blocks, which is what the published training did, or with `temporal = "all"` without any temporal layer,
-    which is what its text says. Autoencoder and image tower never move.
-    """
-    if stage not in (1, 2) or temporal not in ("transformers", "all"):
-        raise UsageError(
-            "unknown training stage", expected="stage 1 or 2, temporal transformers or all", got=f"{stage}, {temporal}"
-        )
-    model.requires_grad_(False)
-    model.net.requires_grad_(True)
-    model.image_tokens.requires_grad_(True)
-    if stage == 2:
-        for layer in temporal_layers(model.net, all_layers=temporal == "all"):
-            layer.requires_grad_(False)
-    return [p for p in model.parameters() if p.requires_grad]
