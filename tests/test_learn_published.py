@@ -18,7 +18,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import ConditionRules, build_condition
+from mudg.data.clips.condition import ConditionRules, build_conditions
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
@@ -213,7 +213,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     recorded = synthesize.recorded_images(log.scene, SynthesizeConfig(given_classes=False))
     views = [log.frame(name).view for name in window.frames]
     conditions = ConditionRules(48, 32, 72, 48, published=True)
-    wanted = build_condition(log.cloud, log.scene.tracks, views, recorded, conditions)
+    wanted = build_conditions(log.cloud, log.scene.tracks, views, recorded, conditions)[0]
     for name in ("color", "depth", "valid", "reference"):
         assert torch.equal(getattr(clip.condition, name), getattr(wanted, name)), name
     assert float((clip.condition.reference - clip.rgb[0]).abs().mean()) < 0.03  # frame 0's own image

@@ -3,7 +3,7 @@
 The only place where a pickle is opened, and only with torch's restricted unpickler: tensors and plain containers. Of the objects
 that training frameworks leave in their files a short list is replaced by an inert stand-in; anything else is refused.
 
-`RULES` is the complete map, as text: each row says how a published name is called here, both ways. `{i}` stands for a number.
+`RULES` is the complete map, as text: each row says how a published tensor is called here. `{i}` stands for a number.
 """
 
 from __future__ import annotations
@@ -169,16 +169,7 @@ def _index(rows: Iterable[tuple[str, str]]) -> _Index:
     return found
 
 
-_TO_CLEAN = _index(RULES)
 _TO_PUBLISHED = _index((clean, published) for published, clean in RULES)
-
-
-def clean_name(published: str) -> str | None:
-    """Our name of a published tensor; None if it has none (unused or unknown)."""
-    for pattern, clean in _TO_CLEAN.get(_place(published), ()):
-        if found := pattern.fullmatch(published):
-            return clean.format(**found.groupdict())
-    return None
 
 
 def published_names(clean: Iterable[str]) -> dict[str, str]:
@@ -280,17 +271,7 @@ def _unpickle(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except MemoryError:
         raise
-    except (
-        EOFError,
-        RuntimeError,
-        ValueError,
-        KeyError,
-        IndexError,
-        TypeError,
-        AttributeError,
-        OSError,
-        *_UNPICKLING,
-    ) as error:
+    except _UNREADABLE as error:
         text = str(error)
         refused = re.search(r"GLOBAL (\S+)", text)
         if refused is not None:
@@ -312,8 +293,10 @@ def out_of_memory(error: Exception) -> bool:
     return any(sign in str(error) for sign in ("DefaultCPUAllocator", "not enough memory", "Cannot allocate memory"))
 
 
-# torch raises the pickle module's error; named through torch, since this package imports no pickle
-_UNPICKLING: tuple[type[Exception], ...] = (torch.serialization.pickle.UnpicklingError,)  # type: ignore[attr-defined]
+_UNREADABLE: tuple[type[Exception], ...] = (
+    EOFError, RuntimeError, ValueError, KeyError, IndexError, TypeError, AttributeError, OSError,
+    torch.serialization.pickle.UnpicklingError,  # type: ignore[attr-defined]  # through torch: this package imports no pickle
+)  # fmt: skip
 
 
 def _named_tensors(content: Any) -> dict[str, Tensor]:
@@ -360,6 +343,15 @@ def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], wher
     read = {name: value for name, value in found.items() if name in known or name not in UNUSED}
     match_exactly(read, {published[ours]: shape for ours, shape in wanted.items()}, where, "the published model")
     return {ours: found[theirs] for ours, theirs in published.items()}
+
+
+def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
+    """InputError for the first tensor that does not hold finite floating-point numbers; ``where``: its file."""
+    for name, value in tensors.items():
+        if not value.is_floating_point():
+            raise InputError("a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype))
+        if not bool(torch.isfinite(value).all()):
+            raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
 
 
 def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str, network: str) -> None:

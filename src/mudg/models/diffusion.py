@@ -54,8 +54,7 @@ class SampleRequest:
 
     def sampler_settings(self) -> dict[str, Any]:
         """Settings of the sampler that were given; UsageError where there is no such sampler or it does not take them."""
-        given = {"eta": self.eta}
-        settings = {name: value for name, value in given.items() if value is not None}
+        settings = {} if self.eta is None else {"eta": self.eta}
         noise.check_sampler(self.sampler, settings)
         return settings
 

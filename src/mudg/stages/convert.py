@@ -41,12 +41,7 @@ LICENCE = (
 
 
 def run(
-    config: ConvertConfig,
-    checkpoint: Path,
-    to: Path,
-    *,
-    overwrite: bool = False,
-    network: PublishedConfig | None = None,
+    config: ConvertConfig, checkpoint: Path, to: Path, *, overwrite: bool = False, network: PublishedConfig | None = None
 ) -> Path:
     """Convert one checkpoint; returns `to`, which is complete or not there.
 
@@ -69,11 +64,10 @@ def run(
     if replaces and not _holds_model(to):
         raise UsageError("the folder holds something else than a model", where=str(to), remedy="choose another --to")
     place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
-    work, limit = (
-        _from_folder(config, checkpoint, place)
-        if checkpoint.is_dir()
-        else _from_file(config, checkpoint, place, network)
-    )
+    if checkpoint.is_dir():
+        work, limit = _from_folder(config, checkpoint, place)
+    else:
+        work, limit = _from_file(config, checkpoint, place, network)
     if replaces:
         replacement.begin()
     try:
@@ -107,9 +101,10 @@ def own_names(folder: Path) -> list[str]:
     return [name for name in (*files, "MODEL_CARD.md", "model.json") if name in there] if files else []
 
 
-def _from_file(
-    config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None
-) -> tuple[Callable[[], None], int]:
+Work = Callable[[], None]
+
+
+def _from_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None) -> tuple[Work, int]:
     """The conversion of a checkpoint, and the address space it may take."""
     if not checkpoint.is_file():
         raise InputError("no such checkpoint", where=str(checkpoint))
@@ -119,16 +114,14 @@ def _from_file(
     return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint, *towers)
 
 
-def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Callable[[], None], int]:
+def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, int]:
     """The conversion of DepthLab's files, and the address space it may take."""
     if config.resolution != "auto" or config.towers:
         raise UsageError("a folder is read as DepthLab, which has neither resolution nor towers", where=str(folder),
                          remedy="leave out --resolution and --towers, or name a checkpoint file")  # fmt: skip
     files = convert_depthlab.find(folder).files()
-    work = functools.partial(
-        convert_depthlab.convert_folder, folder, to, DTYPES[config.dtype], config.shard_mb << 20
-    )  # fmt: skip
-    return work, memory_limit(config, *files)
+    dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
+    return functools.partial(convert_depthlab.convert_folder, folder, to, dtype, shard_bytes), memory_limit(config, *files)
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
@@ -175,15 +168,8 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
         "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
     }  # fmt: skip
-    published_files.save(
-        to,
-        network,
-        tensors,
-        facts,
-        _card(network, facts),
-        dtype=DTYPES[config.dtype],
-        shard_bytes=config.shard_mb << 20,
-    )
+    dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
+    published_files.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=shard_bytes)
 
 
 def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
@@ -228,13 +214,7 @@ def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
 
 def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: Path) -> None:
     """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0, 1]."""
-    for name, value in tensors.items():
-        if not value.is_floating_point():
-            raise InputError(
-                "a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype)
-            )
-        if not bool(torch.isfinite(value).all()):
-            raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
+    weights.refuse_bad_values(tensors, str(where))
     scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
     if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
         raise InputError(

@@ -27,11 +27,8 @@ from mudg.models import folders
 from mudg.models.depth import depthlab, marigold
 from mudg.models.depth.depthlab import PARTS, UNETS
 
-PICKLES = {
-    "denoising_unet": "denoising_unet.pth",
-    "reference_unet": "reference_unet.pth",
-    "mapping_layer": "mapping_layer.pth",
-}
+PICKLES = {part: f"{part}.pth" for part in (*UNETS, "mapping_layer")}
+"""Part -> the published file that holds it."""
 LICENCE = (
     "Weights keep the terms of those who published them: DepthLab, Marigold (made from Stable Diffusion) and the CLIP image encoder. "
     "Read the pages they came from before any use."
@@ -82,11 +79,11 @@ def find(folder: Path) -> Sources:
             raise InputError("a published file is missing", where=str(pickles), expected=name)
     marigolds = ("MarigoldPipeline", "MarigoldDepthPipeline")
     base = _only(
-        folder, [place for place in places if _told(place / "model_index.json", "_class_name") in marigolds],
+        folder, [place for place in places if _setting(place / "model_index.json", "_class_name") in marigolds],
         "marigold-depth-v1-0, a folder of diffusers",
     )  # fmt: skip
     encoder = _only(
-        folder, [place for place in places if _told(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
+        folder, [place for place in places if _setting(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
         "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers",
     )  # fmt: skip
     return Sources(pickles, base, encoder)
@@ -102,7 +99,8 @@ def _only(folder: Path, found: list[Path], what: str) -> Path:
     return found[0]
 
 
-def _told(file: Path, key: str) -> object:
+def _setting(file: Path, key: str) -> object:
+    """A value of a folder's description, None where there is no such file."""
     return folders.read_settings(file).get(key) if file.is_file() else None
 
 
@@ -154,12 +152,7 @@ def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str
              "image_encoder": sources.encoder_file()}  # fmt: skip
     for part, network in depthlab.blank_parts(configs).items():
         weights.match_exactly(found[part], depthlab.shapes_of(network), str(files[part]), f"DepthLab's {part}")
-        for name, value in found[part].items():
-            where = f"{files[part]}: {name}"
-            if not value.is_floating_point():
-                raise InputError("a tensor does not hold floating-point numbers", where=where, got=str(value.dtype))
-            if not bool(torch.isfinite(value).all()):
-                raise InputError("a tensor holds values that are not finite", where=where)
+        weights.refuse_bad_values(found[part], str(files[part]))
     return found
 
 

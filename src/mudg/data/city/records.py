@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mudg.base import seeds
 
 COLUMNS: Final = 28
@@ -54,8 +51,3 @@ class Draws:
     def chance(self, probability: float) -> bool:
         """True with this probability."""
         return float(self.rng.random()) < probability
-
-
-def to_array(rows: list[list[float]]) -> NDArray[np.float64]:
-    """Rows to f64[N, 28]."""
-    return np.ascontiguousarray(np.array(rows, np.float64).reshape(-1, COLUMNS))

@@ -123,12 +123,12 @@ def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     if not ground.any():
         raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
     far_m, near_m = (float(np.quantile(given.filled[ground], share)) for share in (0.995, 0.005))
-    whole = np.where(ground, given.filled, np.float32(far_m)).clip(near_m, max(far_m, near_m * 1.01))
-    height, width = whole.shape
+    dense = np.where(ground, given.filled, np.float32(far_m)).clip(near_m, max(far_m, near_m * 1.01))
+    height, width = dense.shape
     scale = min(1.0, longest_px / max(height, width))
     size = (max(1, round(height * scale)), max(1, round(width * scale)))
     small = functional.interpolate(
-        torch.from_numpy(whole.astype(np.float32))[None, None], size=size, mode="nearest-exact"
+        torch.from_numpy(dense.astype(np.float32))[None, None], size=size, mode="nearest-exact"
     )
     if float(small.max() - small.min()) <= 0:
         small[..., 0, 0] *= 1.01  # the network divides by the range

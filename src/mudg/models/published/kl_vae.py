@@ -158,7 +158,6 @@ class Autoencoder(nn.Module):
         super().__init__()
         self.config = config
         self.factor = 2 ** (len(config.multipliers) - 1)
-        self.channels: dict[Modality, int] = dict.fromkeys(("rgb", "depth", "semantics"), config.latent_channels)
         self.encoder, self.decoder = Encoder(config), Decoder(config)
         self.to_moments = nn.Conv2d(2 * config.latent_channels, 2 * config.latent_channels, 1)
         self.from_latent = nn.Conv2d(config.latent_channels, config.latent_channels, 1)

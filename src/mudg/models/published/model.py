@@ -314,7 +314,7 @@ class PublishedMDM(nn.Module):
         planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
         return self.velocity_loss(
             truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
-            dropout=ContextDropout.of(settings.reference_dropout), known=known, first=part.first, whole=part.count,
+            dropout=ContextDropout.of(settings.reference_dropout), known=known, first=part.first, batch_clips=part.count,
         )  # fmt: skip
 
     forward = loss
@@ -333,34 +333,34 @@ class PublishedMDM(nn.Module):
         dropout: ContextDropout = PAPER_DROPOUT,
         known: Mapping[Modality, Tensor] | None = None,
         first: int = 0,
-        whole: int = 0,
+        batch_clips: int = 0,
     ) -> Losses:
         """Mean squared error of the velocity; every clip of the batch shows one modality, drawn by `MODALITY_SHARES`.
 
         truth       latents of `encode_truth`, each [B,T,4,h,w]
         generator   of all draws: modality, noise step, noise, which context is left out, dropout inside the network
         known       f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere
-        first, whole  these clips are number `first` and following of a batch of `whole` clips (0 = of just these); what is
+        first, batch_clips  these clips are number `first` and following of a batch of `batch_clips` clips (0 = of just these); what is
                     drawn for a clip does not depend on how that batch is divided
 
         Terms: one for each modality that any clip of the whole batch shows, so that all parts have the same; scaled so that the
         mean over equal parts is the mean over the clips that show it.
         """
-        batch = encoded.planes.shape[0]
-        whole, own = whole or batch, slice(first, first + batch)
-        t = noise.stratified_steps(whole, len(self.schedule), generator)[own].to(self.device)
-        shown = _draw_modalities(whole, generator)
-        names = shown[own]
+        count = encoded.planes.shape[0]
+        batch_clips, own = batch_clips or count, slice(first, first + count)
+        t = noise.stratified_steps(batch_clips, len(self.schedule), generator)[own].to(self.device)
+        drawn = _draw_modalities(batch_clips, generator)
+        names = drawn[own]
         x0 = torch.stack([truth[m][n] for n, m in enumerate(names)])
         seed, shape = generator.initial_seed(), (1, *x0.shape[1:])
-        draws = [noise.video_noise(shape, seeds.torch_generator(seed, first + n, "noise")) for n in range(batch)]
+        draws = [noise.video_noise(shape, seeds.torch_generator(seed, first + n, "noise")) for n in range(count)]
         eps = torch.cat(draws).to(self.device)
-        u = torch.rand(whole, generator=generator)[own].to(self.device)
+        u = torch.rand(batch_clips, generator=generator)[own].to(self.device)
         no_text = u < dropout.text + dropout.both
         no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
         text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
         features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
-        self._seed_dropout(seed, range(first, first + batch))
+        self._seed_dropout(seed, range(first, first + count))
         stated = self.predict(
             self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
         )
@@ -369,8 +369,8 @@ class PublishedMDM(nn.Module):
             everywhere = torch.ones_like(x0[0, :, :1])
             squares = squares * torch.stack([known[m][n] if m in known else everywhere for n, m in enumerate(names)])
         errors = squares.flatten(1).mean(1)
-        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in shown}
-        return Losses(errors.mean(), {m: total * whole / (batch * shown.count(m)) for m, total in sums.items()})
+        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in drawn}
+        return Losses(errors.mean(), {m: total * batch_clips / (count * drawn.count(m)) for m, total in sums.items()})
 
     def _seed_dropout(self, seed: int, clips: range) -> None:
         layers = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]

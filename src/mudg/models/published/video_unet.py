@@ -327,11 +327,6 @@ class VideoUNet(nn.Module):
         self.norm = nn.GroupNorm(GROUPS, inside)
         self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))
 
-    @property
-    def multiple(self) -> int:
-        """Latent sides must be multiples of this."""
-        return 2 ** (len(self.config.multipliers) - 1)
-
     def forward(self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor) -> Tensor:
         """One denoiser pass.
 

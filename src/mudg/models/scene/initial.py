@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 SH_C0: Final = 0.28209479177387814
@@ -29,8 +30,6 @@ def voxel_filter(xyz: NDArray[np.float32], size_m: NDArray[np.floating] | float)
 
 def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest_m: float = 1.5) -> NDArray[np.float32]:
     """Root mean square distance to the three nearest other points, f32[N] metres, kept within bounds."""
-    from scipy.spatial import cKDTree
-
     if len(xyz) < 4:
         return np.full(len(xyz), 0.1, np.float32)
     distance, _ = cKDTree(xyz).query(xyz, k=4, workers=1)

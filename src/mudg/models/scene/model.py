@@ -95,9 +95,8 @@ class SceneModel:
         owner = renumber[self.table.labels["node"].long()]
         rows = (owner >= 0).nonzero()[:, 0]
         table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]})
-        return SceneModel(
-            table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts)
-        )
+        nodes = tuple(self.nodes[i] for i in kept)
+        return SceneModel(table, nodes, self.sky, self.classes, self.sh_degree, dict(self.facts))
 
     # -- state ------------------------------------------------------------------------------------------------------
 
@@ -135,9 +134,7 @@ class SceneModel:
         table = Table.from_state(groups["gaussians"])
         owner = table.labels["node"]
         if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
-            raise InputError(
-                "a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}"
-            )
+            raise InputError("a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}")
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
@@ -153,8 +150,8 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
         semantics: add the class logits as ``extra`` channels.
     """
     table, counts = model.table, model.counts()
-    whole = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
-    blocks = zip(*(column.split(counts) for column in (whole.means, whole.quats, whole.opacity, whole.sh_dc)))
+    all_rows = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
+    blocks = zip(*(column.split(counts) for column in (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)))
     own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
     given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
     found = []
@@ -166,7 +163,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
         """One column of all nodes; a column that no node changed is passed on without a copy."""
         parts = [getattr(rows, name) for rows in found]
         changed = any(part is not getattr(rows, name) for part, rows in zip(parts, given))
-        return torch.cat(parts) if changed else getattr(whole, name)
+        return torch.cat(parts) if changed else getattr(all_rows, name)
 
     return Gaussians(
         means=column("means"),
@@ -190,11 +187,9 @@ def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
 
     The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
     """
-    return (
-        None
-        if ID["sky"] not in model.classes
-        else (model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0]))
-    )
+    if ID["sky"] not in model.classes:
+        return None
+    return model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0])
 
 
 def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
