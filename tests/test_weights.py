@@ -348,5 +348,5 @@ def test_altered_model_folders_are_refused(tmp_path, whole):
     values = json.loads(description.read_text())
     values["config"]["net"]["colour"] = 1
     description.write_text(json.dumps(values))
-    with pytest.raises(InputError, match="unknown colour"):
+    with pytest.raises(InputError, match="unknown field 'colour'"):
         published_files.load(tmp_path / "out")

@@ -126,12 +126,15 @@ def parse_dataclass(kind: type[Value], values: object, where: str) -> Value:
 
 
 def _compare_fields(stated: Any, complete: Mapping[str, Any], where: str) -> None:
-    for name in (*complete, *stated):
-        if name not in stated or name not in complete:
-            state = "missing" if name in complete else "unknown"
-            raise InputError(f"the field {name!r} is {state}", where=place(where), expected=", ".join(complete), got=", ".join(stated))
-        if isinstance(complete[name], Mapping):
-            _compare_fields(stated[name], complete[name], place(where, name))
+    try:
+        refuse_unknown(stated, complete)
+    except InputError as problem:
+        raise problem.located(place(where)) from problem
+    for name, value in complete.items():
+        if name not in stated:
+            raise InputError(f"the field {name!r} is missing", where=place(where), got=", ".join(stated) or "an empty object")
+        if isinstance(value, Mapping):
+            _compare_fields(stated[name], value, place(where, name))
 
 
 def first_problem(error: ValidationError, where: str, error_type: type[ErrorType] = InputError) -> ErrorType:

@@ -256,10 +256,9 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     content = _unpickle(path)
     found = _named_tensors(content)
     if not found:
-        raise InputError(
-            "the file holds no named tensors", where=str(path), expected="state_dict, module, or names with tensors",
-            got=", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__,
-        )  # fmt: skip
+        raise InputError("the file holds no named tensors", where=str(path),
+            expected="state_dict, module, or names with tensors",
+            got=", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__)  # fmt: skip
     return _without_prefix(found)
 
 
@@ -278,14 +277,13 @@ def _unpickle(path: Path) -> Any:
             raise InputError(
                 "the checkpoint holds an object that is neither a tensor nor known to be harmless; it was not loaded",
                 where=str(path), expected="tensors, numbers, text and plain containers", got=refused.group(1),
-                remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors",
-            ) from error  # fmt: skip
+                remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors") from error  # fmt: skip
         if out_of_memory(error):
             raise MemoryError(text) from error
-        raise InputError(
-            "not a readable checkpoint", where=str(path), expected="a complete file written by torch.save, or safetensors",
-            got=text.splitlines()[0][:200] if text else type(error).__name__, remedy="fetch the file again and compare its size",
-        ) from error  # fmt: skip
+        raise InputError("not a readable checkpoint", where=str(path),
+            expected="a complete file written by torch.save, or safetensors",
+            got=text.splitlines()[0][:200] if text else type(error).__name__,
+            remedy="fetch the file again and compare its size") from error  # fmt: skip
 
 
 def out_of_memory(error: Exception) -> bool:
@@ -373,8 +371,6 @@ def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int
             for kind, names in (("missing", missing), ("unexpected", unexpected), ("of another shape", misshaped))
             if names
         ]
-        raise InputError(
-            "the checkpoint is not the network it should be", where=where,
+        raise InputError("the checkpoint is not the network it should be", where=where,
             expected=f"{len(wanted)} tensors of {network}", got="; ".join(lines),
-            remedy="check that the file is complete and of the right kind",
-        )  # fmt: skip
+            remedy="check that the file is complete and of the right kind")  # fmt: skip

@@ -80,7 +80,7 @@ def check_image_size(height: int, width: int, multiple: int) -> None:
     """UsageError unless both sides are positive multiples of `multiple` pixels, as the network's strides need."""
     if height % multiple or width % multiple or min(height, width) < multiple:
         raise UsageError("image size does not fit the diffusion model", expected=f"multiples of {multiple} pixels",
-                         got=f"{width}x{height}")  # fmt: skip
+            got=f"{width}x{height}")  # fmt: skip
 
 
 def sized_to_width(width_px: int, aspect: float, multiple: int) -> tuple[int, int]:

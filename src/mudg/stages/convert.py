@@ -118,7 +118,7 @@ def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, i
     """The conversion of DepthLab's files, and the address space it may take."""
     if config.resolution != "auto" or config.towers:
         raise UsageError("a folder is read as DepthLab, which has neither resolution nor towers", where=str(folder),
-                         remedy="leave out --resolution and --towers, or name a checkpoint file")  # fmt: skip
+            remedy="leave out --resolution and --towers, or name a checkpoint file")  # fmt: skip
     files = convert_depthlab.find(folder).files()
     dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
     return functools.partial(convert_depthlab.convert_folder, folder, to, dtype, shard_bytes), memory_limit(config, *files)
@@ -133,10 +133,8 @@ def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
         for mark, size in (("1024", (576, 1024)), ("512", (320, 512))):
             if mark in part:
                 return size
-    raise UsageError(
-        "the file's name does not tell which resolution the model was trained at", where=str(checkpoint), expected="512 or 1024 in it",
-        remedy="add --resolution 320x512 or --resolution 576x1024",
-    )  # fmt: skip
+    raise UsageError("the file's name does not tell which resolution the model was trained at", where=str(checkpoint),
+        expected="512 or 1024 in it", remedy="add --resolution 320x512 or --resolution 576x1024")  # fmt: skip
 
 
 def memory_limit(config: ConvertConfig, *files: Path) -> int:
@@ -176,12 +174,11 @@ def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
     """InputError for DynamiCrafter-256, which looks alike and is another model."""
     marks = [name for name in found if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
     if marks:
-        raise InputError(
-            "this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where), got=", ".join(marks[:3]),
+        raise InputError("this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where),
+            got=", ".join(marks[:3]),
             expected="MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule that never "
             "reaches pure noise and no dynamic rescale, and weighs its image attention by learnt factors",
-            remedy="take the 512 or 1024 checkpoint",
-        )  # fmt: skip
+            remedy="take the 512 or 1024 checkpoint")  # fmt: skip
 
 
 def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
@@ -217,15 +214,12 @@ def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], wh
     weights.refuse_bad_values(tensors, str(where))
     scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
     if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
-        raise InputError(
-            "the table of the dynamic rescale is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
-            got=f"{float(scale.min())} .. {float(scale.max())}",
-        )  # fmt: skip
+        raise InputError("the table of the dynamic rescale is out of range", where=f"{where}: scale_arr",
+            expected="0 < value <= 1", got=f"{float(scale.min())} .. {float(scale.max())}")  # fmt: skip
     if alpha_bar is not None and abs(float(alpha_bar.flatten()[-1])) > 1e-6:
-        raise InputError(
-            "the checkpoint's noise schedule keeps signal at its last step", where=f"{where}: alphas_cumprod[-1]", expected="0",
-            got=str(float(alpha_bar.flatten()[-1])), remedy="this is another model, though its tensors have the same names",
-        )  # fmt: skip
+        raise InputError("the checkpoint's noise schedule keeps signal at its last step",
+            where=f"{where}: alphas_cumprod[-1]", expected="0", got=str(float(alpha_bar.flatten()[-1])),
+            remedy="this is another model, though its tensors have the same names")  # fmt: skip
 
 
 @torch.no_grad()
@@ -234,7 +228,7 @@ def embed_captions(network: PublishedConfig, tower_weights: Mapping[str, Tensor]
     with torch.device("meta"):
         tower = TextTower(network.text, network.vocabulary)
     tower.load_state_dict({n: t if n == "tokens.weight" else t.float() for n, t in tower_weights.items()}, assign=True)
-    ids = torch.stack([clip.caption_tokens(clip.CAPTION), clip.caption_tokens("")])
+    ids = torch.stack([clip.padded_tokens(clip.CAPTION_IDS), clip.padded_tokens(clip.EMPTY_IDS)])
     tower.tokens = torch.nn.Embedding.from_pretrained(tower.tokens.weight[ids.flatten()].float())
     return tower.eval()(torch.arange(ids.numel()).view_as(ids)).float()
 

@@ -58,9 +58,8 @@ class Sources:
         for name in _ENCODER_FILES:
             if (self.encoder / name).is_file():
                 return self.encoder / name
-        raise InputError(
-            "the image encoder has no weight file", where=str(self.encoder), expected=" or ".join(_ENCODER_FILES)
-        )
+        raise InputError("the image encoder has no weight file", where=str(self.encoder),
+            expected=" or ".join(_ENCODER_FILES))  # fmt: skip
 
 
 def find(folder: Path) -> Sources:
@@ -91,11 +90,10 @@ def find(folder: Path) -> Sources:
 
 def _only(folder: Path, found: list[Path], what: str) -> Path:
     if len(found) != 1:
-        raise InputError(
-            "a part of DepthLab is missing" if not found else "a part of DepthLab is there more than once", where=str(folder),
-            expected=f"one folder with {what}", got=", ".join(place.name for place in found) or "none",
-            remedy="lay the three folders side by side, as DepthLab's page says, and give the folder around them",
-        )  # fmt: skip
+        raise InputError("a part of DepthLab is missing" if not found else "a part of DepthLab is there more than once",
+            where=str(folder), expected=f"one folder with {what}",
+            got=", ".join(place.name for place in found) or "none",
+            remedy="lay the three folders side by side, as DepthLab's page says, and give the folder around them")  # fmt: skip
     return found[0]
 
 
@@ -122,14 +120,14 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
         vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError("the image encoder is not described", where=str(sources.encoder / "config.json"),
-                         got=str(error)[:300]) from error  # fmt: skip
+            got=str(error)[:300]) from error  # fmt: skip
     file = sources.base / marigold.SCHEDULE_FILE
     schedule = folders.read_settings(file)
     marigold.ddim_scheduler(schedule, str(file))
     if schedule.get("rescale_betas_zero_snr"):
-        raise InputError("this is the noise schedule of a later Marigold", where=str(file), got="rescale_betas_zero_snr: true",
-                         expected="that of marigold-depth-v1-0, which DepthLab was made from",
-                         remedy="take marigold-depth-v1-0")  # fmt: skip
+        raise InputError("this is the noise schedule of a later Marigold", where=str(file),
+            got="rescale_betas_zero_snr: true", expected="that of marigold-depth-v1-0, which DepthLab was made from",
+            remedy="take marigold-depth-v1-0")  # fmt: skip
     return depthlab.part_configs(unet, vae, vision_config), schedule
 
 

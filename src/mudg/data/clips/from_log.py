@@ -108,8 +108,8 @@ def log_source(text: str) -> LogSource:
         labelled = run / "annotate"
         found = LogSource(labelled if (labelled / "scene.json").is_file() else run / "scene", run / "fuse")
     if not (found.fused / "fuse.json").is_file() or not found.scene.exists():
-        raise InputError("no scene with a fused cloud here", where=text, expected="SCENE=FUSED, or an output folder of mudg run",
-                         remedy="make the cloud with `mudg fuse`")  # fmt: skip
+        raise InputError("no scene with a fused cloud here", where=text,
+            expected="SCENE=FUSED, or an output folder of mudg run", remedy="make the cloud with `mudg fuse`")  # fmt: skip
     return found
 
 
@@ -329,7 +329,7 @@ def claim_folder(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]
         found = store.read_json(path)
         if found != wanted:
             raise UsageError("the folder holds training clips of other logs or settings", where=str(folder),
-                             got="; ".join(differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
+                got="; ".join(differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
         return
     if folder.is_dir() and any(folder.glob("*.safetensors")):
         raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --data.clips")

@@ -99,7 +99,7 @@ def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
         return safe_open(str(path), "numpy")
     except (SafetensorError, OSError) as error:
         raise InputError("a shard of training clips is missing or damaged", where=str(path), got=str(error),
-                         remedy="delete it; it is made again") from error  # fmt: skip
+            remedy="delete it; it is made again") from error  # fmt: skip
 
 
 _PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "backdrop", "ids", "backdrop_ids", "world_from_cam",

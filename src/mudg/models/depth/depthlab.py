@@ -37,8 +37,9 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
 from mudg.models import folders
 from mudg.models.depth.inputs import PLAIN, DepthInput, DepthOptions, Prediction
-from mudg.models.depth.marigold import ddim_scheduler
+from mudg.models.depth.marigold import check_steps, ddim_scheduler, working_size
 from mudg.models.folders import CPU, Place
+from mudg.models.published import clip
 
 KIND: Final = "depthlab"
 SCHEMA: Final = 1
@@ -51,7 +52,6 @@ _VISION: Final = (
     "hidden_size", "intermediate_size", "projection_dim", "num_hidden_layers", "num_attention_heads", "num_channels", "image_size",
     "patch_size", "hidden_act", "layer_norm_eps",
 )  # fmt: skip
-_CLIP_MEAN, _CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -72,8 +72,8 @@ class DepthLabSampling:
 
     def __post_init__(self) -> None:
         if int(self.steps * self.strength) < 1:
-            raise UsageError("too few denoising steps: none is left of them", where="--depth-steps", got=str(self.steps),
-                             expected=f"at least {int(np.ceil(1 / self.strength))}")  # fmt: skip
+            raise UsageError("too few denoising steps: none is left of them", where="--depth-steps",
+                got=str(self.steps), expected=f"at least {int(np.ceil(1 / self.strength))}")  # fmt: skip
 
 
 PUBLISHED_SAMPLING: Final = DepthLabSampling()
@@ -98,7 +98,7 @@ def part_configs(
         raise InputError("a network's description lacks a number", where="DepthLab", expected=str(error)) from error
     if abs(float(vae.get("scaling_factor", LATENT_SCALE)) - LATENT_SCALE) > 1e-9:
         raise InputError("the autoencoder scales its latents otherwise than DepthLab does", where="vae: scaling_factor",
-                         expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))  # fmt: skip
+            expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))  # fmt: skip
     return {
         "denoising_unet": {**plain, "in_channels": 3 * latent},
         "reference_unet": {**plain, "in_channels": latent},
@@ -133,9 +133,8 @@ def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module
             network_class = folders.member(transformers, "CLIPVisionModelWithProjection")
             made[name] = network_class(vision(**configs[name]))
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise InputError(
-            "a network cannot be made as it is described", where=f"DepthLab: {name}", got=str(error)[:300]
-        ) from error
+        raise InputError("a network cannot be made as it is described", where=f"DepthLab: {name}",
+            got=str(error)[:300]) from error  # fmt: skip
     reference: Any = made["reference_unet"]
     reference.conv_norm_out, reference.conv_out = None, nn.Identity()
     return made
@@ -172,7 +171,7 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
         schedule = dict(described["scheduler"])
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError("the description of a DepthLab model is not whole", where=str(where), got=repr(error)[:200],
-                         remedy="convert the published files again") from error  # fmt: skip
+            remedy="convert the published files again") from error  # fmt: skip
     made = blank_parts(configs)
     for name, network in made.items():
         state = shards.read_shards(folder / name, files[name], remedy="convert the published files again")
@@ -233,7 +232,7 @@ def share_features(reference_unet: Any, denoising_unet: Any) -> None:
     )
     if set(writers) != set(readers) or not writers:
         raise InputError("the two U-Nets differ in their self-attentions", where="DepthLab",
-                         got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all")  # fmt: skip
+            got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all")  # fmt: skip
     for name, writer in writers.items():
         source = _SharedAttention(writer.processor)
         writer.set_processor(source)
@@ -273,9 +272,7 @@ def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: i
     Raises:
         InputError: no depth is known.
     """
-    height, width = given.rgb.shape[:2]
-    longest = max(height, width)
-    size = (max(1, height * sampling.processing_px // longest), max(1, width * sampling.processing_px // longest))
+    size = working_size(given.rgb, sampling.processing_px)
     depth = known_depth(np.where(given.sky, np.float32(np.nan), given.measured), size)
     known = np.isfinite(depth)
     if not known.any():
@@ -323,9 +320,7 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
     high, wide = height * side_px // shorter, width * side_px // shorter
     scaled = resize_bicubic(rgb, wide, high)
     top, left = (high - side_px) // 2, (wide - side_px) // 2
-    cut = torch.from_numpy(scaled[top : top + side_px, left : left + side_px]).permute(2, 0, 1)[None].float() / 255
-    mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (_CLIP_MEAN, _CLIP_DEVIATION))
-    return (cut - mean) / deviation
+    return folders.normalized(scaled[top : top + side_px, left : left + side_px], clip.MEAN, clip.DEVIATION)
 
 
 # --- denoising --------------------------------------------------------------------------------------------------------
@@ -336,9 +331,7 @@ class DepthLab:
 
     def __init__(self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, place: Place = CPU) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
-        most = int(parts.scheduler.config.num_train_timesteps)
-        if sampling.steps > most:
-            raise UsageError("too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(sampling.steps))
+        check_steps(parts.scheduler, sampling.steps)
         self._parts, self._sampling, self._place = parts, sampling, place
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
         share_features(parts.reference_unet, parts.denoising_unet)
@@ -354,9 +347,9 @@ class DepthLab:
         file = Path(folder) / DESCRIPTION
         described = folders.read_settings(file)
         if described.get("kind") != KIND or described.get("schema") != SCHEMA:
-            raise InputError("not a DepthLab model of this version", where=str(file), expected=f"kind {KIND}, schema {SCHEMA}",
-                             got=f"{described.get('kind')}, {described.get('schema')}",
-                             remedy="convert the published files again")  # fmt: skip
+            raise InputError("not a DepthLab model of this version", where=str(file),
+                expected=f"kind {KIND}, schema {SCHEMA}", got=f"{described.get('kind')}, {described.get('schema')}",
+                remedy="convert the published files again")  # fmt: skip
         sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
         sampling = dataclasses.replace(sampling, steps=options.steps or sampling.steps)
         return cls(read_parts(Path(folder), described, place), sampling, place)
@@ -371,8 +364,7 @@ class DepthLab:
         shape = (1, self._parts.vae.config.latent_channels, *(side // self._cell for side in made.image.shape[2:]))
         noise = torch.randn(shape, generator=seeds.torch_generator(0, 0, "depthlab"))
         found = self.predict(made, noise) * (made.high_m - made.low_m) + made.low_m
-        found = functional.interpolate(found, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
-        return Prediction(found[0, 0].clamp(min=0).cpu().numpy(), "depth")
+        return Prediction.resized(found, given, "depth", least=0)
 
     def predict(self, made: Prepared, noise: Tensor) -> Tensor:
         """Depth f32[1, 1, h, w], 0..1 between the least and the greatest known (others go beyond), from noise [1, C, H, W] in cells."""

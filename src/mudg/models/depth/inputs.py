@@ -8,6 +8,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
 
 from mudg.core.align import Space
 
@@ -35,6 +37,12 @@ class Prediction:
 
     values: NDArray[np.float32]
     space: Space
+
+    @classmethod
+    def resized(cls, values: Tensor, given: DepthInput, space: Space, least: float | None = None) -> Prediction:
+        """From a network's values f32[1, 1, h, w], at the size of the image and at least ``least``."""
+        found = functional.interpolate(values, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
+        return cls((found if least is None else found.clamp(min=least))[0, 0].cpu().numpy(), space)
 
 
 @dataclass(frozen=True, slots=True)

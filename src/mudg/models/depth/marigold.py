@@ -71,9 +71,7 @@ class Marigold:
         longest_px: int = PROCESSING_PX, place: Place = CPU,
     ) -> None:  # fmt: skip
         """``longest_px``: longest side at which the networks work. Raises: UsageError: more steps than the noise schedule has."""
-        most = int(parts.scheduler.config.num_train_timesteps)
-        if steps > most:
-            raise UsageError("too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(steps))
+        check_steps(parts.scheduler, steps)
         self._parts, self._space, self._steps, self._guided = parts, space, steps, guided
         self._longest_px, self._place = longest_px, place
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
@@ -113,15 +111,12 @@ class Marigold:
         found = self.predict(
             image, size, noise, _returns(given, self._space, self._place.device) if self._guided else None
         )
-        found = functional.interpolate(found, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
-        return Prediction(found[0, 0].cpu().numpy(), self._space)
+        return Prediction.resized(found, given, self._space)
 
     def _prepared(self, rgb: NDArray[np.uint8]) -> tuple[Tensor, tuple[int, int]]:
         """Image u8[H, W, 3] -> f32[1, 3, h, w] in -1..1 with the last row and column repeated to whole cells; and its unpadded size."""
         image = torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
-        height, width = rgb.shape[:2]
-        longest = max(height, width)
-        size = (max(1, height * self._longest_px // longest), max(1, width * self._longest_px // longest))
+        size = working_size(rgb, self._longest_px)
         image = functional.interpolate(image, size=size, mode="bilinear", antialias=True)
         fill = (0, -size[1] % self._cell, 0, -size[0] % self._cell)
         return functional.pad(image, fill, mode="replicate").to(self._place.device), size
@@ -226,6 +221,19 @@ def _returns(given: DepthInput, space: Space, device: str) -> _Returns | None:
     )
 
 
+def working_size(rgb: NDArray[np.uint8], longest_px: int) -> tuple[int, int]:
+    """Height and width of an image u8[H, W, 3] whose longest side gets ``longest_px`` pixels."""
+    height, width = rgb.shape[:2]
+    return max(1, height * longest_px // max(height, width)), max(1, width * longest_px // max(height, width))
+
+
+def check_steps(scheduler: Any, steps: int) -> None:
+    """UsageError for more denoising steps than the noise schedule has."""
+    most = int(scheduler.config.num_train_timesteps)
+    if steps > most:
+        raise UsageError("too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(steps))
+
+
 def ddim_scheduler(settings: Mapping[str, Any], where: str) -> Any:
     """The DDIM scheduler of diffusers with the settings of a folder.
 
@@ -235,7 +243,7 @@ def ddim_scheduler(settings: Mapping[str, Any], where: str) -> Any:
     kind, prediction = settings.get("_class_name"), settings.get("prediction_type", "epsilon")
     if kind != "DDIMScheduler" or prediction not in _PREDICTIONS:
         raise InputError("the folder's noise schedule is of another kind", where=where, got=f"{kind}, {prediction}",
-                         expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}")  # fmt: skip
+            expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}")  # fmt: skip
     scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
     return scheduler_class.from_config({name: value for name, value in settings.items() if not name.startswith("_")})
 

@@ -38,7 +38,6 @@ from mudg.models.folders import CPU, Place
 
 CUE_PX: Final = 256
 """Longest side of the small depth map that PromptDepthAnything is given (its training had 256x192)."""
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _ERROR_SCALE: Final = 0.05
 _SKY_CONFIDENCE: Final = 0.8
 
@@ -67,8 +66,8 @@ class Preparation:
             size = {"height": size, "width": size}
         return cls(
             int(size.get("height", side_px)), int(size.get("width", side_px)), int(settings.get("ensure_multiple_of") or multiple),
-            bool(settings.get("keep_aspect_ratio", True)), tuple(settings.get("image_mean") or _MEAN),
-            tuple(settings.get("image_std") or _DEVIATION),
+            bool(settings.get("keep_aspect_ratio", True)), tuple(settings.get("image_mean") or folders.MEAN),
+            tuple(settings.get("image_std") or folders.DEVIATION),
         )  # fmt: skip
 
     def size_for(self, height: int, width: int) -> tuple[int, int]:
@@ -84,10 +83,7 @@ class Preparation:
     def pixels(self, rgb: NDArray[np.uint8]) -> Tensor:
         """Image u8[H, W, 3] -> f32[1, 3, h, w] as the network wants it."""
         height, width = self.size_for(*rgb.shape[:2])
-        scaled = resize_bicubic(rgb, width, height)
-        image = torch.from_numpy(scaled).permute(2, 0, 1)[None].float() / 255
-        mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (self.mean, self.deviation))
-        return (image - mean) / deviation
+        return folders.normalized(resize_bicubic(rgb, width, height), self.mean, self.deviation)
 
 
 class TransformersDepth:
@@ -106,9 +102,7 @@ class TransformersDepth:
             inputs["prompt_depth"] = lidar_cue(given)
         with torch.inference_mode(), self._place.autocast():
             output = self._network(**{name: value.to(self._place.device) for name, value in inputs.items()})
-        found = output.predicted_depth.float()[:, None]
-        found = functional.interpolate(found, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
-        return Prediction(found[0, 0].cpu().numpy(), self._space)
+        return Prediction.resized(output.predicted_depth.float()[:, None], given, self._space)
 
 
 def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
@@ -171,13 +165,11 @@ def kind_of(folder: str | Path) -> str:
             kind = str(folders.read_settings(path / name).get(key))
             if kind not in KINDS:
                 raise InputError("the folder holds another kind of network", where=str(path / name),
-                                 expected=", ".join(KINDS), got=kind)  # fmt: skip
+                    expected=", ".join(KINDS), got=kind)  # fmt: skip
             return kind
-    raise ResourceError(
-        "the depth network's weights are missing", where=str(folder) or "--depth-network",
+    raise ResourceError("the depth network's weights are missing", where=str(folder) or "--depth-network",
         expected="a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)",
-        remedy="give the folder of such a network as --depth-network, or leave the flag out",
-    )  # fmt: skip
+        remedy="give the folder of such a network as --depth-network, or leave the flag out")  # fmt: skip
 
 
 def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
@@ -209,7 +201,7 @@ def align_to_lidar(prediction: Prediction, given: DepthInput, rules: CompletionR
     """
     if prediction.values.shape != given.measured.shape:
         raise InputError("a network's depth and its image differ in size", where="depth network",
-                         expected=str(given.measured.shape), got=str(prediction.values.shape))  # fmt: skip
+            expected=str(given.measured.shape), got=str(prediction.values.shape))  # fmt: skip
     known = np.isfinite(given.measured) & ~given.sky
     values, measured = prediction.values[known], given.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)

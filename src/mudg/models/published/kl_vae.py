@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import palette
-from mudg.base.errors import UsageError
 from mudg.models.mdm.codec import Decoded, Modality
 
 GROUPS = 32
@@ -192,8 +191,6 @@ class Autoencoder(nn.Module):
 
     def decode_image(self, z: Tensor, frames_at_once: int = 1) -> Tensor:
         """Images f32[..,3,H,W], about [-1,1], of scaled latents [..,4,H/8,W/8], a few frames at a time."""
-        if frames_at_once < 1:
-            raise UsageError("decoding needs at least one frame at a time", got=str(frames_at_once))
         lead = z.shape[:-3]
         flat = (z.reshape(-1, *z.shape[-3:]) / LATENT_SCALE).to(self.dtype)
         image = torch.cat([self.decoder(self.from_latent(part)).float() for part in flat.split(frames_at_once)])

@@ -40,7 +40,13 @@ from mudg.models.mdm.model import BatchPart, Losses, LossSettings
 from mudg.models.published.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, ImageTower, TowerConfig
 from mudg.models.published.kl_vae import Autoencoder, AutoencoderConfig
 from mudg.models.published.resampler import Resampler, ResamplerConfig
-from mudg.models.published.video_unet import SeededDropout, VideoUNet, VideoUNetConfig, temporal_layers
+from mudg.models.published.video_unet import (
+    SeededDropout,
+    TemporalConv,
+    TemporalTransformer,
+    VideoUNet,
+    VideoUNetConfig,
+)
 
 LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
 """Modality labels of the published checkpoints; fed through a sinusoid like a time step."""
@@ -77,23 +83,18 @@ class PublishedConfig:
 
     def __post_init__(self) -> None:
         if self.text.width != self.net.context_width or self.image_tokens.context_width != self.net.context_width:
-            raise UsageError(
-                "caption and image tokens must have the width of the network's context", expected=str(self.net.context_width),
-                got=f"{self.text.width}, {self.image_tokens.context_width}",
-            )  # fmt: skip
+            raise UsageError("caption and image tokens must have the width of the network's context",
+                expected=str(self.net.context_width), got=f"{self.text.width}, {self.image_tokens.context_width}")  # fmt: skip
         if self.image.width != self.image_tokens.image_width:
-            raise UsageError(
-                "image tower and resampler differ in width", got=f"{self.image.width}, {self.image_tokens.image_width}"
-            )
+            raise UsageError("image tower and resampler differ in width",
+                got=f"{self.image.width}, {self.image_tokens.image_width}")  # fmt: skip
         if (
             self.net.channels_in != 3 * self.codec.latent_channels
             or self.net.channels_out != self.codec.latent_channels
         ):
-            raise UsageError(
-                "the network must take three latents (noisy, colour, depth) and give one",
+            raise UsageError("the network must take three latents (noisy, colour, depth) and give one",
                 expected=f"{3 * self.codec.latent_channels} -> {self.codec.latent_channels}",
-                got=f"{self.net.channels_in} -> {self.net.channels_out}",
-            )  # fmt: skip
+                got=f"{self.net.channels_in} -> {self.net.channels_out}")  # fmt: skip
 
     @property
     def window(self) -> int:
@@ -207,8 +208,7 @@ class PublishedMDM(nn.Module):
             raise UsageError(
                 "a clip of the published model has a fixed number of frames: its image tokens belong to one frame each",
                 where="PublishedMDM", expected=f"{self.config.window} frames", got=f"{frames}",
-                remedy=f"use trajectories of at least {self.config.window} frames; they are made in windows of that length",
-            )  # fmt: skip
+                remedy=f"use trajectories of at least {self.config.window} frames; they are made in windows of that length")  # fmt: skip
 
     def encode_condition(
         self,
@@ -218,9 +218,10 @@ class PublishedMDM(nn.Module):
     ) -> PublishedLatents:
         """Latents of the conditions of clips of one shape, and image features of their references (see `PublishedLatents`).
 
-        generator   noise of the autoencoder's posterior; needed unless the configuration asks for its mean
-        known       colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
-                    colour there (of every clip), frame 0 excepted
+        Args:
+            generator: noise of the autoencoder's posterior; needed unless the configuration names its mean.
+            known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
+                colour there (of every clip), frame 0 excepted.
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
         color, depth, valid, reference = (
@@ -264,11 +265,8 @@ class PublishedMDM(nn.Module):
         if self.config.codec.posterior == "mean":
             return None
         if generator is None:
-            raise UsageError(
-                "encoding draws from the posterior and needs a generator",
-                where="PublishedMDM",
-                remedy='or use posterior = "mean"',
-            )
+            raise UsageError("encoding draws from the posterior and needs a generator", where="PublishedMDM",
+                remedy='or use posterior = "mean"')  # fmt: skip
         return generator
 
     # network ----------------------------------------------------------------------------------------------------------
@@ -297,11 +295,9 @@ class PublishedMDM(nn.Module):
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
-                    raise InputError(
-                        "the training clips show warped images in their condition", where=f"step {part.step}",
-                        expected="points alone, as the published-type model is given",
-                        remedy="give another folder of clips; they are made anew",
-                    )  # fmt: skip
+                    raise InputError("the training clips show warped images in their condition",
+                        where=f"step {part.step}", expected="points alone, as the published-type model is given",
+                        remedy="give another folder of clips; they are made anew")  # fmt: skip
                 draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
                 encoded.append(self.encode_condition(clip.condition, draws))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
@@ -337,14 +333,16 @@ class PublishedMDM(nn.Module):
     ) -> Losses:
         """Mean squared error of the velocity; every clip of the batch shows one modality, drawn by `MODALITY_SHARES`.
 
-        truth       latents of `encode_truth`, each [B,T,4,h,w]
-        generator   of all draws: modality, noise step, noise, which context is left out, dropout inside the network
-        known       f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere
-        first, batch_clips  these clips are number `first` and following of a batch of `batch_clips` clips (0 = of just these); what is
-                    drawn for a clip does not depend on how that batch is divided
+        Args:
+            truth: latents of `encode_truth`, each [B,T,4,h,w].
+            generator: of all draws: modality, noise step, noise, which context is left out, dropout inside the network.
+            known: f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere.
+            first: number of the first of these clips in the batch of a training step.
+            batch_clips: clips of that batch (0 = just these); what is drawn for a clip does not depend on how the batch is divided.
 
-        Terms: one for each modality that any clip of the whole batch shows, so that all parts have the same; scaled so that the
-        mean over equal parts is the mean over the clips that show it.
+        Returns:
+            A term for each modality that any clip of the batch shows, so that all parts have the same terms; scaled so that the
+            mean over equal parts is the mean over the clips that show it.
         """
         count = encoded.planes.shape[0]
         batch_clips, own = batch_clips or count, slice(first, first + count)
@@ -382,9 +380,13 @@ class PublishedMDM(nn.Module):
         return nn.ModuleDict({"net": self.net, "image_tokens": self.image_tokens})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
-        """Names in `trained_part` of the parameters that mix frames: of the temporal transformers inside the blocks, which is
-        what the published second stage froze, or of `all` temporal layers, which is what its text says."""
-        layers = temporal_layers(self.net, all_layers=which == "all")
+        """Names in `trained_part` of the parameters that mix frames.
+
+        Those of the temporal transformers inside the blocks, which is what the published second stage froze; or of `all` temporal
+        layers, that after the input convolution and the temporal convolutions included, which is what its text says.
+        """
+        kinds = (TemporalTransformer, TemporalConv) if which == "all" else TemporalTransformer
+        layers = [m for m in self.net.modules() if isinstance(m, kinds) and (which == "all" or m is not self.net.first)]
         ids = {id(parameter) for layer in layers for parameter in layer.parameters()}
         return {name for name, parameter in self.trained_part().named_parameters() if id(parameter) in ids}
 
@@ -397,8 +399,7 @@ class PublishedMDM(nn.Module):
         if "last" not in noise.SAMPLER_SETTINGS[request.sampler]:
             raise UsageError(
                 "the sampler does not suit a published-type model, which has a dynamic rescale and ends at the first noise level",
-                where="sampler", expected="ddim", got=request.sampler,
-            )  # fmt: skip
+                where="sampler", expected="ddim", got=request.sampler)  # fmt: skip
 
     def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
         """Width and height the model works at: its own whatever the camera's are, or about `width_px` wide in the same aspect."""

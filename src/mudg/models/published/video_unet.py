@@ -47,15 +47,11 @@ class VideoUNetConfig:
 
     def __post_init__(self) -> None:
         if len(self.multipliers) != len(self.attention):
-            raise UsageError(
-                "multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}"
-            )
+            raise UsageError("multipliers and attention need one entry per level",
+                got=f"{self.multipliers}, {self.attention}")  # fmt: skip
         if self.width % GROUPS:
-            raise UsageError(
-                "the width is no multiple of the normalisation groups",
-                expected=f"multiple of {GROUPS}",
-                got=str(self.width),
-            )
+            raise UsageError("the width is no multiple of the normalisation groups", expected=f"multiple of {GROUPS}",
+                got=str(self.width))  # fmt: skip
 
 
 class SeededDropout(nn.Module):
@@ -76,10 +72,9 @@ class SeededDropout(nn.Module):
         if not self.training or self.share == 0:
             return x
         if not self.seeds or len(x) % len(self.seeds):
-            raise UsageError(
-                "dropout needs a seed for every clip", where="SeededDropout", expected=f"a divisor of {len(x)} seeds",
-                got=str(len(self.seeds)), remedy="call PublishedMDM.loss, or eval()",
-            )  # fmt: skip
+            raise UsageError("dropout needs a seed for every clip", where="SeededDropout",
+                expected=f"a divisor of {len(x)} seeds", got=str(len(self.seeds)),
+                remedy="call PublishedMDM.loss, or eval()")  # fmt: skip
         shape = (len(x) // len(self.seeds), *x.shape[1:])
         draws = [
             torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
@@ -337,10 +332,9 @@ class VideoUNet(nn.Module):
         """
         batch, frames = x.shape[:2]
         if image.shape[1] != frames:
-            raise UsageError(
-                "the image tokens are made for another number of frames", where="VideoUNet", expected=f"{image.shape[1]} frames",
-                got=f"{frames}", remedy="give the model clips of exactly the length it was trained on",
-            )  # fmt: skip
+            raise UsageError("the image tokens are made for another number of frames", where="VideoUNet",
+                expected=f"{image.shape[1]} frames", got=f"{frames}",
+                remedy="give the model clips of exactly the length it was trained on")  # fmt: skip
         wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)  # noqa: E731
         embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
         embedding = embedding.repeat_interleave(frames, 0)
@@ -362,12 +356,3 @@ class VideoUNet(nn.Module):
         if not (self.checkpointing and self.training and torch.is_grad_enabled()):
             return stage(*inputs)
         return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)  # type: ignore[return-value]
-
-
-def temporal_layers(net: VideoUNet, *, all_layers: bool) -> list[nn.Module]:
-    """What stage 2 keeps frozen: the temporal transformers inside the blocks, as the published training did, or with
-    `all_layers` the one after the input convolution and the temporal convolutions too."""
-    found: list[nn.Module] = [m for m in net.modules() if isinstance(m, TemporalTransformer) and m is not net.first]
-    if all_layers:
-        found += [net.first, *(m for m in net.modules() if isinstance(m, TemporalConv))]
-    return found

@@ -88,7 +88,7 @@ class SceneModel:
         for name in names:
             if name not in known:
                 raise UsageError(f"the fitted scene has no dynamic object {name!r}",
-                                 expected="one of " + ", ".join(known) if known else "a scene with dynamic objects")  # fmt: skip
+                    expected="one of " + ", ".join(known) if known else "a scene with dynamic objects")  # fmt: skip
         kept = [index for index, node in enumerate(self.nodes) if node.name not in names or node.kind == "static"]
         renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
