@@ -66,6 +66,12 @@ def _at(published: str, clean: str, leaves: Iterable[tuple[str, str]]) -> list[t
     return [(published + a, clean + b) for a, b in leaves]
 
 
+def _block(published: str, clean: str) -> list[tuple[str, str]]:
+    """A residual block and its transformers."""
+    parts = (("0.", "res.", _RES), ("1.", "spatial.", _TRANSFORMER), ("2.", "temporal.", _TRANSFORMER))
+    return [row for a, b, leaves in parts for row in _at(published + a, clean + b, leaves)]
+
+
 def _parameters(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     """Each row for its weight and for its bias."""
     return [(f"{a}.{kind}", f"{b}.{kind}") for a, b in rows for kind in ("weight", "bias")]
@@ -78,17 +84,13 @@ RULES: tuple[tuple[str, str], ...] = (
           for n in (0, 2)),
         (f"{_UNET}input_blocks.0.0", "net.down.0.conv"),
         *_at(f"{_UNET}init_attn.0.", "net.first.", _TRANSFORMER),
-        *_at(f"{_UNET}input_blocks.{{i}}.0.", "net.down.{i}.res.", _RES),
-        *_at(f"{_UNET}input_blocks.{{i}}.1.", "net.down.{i}.spatial.", _TRANSFORMER),
-        *_at(f"{_UNET}input_blocks.{{i}}.2.", "net.down.{i}.temporal.", _TRANSFORMER),
+        *_block(f"{_UNET}input_blocks.{{i}}.", "net.down.{i}."),
         (f"{_UNET}input_blocks.{{i}}.0.op", "net.down.{i}.conv"),
         *_at(f"{_UNET}middle_block.0.", "net.middle.res1.", _RES),
         *_at(f"{_UNET}middle_block.1.", "net.middle.spatial.", _TRANSFORMER),
         *_at(f"{_UNET}middle_block.2.", "net.middle.temporal.", _TRANSFORMER),
         *_at(f"{_UNET}middle_block.3.", "net.middle.res2.", _RES),
-        *_at(f"{_UNET}output_blocks.{{i}}.0.", "net.up.{i}.res.", _RES),
-        *_at(f"{_UNET}output_blocks.{{i}}.1.", "net.up.{i}.spatial.", _TRANSFORMER),
-        *_at(f"{_UNET}output_blocks.{{i}}.2.", "net.up.{i}.temporal.", _TRANSFORMER),
+        *_block(f"{_UNET}output_blocks.{{i}}.", "net.up.{i}."),
         (f"{_UNET}output_blocks.{{i}}.3.conv", "net.up.{i}.grow"),
         (f"{_UNET}output_blocks.{{i}}.1.conv", "net.up.{i}.grow"),
         (f"{_UNET}out.0", "net.norm"), (f"{_UNET}out.2", "net.leave"),

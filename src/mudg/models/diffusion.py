@@ -1,7 +1,7 @@
-"""What the two diffusion models share: what is asked of them, what they return, and how far it can be trusted.
+"""The interface that the two diffusion models share: requests, generated clips, and their confidence.
 
-`MDM` (`models/mdm/model.py`) and `PublishedMDM` (`models/published/model.py`) have the same methods for it: `check_request`,
-`check_clip`, `image_size`, and `sample`, into which a condition and a `SampleRequest` go and out of which comes a `GeneratedClip`.
+`MDM` (`models/mdm/model.py`) and `PublishedMDM` (`models/published/model.py`) have the same methods: `check_request`, `check_clip`,
+`image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class GeneratedClip:
 
     rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1]. `latents`:
     modality -> [T,C,h,w], to be handed to the next window as `known`. `depth_fits`: one per frame, how depth was brought to
-    the measured scale; empty if that was not asked for.
+    the measured scale; empty without `SampleRequest.align`.
     """
 
     rgb: Tensor

@@ -29,7 +29,7 @@ _REMEDY: Final = "pip install 'mudg[models]'"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a network computes, and whether its convolutions and matrix products are made in bfloat16."""
+    """Device of a network, and whether its convolutions and matrix products are computed in bfloat16."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     bf16: bool = False
@@ -87,7 +87,7 @@ def find(name: str | Path) -> Path:
 
 
 def title(folder: str | Path) -> str:
-    """What a folder is called in notes: "owner/name@revision" of one in the Hugging Face cache, else its own name."""
+    """Name of a folder in notes: "owner/name@revision" of one in the Hugging Face cache, else its own name."""
     path = Path(folder)
     parent = path.parent.parent.name
     if path.parent.name == "snapshots" and parent.startswith("models--"):
@@ -96,7 +96,7 @@ def title(folder: str | Path) -> str:
 
 
 def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> ModuleType:
-    """A package that reads folders, its progress bars off; ResourceError naming the extra where it is missing."""
+    """A package that reads folders, with its progress bars off; ResourceError names the extra if it is missing."""
     try:
         match name:
             case "transformers":

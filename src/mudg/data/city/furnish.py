@@ -1,4 +1,4 @@
-"""What lines the streets: buildings, gardens, walls, fences, the crossing street and the background. All static."""
+"""Static surroundings of the streets: buildings, gardens, walls, fences, the crossing street and the background."""
 
 from __future__ import annotations
 

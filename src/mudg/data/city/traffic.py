@@ -1,4 +1,4 @@
-"""Everything with a pose: moving, waiting and parked vehicles, pedestrians, cyclists; and the recording vehicle."""
+"""Objects with poses: moving, waiting and parked vehicles, pedestrians, cyclists; and the recording vehicle."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from mudg.data.city.config import CityConfig
 from mudg.data.city.furnisher import KERB_M
 from mudg.data.city.layout import StreetPlan
 from mudg.data.city.records import Color, Draws, record
+from mudg.data.city.rig import pitch_rotation
 
 Array = NDArray[np.float64]
 
@@ -68,7 +69,7 @@ def ego_keys(config: CityConfig, plan: StreetPlan) -> tuple[Array, Array]:
     poses = np.empty((len(times), 4, 4))
     for i, t in enumerate(times):
         z, pitch, roll = bump * np.sin(rate * t) * np.clip(abs(t) * 2, 0, 1)
-        attitude = _rotation_y(pitch) @ _rotation_x(roll)
+        attitude = pitch_rotation(pitch) @ _rotation_x(roll)
         poses[i] = geometry.yaw_matrix(float(heading[i]), (x[i], y[i], z))
         poses[i, :3, :3] = poses[i, :3, :3] @ attitude
     poses[margin] = np.eye(4)
@@ -78,11 +79,6 @@ def ego_keys(config: CityConfig, plan: StreetPlan) -> tuple[Array, Array]:
 def _rotation_x(a: float) -> Array:
     c, s = math.cos(a), math.sin(a)
     return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-
-
-def _rotation_y(a: float) -> Array:
-    c, s = math.cos(a), math.sin(a)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 class TrafficPlanner(Draws):
@@ -189,7 +185,7 @@ class TrafficPlanner(Draws):
                       tuple(0.4 * c for c in clothes[1]), (swing, float(self.chance(0.3))))  # type: ignore[arg-type]  # fmt: skip
 
     def along_street(self, s: Array, u: Array | float, direction: int, z: float = 0.0) -> Array:
-        """Keys of something that follows the main street; direction -1 = against it."""
+        """Keys of an object that follows the main street; direction -1 = against it."""
         x, y, heading = self.plan.line.at(s, u)
         return np.stack([x, y, np.full(len(s), z), heading + (0.0 if direction > 0 else math.pi)], 1)
 
@@ -246,7 +242,7 @@ def _lanes(t: TrafficPlanner) -> None:
 
 
 def _follow(points: Array, start: float, speed: float, times: Array) -> Array:
-    """Keys of something that runs along a polyline [n, 2], at ``start`` metres at time 0."""
+    """Keys of an object that follows a polyline [n, 2], at ``start`` metres at time 0."""
     step = np.hypot(*np.diff(points, axis=0).T)
     length = np.concatenate([[0.0], np.cumsum(step)])
     at = np.clip(start + speed * times, 0.0, length[-1] - 1e-3)

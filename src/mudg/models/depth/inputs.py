@@ -16,7 +16,7 @@ from mudg.core.align import Space
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthInput:
-    """What a depth network is given for one image.
+    """Input of a depth network for one image.
 
     Args:
         rgb: u8[H, W, 3].
@@ -47,7 +47,7 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class DepthOptions:
-    """Numbers for networks that denoise; others do not read them.
+    """Options of networks that denoise; others do not use them.
 
     Args:
         guided: Marigold: LiDAR steers every denoising step, instead of aligning the result only.

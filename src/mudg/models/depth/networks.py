@@ -7,9 +7,9 @@
 | Marigold (``models.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
 | DepthLab (``models.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
-Whatever comes out is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the
-sky is put at its fixed distance, and the confidence is taken from how far the aligned depth is off at the returns near a pixel.
-Where too few returns are seen, or the network's depth does not fit them, there is no result.
+The result is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the sky gets
+its fixed distance, and the confidence follows from the error of the aligned depth at the returns near a pixel. There is no result
+where too few returns are visible, or where the network's depth does not fit them.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ _DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_cl
 
 
 def kind_of(folder: str | Path) -> str:
-    """Kind of network that a folder says it holds; nothing but its description is read.
+    """Kind of network according to a folder's description; nothing else of it is read.
 
     Raises:
         ResourceError: no such folder, or it has no description. InputError: another kind of network.
@@ -182,7 +182,7 @@ def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOpt
     return KINDS[kind_of(path)](path, place, options)
 
 
-# --- what every network's depth goes through --------------------------------------------------------------------------
+# --- alignment to LiDAR, for every network ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,5 +244,5 @@ def residual_confidence(
 
 
 def enough_returns(given: DepthInput) -> bool:
-    """Whether there are returns enough in the image to align to."""
+    """Whether the image has enough returns for an alignment."""
     return int((np.isfinite(given.measured) & ~given.sky).sum()) >= MIN_POINTS

@@ -1,7 +1,7 @@
-"""The ground around a vehicle: the plane it drives on, and which of it can be reached from the driven path without a step.
+"""The ground around a vehicle: its plane, and the part that can be reached from the driven path without a step.
 
-A kerb is a decimetre; nothing else that a scanner measures tells a road from a sidewalk as well, and unlike colour it means the same in
-every town. ``map_ground`` looks for it from above, in cells of ``CELL_M``.
+A kerb of a decimetre separates a road from a sidewalk better than anything else that a scanner measures, and unlike colour it is the
+same in every town. ``map_ground`` finds it from above, in cells of ``CELL_M``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ CELL_M: Final = 0.3
 REACH_M: Final = 45.0
 """The map goes this far from the camera to each side."""
 LOW_M: Final = 0.7
-"""Points farther than this above or below the plane are no ground."""
+"""Points farther above or below the plane than this are not ground."""
 KERB_M: Final = 0.07
 """Heights of neighbouring cells that differ by more than this are a step."""
 _KNOWN_M: Final = 2.5

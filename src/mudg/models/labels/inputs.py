@@ -31,17 +31,17 @@ GROWTH_M: Final = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelInput:
-    """What a labeller is given for one image.
+    """Input of a labeller for one image.
 
     Args:
         view: camera and pose.
         rgb: u8[H, W, 3].
-        xyz_world: f32[N, 3] metres: LiDAR returns of static things and of things as they stand at the image's time.
+        xyz_world: f32[N, 3] metres: LiDAR returns of the static scene, and of dynamic objects where they are at the image's time.
         tracks: tracked boxes.
         path_world: f64[M, 3], places of the vehicle (``ground.driven_path``).
         beam_gap_deg: largest angle between neighbouring beams of the LiDAR.
         highest_rad: elevation of its highest beam above the horizontal.
-        moving: numbers of the tracks that move at some time of the log.
+        moving: numbers of the tracks of dynamic objects: those that move at some time of the log.
     """
 
     view: View

@@ -1,4 +1,4 @@
-"""A small network that tells the Cityscapes classes of a street from colour and measured evidence.
+"""A small segmentation network: Cityscapes classes of a street from colour and measured evidence.
 
 An encoder and decoder with skips at strides 2 to 32. Colour and the planes of ``models.labels.evidence`` enter together as cells of
 2x2 pixels, and the scores of a cell's four pixels leave together: nothing is computed at full size, and nothing of it is lost.

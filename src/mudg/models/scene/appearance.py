@@ -1,4 +1,4 @@
-"""What differs from picture to picture though the scene does not: exposure and colour, small errors of camera poses.
+"""Corrections of single images: exposure and colour, and small errors of camera poses, which vary although the scene does not.
 
 Three corrections, each optional, each the identity at the start, none of them used when a fitted scene is rendered:
 

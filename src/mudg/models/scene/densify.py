@@ -1,4 +1,4 @@
-"""Densification by screen gradient: grow Gaussians where the image asks for detail, drop those that do nothing.
+"""Densification by screen gradient: add Gaussians where the image lacks detail, remove those without effect.
 
 The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): every ``every`` steps rows whose mean screen
 gradient exceeds a threshold are cloned (small) or split in two (large); rows that are transparent, grown out of proportion,
@@ -6,8 +6,8 @@ or have left their box are removed; now and then opacities are pulled down so th
 is judged by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain ones. Growth is
 bounded by ``max_rows``: the rows with the largest gradients go first.
 
-State is explicit: statistics belong to rows of the table, the schedule is a function of the step. Which views may speak is the
-caller's choice (``stages/fit.py`` feeds recorded views only, see ``Observation.kind``). ``models/scene/mcmc.py`` is the alternative.
+State is explicit: statistics belong to rows of the table, the schedule is a function of the step. The caller chooses the views that
+count (``stages/fit.py``: recorded views only, see ``Observation.kind``). ``models/scene/mcmc.py`` is the alternative.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Densification as sampling: Gaussians that do nothing move to where something is, and the number stays below a cap.
+"""Densification as sampling: Gaussians without effect move to where others are, and their number stays below a cap.
 
 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). Every ``every`` steps
 

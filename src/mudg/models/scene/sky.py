@@ -1,4 +1,4 @@
-"""The sky of a scene: a picture of all directions, seen wherever nothing covers it."""
+"""The sky of a scene: a panorama of all directions, visible where no Gaussian covers it."""
 
 from __future__ import annotations
 
