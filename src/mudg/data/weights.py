@@ -332,8 +332,9 @@ def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> di
 def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str) -> dict[str, Tensor]:
     """The tensors of a checkpoint under our names, strictly.
 
-    found   published name -> tensor
-    wanted  our name -> shape, all that the model needs and nothing else
+    Args:
+        found: published name -> tensor.
+        wanted: our name -> shape, all that the model needs and nothing else.
 
     Raises:
         InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the counts.

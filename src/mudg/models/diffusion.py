@@ -27,17 +27,18 @@ from mudg.models.mdm.codec import Modality
 class SampleRequest:
     """How one clip is to be generated.
 
-    steps       denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for each
-                modality, two networks' worth each with guidance
-    seed, index all noise is drawn from (seed, index): same in, same out
-    sampler     a row of `noise.SAMPLERS`
-    eta         ddim: noise added between steps, 0 to 1 (None = the sampler's default)
-    guidance    published kind: weight of the guided over the unguided prediction; 1 = none (None = the model's own)
-    guidance_rescale  published kind: share of the guided prediction whose spread is pulled back (None = the model's own)
-    n_samples   > 1: the first sample is returned, the spread of all lowers the confidence
-    known       modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window
-    align       bring each frame's depth to the measured scale (`core.align`)
-    bf16        run the networks in bfloat16
+    Args:
+        steps: denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for each
+            modality, and twice as many with guidance.
+        seed, index: all noise is drawn from (seed, index): same in, same out.
+        sampler: a row of `noise.SAMPLERS`.
+        eta: ddim: noise added between steps, 0 to 1 (None = the sampler's default).
+        guidance: published kind: weight of the guided over the unguided prediction; 1 = none (None = the model's own).
+        guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's own).
+        n_samples: if > 1, the first sample is returned, and the spread of all lowers the confidence.
+        known: modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window.
+        align: bring each frame's depth to the measured scale (`core.align`).
+        bf16: run the networks in bfloat16.
     """
 
     steps: int
@@ -144,9 +145,10 @@ def mean_change(estimates: list[Tensor], last: Tensor) -> Tensor:
 def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     """How far a generated pixel can be trusted, f32[T,1,H,W] in [0,1].
 
-    seen    [T,1,h,w] share of the latent cell that was measured or warped from a recorded image
-    change  [T,1,h,w] how much the colour latent still moved in the later half of sampling (or its spread over samples)
-    factor  pixels per cell
+    Args:
+        seen: [T,1,h,w] share of the latent cell that was measured or warped from a recorded image.
+        change: [T,1,h,w] how much the colour latent still changed in the later half of sampling (or its spread over samples).
+        factor: pixels per cell.
 
     The product of a coverage term (1 where seen, 0.35 far from anything seen, smoothed over 5 cells) and exp(-2 change).
     """

@@ -325,16 +325,15 @@ class VideoUNet(nn.Module):
     def forward(self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor) -> Tensor:
         """One denoiser pass.
 
-        x      [B,T,channels_in,h,w]: noisy latent, latent of the colour condition, latent of the depth condition
-        t      i64[B] noise step; label i64[B] modality; fps i64[B] frames per second
-        text   [B,77,D] caption tokens; image [B,T,16,D] image tokens of each frame
-        Returns v [B,T,channels_out,h,w]. Raises UsageError when the image tokens are for another number of frames.
+        Args:
+            x: [B,T,channels_in,h,w], noisy latent, latent of the colour condition, latent of the depth condition.
+            t: i64[B] noise step. label: i64[B] modality. fps: i64[B] frames per second.
+            text: [B,77,D] caption tokens. image: [B,T,16,D] image tokens of each frame.
+
+        Returns:
+            Velocity [B,T,channels_out,h,w].
         """
         batch, frames = x.shape[:2]
-        if image.shape[1] != frames:
-            raise UsageError("the image tokens are made for another number of frames", where="VideoUNet",
-                expected=f"{image.shape[1]} frames", got=f"{frames}",
-                remedy="give the model clips of exactly the length it was trained on")  # fmt: skip
         wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)  # noqa: E731
         embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
         embedding = embedding.repeat_interleave(frames, 0)

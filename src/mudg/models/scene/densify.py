@@ -126,7 +126,7 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
     clone_rows = (grow & (largest <= settings.split_above_m)).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool)
     keep[split_rows] = False
-    for columns, labels in (_rows(model, clone_rows), *_halves(model, split_rows, step, run_seed)):
+    for columns, labels in (copied_rows(model.table, clone_rows), *_halves(model, split_rows, step, run_seed)):
         model.table.append(columns, labels)
     keep = torch.cat([keep, torch.ones(len(model.table) - len(keep), dtype=torch.bool)])
     doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
@@ -170,17 +170,17 @@ def _rows_to_grow(model: SceneModel, stats: DensifyStats, settings: DensifySetti
     return wanted
 
 
-def _rows(model: SceneModel, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    table = model.table
-    columns = {name: value.detach()[rows].clone() for name, value in table.columns.items()}
-    return columns, {name: value[rows].clone() for name, value in table.labels.items()}
+def copied_rows(table: Table, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Columns and labels of the rows with the numbers i64[n], as ``Table.append`` takes them."""
+    columns = {name: value.detach()[rows] for name, value in table.columns.items()}
+    return columns, {name: value[rows] for name, value in table.labels.items()}
 
 
 def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
     """Two smaller Gaussians drawn from each split one (centres sampled from its own density)."""
     halves = []
     for half in (0, 1):
-        columns, labels = _rows(model, rows)
+        columns, labels = copied_rows(model.table, rows)
         generator = seeds.torch_generator(run_seed, step, f"split half {half}")
         noise = torch.randn(len(rows), 3, generator=generator)
         local = torch.exp(columns["log_scales"]) * noise

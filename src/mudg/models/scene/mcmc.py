@@ -26,7 +26,7 @@ from torch import Tensor
 
 from mudg.base import seeds
 from mudg.core.quaternions import rotate
-from mudg.models.scene.densify import useless_rows
+from mudg.models.scene.densify import copied_rows, useless_rows
 from mudg.models.scene.model import SceneModel
 
 LARGEST_STACK = 51
@@ -142,8 +142,7 @@ def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_
     sources = copies.nonzero()[:, 0]
     _correct(model, sources, copies[sources] + 1, opacity[sources])
     repeated = sources.repeat_interleave(copies[sources])
-    columns = {name: value.detach()[repeated] for name, value in table.columns.items()}
-    labels = {name: value[repeated] for name, value in table.labels.items()}
+    columns, labels = copied_rows(table, repeated)
     table.take(~dead)
     if len(repeated):
         table.append(columns, labels)
