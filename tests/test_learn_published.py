@@ -178,9 +178,9 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
         learn.run(published_settings(converted, clips, reference_dropout=0.8), tmp_path / "run")
     assert given and not any(given)
     assert dropped == [pytest.approx(0.8)]
-    assert ContextDropout.of(0.2) == PAPER_DROPOUT
-    assert ContextDropout.of(0.1) == ContextDropout(0.05, 0.05, 0.05)  # as the released training code
-    assert ContextDropout.of(0.0) == ContextDropout(0.05, 0.0, 0.0)
+    assert ContextDropout.for_reference(0.2) == PAPER_DROPOUT
+    assert ContextDropout.for_reference(0.1) == ContextDropout(0.05, 0.05, 0.05)  # as the released training code
+    assert ContextDropout.for_reference(0.0) == ContextDropout(0.05, 0.0, 0.0)
 
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):

@@ -1,8 +1,8 @@
 """Training clips from generated cities: pure functions of (seed, city number).
 
-One city is a short log (12 frames) seen by the front camera and, sometimes, the two beside it. Its sweeps are fused as
+One city is a short log (12 frames) recorded by the front camera and, sometimes, the two beside it. Its sweeps are fused as
 the `fuse` verb does, the condition is built as `synthesize` does, and the truth comes from the generator at exactly the
-views asked for. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded images
+views of the clip. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded images
 given, as for frames that a log lacks.
 
 What varies from city to city besides the city itself: field of view, mounting height and pitch, number and elevation range
@@ -79,16 +79,14 @@ class CityLog:
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
     """The city's configuration."""
     seed = seeds.key(0 if city >= HELD_OUT else rules.seed, city, "city") & 0x7FFFFFFF
+    plain = CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
     if city >= HELD_OUT:
-        return CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
+        return plain
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < 0.4
-    return CityConfig(
-        seed=seed,
-        n_frames=FRAMES,
+    return replace(
+        plain,
         rate_hz=float(rng.choice([10.0, 10.0, 6.0])),
-        width=rules.width * rules.fine,
-        height=rules.height * rules.fine,
         cameras=("front", "front_left", "front_right") if side_cameras else ("front",),
         hfov_deg=float(rng.uniform(46, 76)),
         rig_variation=1.0,

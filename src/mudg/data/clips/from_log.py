@@ -5,8 +5,8 @@ A clip is a window of consecutive frames of one camera, seen from where they wer
 * **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured (and the depth labels of
   the scene, where there are such); classes where labels exist and are trusted;
 * **condition**: what `synthesize` would build for these views without their own images. Every view gets only images that
-  are at least some moments away, so that something is left to be done: between one and `farthest` moments, drawn per
-  window. Of the cloud a random share of the points is left out, so that depth is more than copying.
+  are at least some moments away, so that the model has to complete something: between one and `farthest` moments, drawn per
+  window. A random share of the cloud's points is left out, so that depth is more than copying.
 
 The points of the cloud keep the colours that fusing gave them, also where those came from the very image that is the truth;
 so it is in the published system.

@@ -129,7 +129,7 @@ def _paint_surface(
     ground = map_ground(given.xyz_world, given.path_world, given.view.center_world)
     if ground is not None:
         height = above_plane(ground.plane, surface.xyz_world)
-        _, direct, _ = ground.at(surface.xyz_world)
+        _, direct, _ = ground.under(surface.xyz_world)
     flat = known & (np.abs(height) < GROUND_M + 0.005 * surface.depth)
     beside = beside_path(surface.xyz_world, given.path_world, 4)
     green = greenness > GRASS

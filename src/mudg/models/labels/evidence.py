@@ -95,7 +95,7 @@ def gather(given: LabelInput) -> Evidence:
     xyz = surface_points(view, depth)
     box, in_box, labels = _boxes(given, xyz, depth, known)
     ground = map_ground(given.xyz_world, given.path_world, view.center_world)
-    reachable, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.at(xyz)
+    reachable, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.under(xyz)
     beside = beside_path(xyz, given.path_world, 2) if len(given.path_world) else np.full(shape, NO_PATH_M, np.float32)
     return Evidence(
         _height(ground, xyz), depth, np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32), _upwards(xyz),

@@ -138,7 +138,7 @@ class GroundMap:
     direct: NDArray[np.bool_]
     raised_m: NDArray[np.float32]
 
-    def at(self, xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
+    def under(self, xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
         """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for what is no ground."""
         place = np.floor(np.nan_to_num((xyz_world[..., :2] - self.corner_m) / CELL_M, nan=-1.0)).astype(np.int64)
         last = len(self.reachable) - 1

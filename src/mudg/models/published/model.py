@@ -140,7 +140,7 @@ class ContextDropout:
     reference: float = 0.15
 
     @classmethod
-    def of(cls, reference: float) -> ContextDropout:
+    def for_reference(cls, reference: float) -> ContextDropout:
         """With the reference missing in this share of the clips (0.2: the paper, 0.1: the released code)."""
         both = min(cls.both, reference)
         return cls(cls.text, both, round(min(reference - both, 1 - cls.text - both), 12))
@@ -310,7 +310,7 @@ class PublishedMDM(nn.Module):
         planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
         return self.velocity_loss(
             truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
-            dropout=ContextDropout.of(settings.reference_dropout), known=known, first=part.first, batch_clips=part.count,
+            dropout=ContextDropout.for_reference(settings.reference_dropout), known=known, first=part.first, batch_clips=part.count,
         )  # fmt: skip
 
     forward = loss
