@@ -158,18 +158,17 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
 
 
-def depth_agreement(depth: Tensor, condition: Condition, reach_px: int = 2) -> Tensor:
+def depth_agreement(depth: Tensor, condition: Condition) -> Tensor:
     """How far generated depth f32[T,1,H,W] agrees with what was measured nearby, f32[T,1,H,W] in [0.2, 1].
 
-    exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within `reach_px` as the mean of
+    exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within 2 pixels as the mean of
     those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not to
     be trusted either.
     """
     seen = condition.valid.float()
     ratio = (depth.clamp(min=0.1) / condition.depth.clamp(min=0.1)).log().abs()
     agrees = torch.exp(-5.0 * ratio).clamp(min=0.2)
-    window = 2 * reach_px + 1
-    pool = lambda x: functional.avg_pool2d(x, window, stride=1, padding=reach_px, count_include_pad=True)  # noqa: E731
+    pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)  # noqa: E731
     near = pool(seen)
     return torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
 

@@ -253,9 +253,9 @@ def _follow(points: Array, start: float, speed: float, times: Array) -> Array:
     return np.column_stack([xy, np.zeros(len(times)), np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))])
 
 
-def _bend(p0: Array, p1: Array, p2: Array, count: int = 24) -> Array:
-    """Quadratic curve from p0 to p2 with both tangents through p1."""
-    f = np.linspace(0, 1, count)[:, None]
+def _bend(p0: Array, p1: Array, p2: Array) -> Array:
+    """Quadratic curve from p0 to p2, 24 points, with both tangents through p1."""
+    f = np.linspace(0, 1, 24)[:, None]
     return (1 - f) ** 2 * p0 + 2 * f * (1 - f) * p1 + f**2 * p2
 
 

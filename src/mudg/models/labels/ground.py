@@ -36,10 +36,8 @@ _STOOD_M: Final = 0.5
 """A path that goes no farther than this shows no direction."""
 
 
-def fit_ground(
-    xyz_world: NDArray[np.floating], path_world: NDArray[np.float64], reach_m: float = 40.0
-) -> NDArray[np.float64] | None:
-    """Ground plane z = a x + b y + c around the path, f64[3], or None with too few points to tell.
+def fit_ground(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Ground plane z = a x + b y + c within 40 m of the path's middle, f64[3], or None with too few points to tell.
 
     Starts from the lowest returns of 2 m cells (their lower half by height), then least squares on what lies within
     0.5, 0.3 and 0.2 m of the plane. A slope above 20 percent is not believed.
@@ -48,7 +46,7 @@ def fit_ground(
         return None
     xyz = np.asarray(xyz_world, np.float64)
     centre = path_world.mean(0)
-    xyz = xyz[(np.abs(xyz[:, :2] - centre[:2]) < reach_m).all(1)]
+    xyz = xyz[(np.abs(xyz[:, :2] - centre[:2]) < 40.0).all(1)]
     xyz = xyz[:: max(1, len(xyz) // 60_000)]
     cells = np.floor(xyz[:, :2] / 2.0).astype(np.int64)
     key = cells[:, 0] * 1_000_003 + cells[:, 1]

@@ -52,7 +52,7 @@ def save(
         store.sync_tree(partial)
 
 
-def load(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None, *, verify: bool = True) -> PublishedMDM:
+def load(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> PublishedMDM:
     """Read a model folder; weights are mapped from the files and converted to `dtype` (None: as stored).
 
     Raises:
@@ -63,7 +63,7 @@ def load(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None, *,
         raise InputError("not a published-type model of this version", where=where, expected=f"schema 1, kind {KIND}")
     with torch.device("meta"):
         model = PublishedMDM(records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config"))
-    state = shards.read_shards(Path(folder), content["files"], verify=verify, remedy="convert the checkpoint again")
+    state = shards.read_shards(Path(folder), content["files"], remedy="convert the checkpoint again")
     shards.check_fit(state, model.state_dict(), Path(folder))
     model.load_state_dict(state, assign=True)
     model.adopt_scale()
