@@ -215,7 +215,7 @@ def test_a_converted_folder_that_changed_is_refused(converted: Path, tmp_path: P
     wide = {**told["parts"]["vae"]["config"], "latent_channels": 8}
     for other, message in (
         ({"schema": 2}, "not a DepthLab model of this version"),
-        ({"sampling": {"steps": 50}}, "sampling of a DepthLab model is not described"),
+        ({"sampling": {"steps": 50}}, "the field 'processing_px' is missing"),
         ({"parts": {**told["parts"], "vae": {}}}, "not whole"),
         (
             {"parts": {**told["parts"], "mapping_layer": {**told["parts"]["mapping_layer"], "config": {"a": 1}}}},

@@ -27,7 +27,7 @@ from mudg.bench import poses as bench_poses
 from mudg.bench import shift as bench_shift
 from mudg.core import flicker
 from mudg.data.clips import from_city
-from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 from mudg.data.clips.from_city import CityClipRules
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
@@ -113,9 +113,9 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     tail: dict[Any, torch.Tensor] = {}
     spans = windows(len(views), model.config.window, usual.overlap)
     for number, span in enumerate(spans):
-        condition = build_condition(
+        condition = build_conditions(
             record.cloud, record.world.tracks(), [views[i] for i in span], record.recorded, ConditionRules(*sizes), sources
-        )
+        )[0]
         shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
         made = model.sample(condition, SampleRequest(usual.steps, config.seed, number, known=known, bf16=bf16))

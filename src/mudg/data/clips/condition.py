@@ -1,6 +1,6 @@
 """Conditions and training clips for the diffusion model.
 
-`build_condition` turns a fused cloud and recorded images into what the model is given for a path of views:
+`build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
 
 1. the cloud is projected into every view (z-buffer);
 2. far points that shine through gaps between near ones are removed (`core.visible`, rule `condition`);
@@ -183,30 +183,6 @@ class WarpSource:
     semantics: Tensor
 
 
-def build_condition(
-    cloud: FusedCloud,
-    tracks: Sequence[Track],
-    views: Sequence[View],
-    recorded: Sequence[Photo],
-    rules: ConditionRules,
-    sources: dict[int, WarpSource] | None = None,
-    beyond: Beyond | None = None,
-) -> Condition:
-    """The model's condition for `views` (any path, any size; resized to the rules' size).
-
-    cloud      fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time
-    recorded   images of any cameras; the ones nearest in time to a view are warped into it; may be empty
-    sources    cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views
-    beyond     what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
-               within `rules.measured_reach_px` as if it were points (not with `published`)
-    Returns colour and depth filled everywhere (zeros with `published`), `valid` where a point was seen and kept,
-    `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as reference the recorded image of the first view's
-    camera that is nearest in time (black if there is none).
-    Raises InputError for an empty list of views.
-    """
-    return build_conditions(cloud, tracks, views, recorded, rules, sources, beyond)[0]
-
-
 def build_conditions(
     cloud: FusedCloud,
     tracks: Sequence[Track],
@@ -216,9 +192,25 @@ def build_conditions(
     sources: dict[int, WarpSource] | None = None,
     beyond: Beyond | None = None,
 ) -> tuple[Condition, Condition]:
-    """As `build_condition`, and the same condition on the fine grid (the same object if there is no finer one)."""
+    """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
+
+    Args:
+        cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
+        recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
+        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views.
+        beyond: what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
+            within `rules.measured_reach_px` as if it were points (not with `published`).
+
+    Returns:
+        Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
+        where a point was seen and kept, `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as
+        reference the recorded image of the first view's camera that is nearest in time (black if there is none).
+
+    Raises:
+        InputError: no views.
+    """
     if not views:
-        raise InputError("a condition needs at least one view", where="clips.build_condition")
+        raise InputError("a condition needs at least one view", where="clips.build_conditions")
     small = [view.resized(rules.width, rules.height) for view in views]
     reference = _reference(small[0], recorded, rules)
     if rules.published:
@@ -249,11 +241,7 @@ def build_conditions(
 
 
 def _condition_of_view(
-    points: DrawnCloud,
-    view: View,
-    recorded: Sequence[Photo],
-    rules: ConditionRules,
-    sources: dict[int, WarpSource],
+    points: DrawnCloud, view: View, recorded: Sequence[Photo], rules: ConditionRules, sources: dict[int, WarpSource]
 ) -> tuple[Tensor, ...]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
     the backdrop u8[1,H,W] of one view, at its size."""
@@ -289,9 +277,8 @@ def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Ten
     if not bool(sparse.valid.any()):
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
     rows, columns = (torch.from_numpy(i.astype(np.int64)) for i in nearest_valid(sparse.valid.numpy()))
-    found = (x[..., rows, columns] for x in (sparse.rgb, sparse.depth, sparse.moving, sparse.semantics))
-    rgb, depth, moving, ids = found
-    return rgb, depth, moving, ids
+    here = (..., rows, columns)
+    return sparse.rgb[here], sparse.depth[here], sparse.moving[here], sparse.semantics[here]
 
 
 def _published_condition(
@@ -318,11 +305,12 @@ def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> 
     nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
     if rules.published and rules.fine_width:
         size = (rules.height, rules.width)
-        return functional.interpolate(_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
-    return _tensor(resize_area(nearest.rgb, rules.width, rules.height))
+        return functional.interpolate(image_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
+    return image_tensor(resize_area(nearest.rgb, rules.width, rules.height))
 
 
-def _tensor(rgb: NDArray[np.uint8]) -> Tensor:
+def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
+    """Image u8[H,W,3] as f32[3,H,W] in [0,1]."""
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
 
 
@@ -331,12 +319,8 @@ def _order_of_images(view: View, recorded: Sequence[Photo], rules: ConditionRule
 
     def rank(number: int) -> tuple[float, bool, float]:
         other = recorded[number].view
-        gap = round(abs(other.time_s - view.time_s) / 0.02)
-        return (
-            gap,
-            other.camera.name != view.camera.name,
-            float(np.linalg.norm(other.center_world - view.center_world)),
-        )
+        distance_m = float(np.linalg.norm(other.center_world - view.center_world))
+        return round(abs(other.time_s - view.time_s) / 0.02), other.camera.name != view.camera.name, distance_m
 
     return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
 
@@ -348,9 +332,8 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
     _, depth, moving, _ = _filled(points.project(view), rules)
-    return WarpSource(
-        view, _tensor(resize_area(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
-    )
+    rgb = image_tensor(resize_area(recorded.rgb, width, height))
+    return WarpSource(view, rgb, depth, moving, _ids_at(recorded, width, height))
 
 
 def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
@@ -365,12 +348,9 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
     """Project a fused cloud into a view of the condition's resolution (see `ProjectedPoints`)."""
     poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
     config = ProjectConfig(
-        static_splat_px=rules.point_px,
-        object_splat_px=rules.point_px,
-        near_m=rules.near_m,
-        far_m=rules.far_m,
+        static_splat_px=rules.point_px, object_splat_px=rules.point_px, near_m=rules.near_m, far_m=rules.far_m,
         occluder_m=0.0 if rules.published else rules.occluder_m,
-    )
+    )  # fmt: skip
     placed = {name: pose for name, pose in poses.items() if pose is not None}
     seen = project_cloud(cloud, placed, view, config)
     valid = seen.valid[0]
@@ -380,6 +360,5 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
     unknown = np.uint8(palette.UNLABELLED)
     ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
     table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
-    return ProjectedPoints(
-        seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()]
-    )
+    moving = (seen.index >= len(cloud.static)) & valid
+    return ProjectedPoints(seen.color, seen.depth[0], valid, moving, table[seen.index.long()])

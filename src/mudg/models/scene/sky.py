@@ -1,4 +1,4 @@
-"""The sky of a scene: a picture of all directions, seen wherever nothing covers it."""
+"""The sky of a scene: a panorama of all directions, visible where no Gaussian covers it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from mudg.base.types import View
@@ -78,8 +79,6 @@ class SkyNode:
         """
         if len(rgb) == 0:
             return
-        from scipy.ndimage import distance_transform_edt
-
         rows, columns = self.rows, 2 * self.rows
         grid = self.panorama_grid(directions_world)
         column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
@@ -95,7 +94,7 @@ class SkyNode:
         self.table.columns["panorama"].detach().copy_(torch.from_numpy(filled).float()[None])
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``Node``."""
+        """What rebuilds the sky: plain JSON values and tensors."""
         return {"name": "sky"}, self.table.state()
 
     @classmethod
