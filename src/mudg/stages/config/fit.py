@@ -161,8 +161,8 @@ class FitConfig:
     }  # fmt: skip
 
     method: Literal["gs3d", "street_gaussians", "mudg_s"] = "mudg_s"
-    """gs3d: static Gaussians only. street_gaussians: static background, sky and dynamic objects. mudg_s: the same, supervised by
-    virtual views too."""
+    """gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, also supervised by
+    virtual views."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
     """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
     to this number."""
