@@ -314,7 +314,7 @@ def test_a_frame_without_lidar_keeps_its_depth(tmp_path: Path) -> None:
 
 
 def test_a_depth_network_needs_depth_and_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no depth is asked for"):
+    with pytest.raises(UsageError, match="contradicts"):
         annotate_depth.digests(AnnotateConfig(depth=False, depth_network="x"))
     with pytest.raises(ResourceError, match="weights"):
         annotate_depth.digests(AnnotateConfig(depth_network=str(tmp_path)))

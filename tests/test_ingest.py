@@ -96,8 +96,8 @@ def test_words_of_the_command_line(words: list[str], out: str | None, expected: 
         (["log"], None, "no folder"),
         (["kitti", "log"], None, "no folder"),
         (["waymoo", "log", "o"], None, "neither such a format"),
-        ([".", "o", "p"], None, "too many words"),
-        ([".", "o"], "p", "too many words"),
+        ([".", "o", "p"], None, "too many arguments"),
+        ([".", "o"], "p", "too many arguments"),
     ],
 )
 def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:

@@ -54,7 +54,7 @@ def film(views: Mapping[str, Path], paths: Sequence[Trajectory], out: Path, *, o
     for path in paths:
         sets = {name: read_observations(listed[path.name]) for name, listed in found.items() if path.name in listed}
         if "truth" not in sets:
-            raise InputError("no truth to show", where=f"{views.get('truth')}: {path.name}")
+            raise InputError("no ground truth to show", where=f"{views.get('truth')}: {path.name}")
         pictures = list(_frames(sets, list(views), len(path)))
         if playable:
             store.atomic_write(folder.path / f"{path.name}.mp4", mp4_within(lambda made=pictures: made, ENCODING, VIDEO_BYTES))

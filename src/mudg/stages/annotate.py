@@ -65,7 +65,7 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     wanted = wanted_labels(config)
     missing = [frame for frame in loaded.frames if not wanted <= set(frame.labels)]
     if not missing:
-        log.info("annotate: labels present, nothing to do; the scene is passed through")
+        log.info("annotate: the scene already has all labels; nothing to add")
     if not (folder.path / "scene.json").is_file():
         aside = folder.path / _ASIDE
         _label_frames(config, Path(scene), loaded, missing, aside)
@@ -131,7 +131,7 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
     """Put the labels of every frame that has none yet into ``aside``."""
     todo = [frame.id for frame in missing if not aside_file(aside, frame.id).is_file()]
     if len(todo) < len(missing):
-        log.info(f"annotate: {len(missing) - len(todo)} frames were labelled before")
+        log.info(f"annotate: {len(missing) - len(todo)} frames are labelled already")
     most = config.processes or (1 if config.device == "cuda" else os.cpu_count()) or 1
     processes = min(most, len(todo) // _FRAMES_PER_PROCESS)
     with log.task("labelling frames", len(missing), len(missing) - len(todo)) as bar:

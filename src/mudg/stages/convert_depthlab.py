@@ -95,9 +95,9 @@ def find(folder: Path) -> Sources:
 def _only(folder: Path, found: list[Path], what: str) -> Path:
     if len(found) != 1:
         raise InputError(
-            "a part of DepthLab is missing" if not found else "a part of DepthLab is there more than once", where=str(folder),
+            "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once", where=str(folder),
             expected=f"one folder with {what}", got=", ".join(place.name for place in found) or "none",
-            remedy="lay the three folders side by side, as DepthLab's page says, and give the folder around them",
+            remedy="put the three folders into one, as DepthLab's page says, and give that folder",
         )  # fmt: skip
     return found[0]
 
@@ -123,7 +123,7 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
     try:
         vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError("the image encoder is not described", where=str(sources.encoder / "config.json"),
+        raise InputError("the image encoder has no description", where=str(sources.encoder / "config.json"),
                          got=str(error)[:300]) from error  # fmt: skip
     file = sources.base / marigold.SCHEDULE_FILE
     schedule = folders.read_settings(file)

@@ -198,7 +198,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
         average = {name: value.detach().clone() for name, value in trained.state_dict().items()}
     state = TrainingState(trained, optimizer, average)
     if state.resume(out, ranks):
-        log.info(f"learn: continues at step {state.step}")
+        log.info(f"learn: resuming at step {state.step}")
     if ranks.size > 1:
         log.info(f"learn: {ranks.size} processes, {config.compute.parallel}")
     return state, spread

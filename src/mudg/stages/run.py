@@ -241,7 +241,7 @@ class _Ledger:
                 before = {}
             else:
                 raise UsageError(
-                    "the output folder holds a run of other settings", where=str(out),
+                    "the output folder holds a run with other settings", where=str(out),
                     got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
                     remedy="choose another --out, or add --overwrite to replace it",
                 )  # fmt: skip
@@ -267,7 +267,7 @@ class _Ledger:
 
     @staticmethod
     def _foreign(out: Path) -> UsageError:
-        return UsageError("the output folder holds files of something else", where=str(out), remedy="choose an empty --out")
+        return UsageError("the output folder holds files that do not belong to this run", where=str(out), remedy="choose an empty --out")
 
     def has_report(self, key: str) -> bool:
         """Whether report.html was made of just this and is unchanged."""

@@ -181,7 +181,7 @@ def windows(frames: int, window: int, overlap: int) -> list[range]:
         UsageError: the overlap leaves no new frame per window.
     """
     if overlap >= window:
-        raise UsageError("windows overlap wholly", expected=f"overlap < {window}", got=str(overlap))
+        raise UsageError("the overlap is as long as a window", expected=f"overlap < {window}", got=str(overlap))
     if frames <= window:
         return [range(frames)]
     starts = list(range(0, frames - window, window - overlap)) + [frames - window]
@@ -294,7 +294,7 @@ class ViewMaker:
         config: SynthesizeConfig, renders: Renders | None = None,
     ) -> None:  # fmt: skip
         if not recorded:
-            log.warn("synthesize: no recorded image may be used; holes take the nearest point's colour")
+            log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
         self._rules, self._full_size = rules, config.full_size
         self._renders = renders

@@ -47,7 +47,7 @@ def start_model(
         InputError: the fused cloud has no points at all.
     """
     if len(fused.static) == 0:
-        raise InputError("the fused cloud has no static points to start from", where=scene.root, remedy="check the LiDAR of the scene")
+        raise InputError("the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene")
     kinds = METHODS[config.method].nodes
     blocks = [_static_columns(fused.static, views, classes, config)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]

@@ -142,7 +142,7 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
             raise UsageError(f"the scene has no camera named {name!r}", where=scene.root, expected=", ".join(scene.cameras))
     frames = tuple(f for f in scene.frames_in("train") if not cameras or f.view.camera.name in cameras)
     if not frames:
-        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a smaller held-out share")
+        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a larger --test-every, or 0")
     return frames
 
 
@@ -205,10 +205,10 @@ def virtual_sets(path: Path) -> dict[str, ObservationSet]:
     """
     sets = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
     if not sets:
-        raise InputError("no finished folders of observations here", where=str(path), remedy="run `mudg synthesize` first")
+        raise InputError("this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first")
     for found in sets.values():
         if found.kind == "recorded":
-            raise InputError("recorded views among the virtual ones: held-out truth must not be learnt from", where=str(found.path),
+            raise InputError("recorded views among the virtual ones: held-out views must not be trained on", where=str(found.path),
                              expected="views of kind virtual", got=f"kind recorded, source {found.source}",
                              remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
     return sets

@@ -55,8 +55,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
         found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
         if not config.depth:
-            raise UsageError("a depth network is named, but no depth is asked for", where="--depth-network",
-                             remedy="leave out --no-depth, or --depth-network")  # fmt: skip
+            raise UsageError("--depth-network contradicts --no-depth", where="--depth-network",
+                             remedy="leave out one of them")  # fmt: skip
         kind_of(config.depth_network)
         found["depth_network"] = store.digest(find(config.depth_network))
     return found

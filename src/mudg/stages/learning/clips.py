@@ -96,8 +96,8 @@ def await_shard(folder: Path, city: int, patience_s: float = 900.0) -> None:
     started = time.monotonic()
     while not path.is_file():
         if time.monotonic() - started > patience_s:
-            raise ResourceError("training clips are not arriving", where=str(path), expected=f"within {patience_s:.0f} s",
-                                remedy="look for an error of the generating processes above")  # fmt: skip
+            raise ResourceError("no training clips arrived", where=str(path), expected=f"within {patience_s:.0f} s",
+                                remedy="see the errors of the generating processes above")  # fmt: skip
         time.sleep(0.5)
 
 
@@ -149,7 +149,7 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
 def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) -> LearnConfig:
     """The configuration in terms of shards: clips of logs lie as those of cities do, one clip per shard."""
     if not scored:
-        log.warn("learn: nothing is held out; scores are of a clip that was trained on")
+        log.warn("learn: no clip is held out; the scored clip was also trained on")
     data = replace(
         config.data, cities=train, first_cities=train, clips_per_city=1, width=rules.width, height=rules.height,
         held_out=max(1, scored),
@@ -197,9 +197,9 @@ def draw_clips(
         clip = clip_shards.read_clip(folder, *picks[place])
         if clip.rgb.shape[-2:] != (config.data.height, config.data.width):
             raise InputError(
-                "training clips are of another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
+                "the training clips have another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
                 expected=f"{config.data.width}x{config.data.height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
-                remedy="give another --data.clips",
+                remedy="choose another --data.clips",
             )  # fmt: skip
         if config.data.augment:
             clip = clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))

@@ -64,8 +64,8 @@ def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
     """The codec that the leader trained, in every process."""
     saved = newest(out / "codec", ranks)
     if saved is None:
-        raise ResourceError("the trained codec is not where the leader wrote it", where=str(out / "codec"),
-                            remedy="give an --out on a file system that all processes see")  # fmt: skip
+        raise ResourceError("the trained codec that rank 0 wrote is not visible here", where=str(out / "codec"),
+                            remedy="choose an --out on a file system that all processes share")  # fmt: skip
     read_rows(saved.path, "net", nn.ModuleDict({"codec": codec}).state_dict())
 
 

@@ -114,7 +114,7 @@ class Ranks:
             raise failure
         if failed:
             raise ResourceError("another process of this training failed", got=f"{failed:.0f} of {self.size}",
-                                remedy="see its own message above or in the launcher's logs")  # fmt: skip
+                                remedy="see its message above or in the launcher's logs")  # fmt: skip
 
     def share(self, clips: int, parts: int) -> list[slice]:
         """Which clips of a batch of `clips` this process takes, in `parts` portions one after another.
@@ -144,7 +144,7 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         UsageError: the launcher's variables are not numbers.
     """
     if device == "cuda" and not torch.cuda.is_available():
-        raise ResourceError("no CUDA device here", where="--compute.device cuda", remedy="leave the flag out")
+        raise ResourceError("no CUDA device was found", where="--compute.device cuda", remedy="leave the flag out")
     if dist.is_available() and dist.is_initialized():
         yield _place(dist.get_rank(), dist.get_world_size(), device)
         return
@@ -273,7 +273,7 @@ def first_row(value: Tensor) -> int:
     (placement,) = value.placements  # type: ignore[attr-defined]
     if placement != Shard(0):
         raise ResourceError(
-            "a tensor is cut in a way that checkpoints do not know", expected="Shard(0)", got=str(placement)
+            "a tensor is sharded in a way that checkpoints do not support", expected="Shard(0)", got=str(placement)
         )
     per_rank = -(-value.shape[0] // value.device_mesh.size())  # type: ignore[attr-defined]
     return min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]

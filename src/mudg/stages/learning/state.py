@@ -178,7 +178,7 @@ class RowFiles:
             if a < b:
                 rows.append((a, part[a - first : b - first]))
         if sum(len(r) for _, r in rows) != len(piece):
-            raise IntegrityError("rows of a tensor are missing in a checkpoint", where=f"{self._where}.{name}",
+            raise IntegrityError("rows of a tensor are missing from a checkpoint", where=f"{self._where}.{name}",
                                  expected=f"{start} to {stop}", got=str([(a, len(r)) for a, r in rows]))  # fmt: skip
         return torch.cat([r for _, r in rows]) if rows else torch.empty_like(piece)
 
