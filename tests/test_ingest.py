@@ -85,7 +85,7 @@ def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp
     ],
 )
 def test_words_of_the_command_line(words: list[str], out: str | None, expected: tuple[str, str, str]) -> None:
-    asked = ingest.asked(words, Path(out) if out else None, IngestConfig())
+    asked = ingest.parse_arguments(words, Path(out) if out else None, IngestConfig())
     assert (asked.config.format, asked.log, str(asked.out)) == expected
 
 
@@ -102,9 +102,9 @@ def test_words_of_the_command_line(words: list[str], out: str | None, expected: 
 )
 def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:
     with pytest.raises(UsageError, match=expected):
-        ingest.asked(words, Path(out) if out else None, IngestConfig())
+        ingest.parse_arguments(words, Path(out) if out else None, IngestConfig())
     with pytest.raises(UsageError, match="two formats"):
-        ingest.asked(["custom", "log", "o"], None, IngestConfig(format="kitti"))
+        ingest.parse_arguments(["custom", "log", "o"], None, IngestConfig(format="kitti"))
     with pytest.raises(UsageError, match="no such format") as caught:
         ingest.run(IngestConfig(format="rosbag"), "log", Path("o"))
     assert "kitti" in caught.value.expected

@@ -35,11 +35,11 @@ TERMINATED = 143
 def _ingest(args: f.Ingest) -> dict[str, Any]:
     from mudg.stages import ingest
 
-    asked = ingest.asked(args.words, args.out, args.settings, many=args.list is not None)
+    given = ingest.parse_arguments(args.words, args.out, args.settings, many=args.list is not None)
     if args.list is not None:
-        return ingest.run_many(asked.config, args.list, asked.out, args.shard, args.jobs, args.overwrite)
+        return ingest.run_many(given.config, args.list, given.out, args.shard, args.jobs, args.overwrite)
     _only_with_list(args)
-    return {"scene": ingest.run(asked.config, asked.log, asked.out, overwrite=args.overwrite)}
+    return {"scene": ingest.run(given.config, given.log, given.out, overwrite=args.overwrite)}
 
 
 def _annotate(args: f.Annotate) -> dict[str, Any]:

@@ -82,11 +82,11 @@ def find(folder: Path) -> Sources:
             raise InputError("a published file is missing", where=str(pickles), expected=name)
     marigolds = ("MarigoldPipeline", "MarigoldDepthPipeline")
     base = _only(
-        folder, [place for place in places if _told(place / "model_index.json", "_class_name") in marigolds],
+        folder, [place for place in places if _json_value(place / "model_index.json", "_class_name") in marigolds],
         "marigold-depth-v1-0, a folder of diffusers",
     )  # fmt: skip
     encoder = _only(
-        folder, [place for place in places if _told(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
+        folder, [place for place in places if _json_value(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
         "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers",
     )  # fmt: skip
     return Sources(pickles, base, encoder)
@@ -102,7 +102,7 @@ def _only(folder: Path, found: list[Path], what: str) -> Path:
     return found[0]
 
 
-def _told(file: Path, key: str) -> object:
+def _json_value(file: Path, key: str) -> object:
     return folders.read_settings(file).get(key) if file.is_file() else None
 
 

@@ -104,7 +104,7 @@ def _alignment(scene: Scene) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class IngestArguments:
     """What a command line asks for: settings, the log (empty with a list), and the folder to write."""
 
     config: IngestConfig
@@ -112,7 +112,7 @@ class Asked:
     out: Path
 
 
-def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False) -> Asked:
+def parse_arguments(words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False) -> IngestArguments:
     """Understand ``[FORMAT] LOG [OUT]`` beside ``--out``; with a list, ``[FORMAT] [OUT]``.
 
     Raises:
@@ -138,7 +138,7 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
         raise UsageError("too many arguments", expected=usage, got=" ".join([source, *left]))
     if out is None:
         raise UsageError("no folder to write was given", expected=usage)
-    return Asked(config, source, out)
+    return IngestArguments(config, source, out)
 
 
 _OF_A_LINE = ("format", "frames", "cameras", "sequence", "poses", "boxes")

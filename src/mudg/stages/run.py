@@ -83,7 +83,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     page = out / "report.html"
     return {
         "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
-        "text": _closing_words(out, page, ledger),
+        "text": _closing_text(out, page, ledger),
     }  # fmt: skip
 
 
@@ -206,7 +206,7 @@ def _use_all_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
-def _closing_words(out: Path, report: Path, ledger: _Ledger) -> str:
+def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     from mudg.stages import score
 
     rows = "\n".join(f"  {name:<26}{seconds:8.1f} s" for name, seconds in ledger.seconds().items())

@@ -321,7 +321,7 @@ class ViewMaker:
             made = enlarge(made, size, None if self._model.points_alone else (condition, fine))
             made_views = tuple(views)
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
-        if self._model.points_alone and not taken_there(views[0], self._recorded):
+        if self._model.points_alone and not recorded_at_pose(views[0], self._recorded):
             usable[0] = False
         trust = made.confidence * usable
         observations = [
@@ -331,7 +331,7 @@ class ViewMaker:
         return sample, condition, observations
 
 
-def taken_there(view: View, recorded: Sequence[Photo]) -> bool:
+def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:
     """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
 
     The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a

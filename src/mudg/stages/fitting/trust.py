@@ -91,7 +91,7 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
             exists[inside] = pose is not None
             if pose is not None:
                 moved[inside] = geometry.transform_points(pose, local)
-        seen |= exists & _looks_at_or_through(witness, moved)
+        seen |= exists & _sees_or_sees_past(witness, moved)
     coarse = ~seen.reshape(shape)
     return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
 
@@ -169,7 +169,7 @@ def _seeds_of(
     ]  # fmt: skip
 
 
-def _looks_at_or_through(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     camera = witness.view.camera
     uv, z = geometry.project(witness.view, points)
     with np.errstate(invalid="ignore"):

@@ -282,10 +282,10 @@ class _SweepCache:
             sweeps = [sweep for sweep in self._scene.sweeps if sweep.sensor == sensor]
             nearest = min(sweeps, key=lambda sweep: abs(sweep.time_s - view.time_s))
             if abs(nearest.time_s - view.time_s) <= NEAREST_SWEEP_S:
-                clouds.append(self._at(nearest, view.time_s))
+                clouds.append(self._points_at(nearest, view.time_s))
         return visible_lidar(view, np.concatenate(clouds)) if clouds else None
 
-    def _at(self, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
+    def _points_at(self, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
         """World points of a sweep, the points of every tracked box carried from when they were measured to ``time_s``."""
         if sweep.id not in self._read:
             points = scenefile.read_points(self._scene, sweep)

@@ -25,7 +25,7 @@ from mudg.models.mdm.codec import CLASSES
 from mudg.stages.config import LearnConfig
 
 
-def held_out(config: LearnConfig) -> list[int]:
+def held_out_cities(config: LearnConfig) -> list[int]:
     """Numbers of the shards used for scoring only."""
     return [from_city.HELD_OUT + n for n in range(config.data.held_out)]
 
@@ -57,7 +57,7 @@ class MakingClips:
 
     def __init__(self, config: LearnConfig, folder: Path, points_alone: bool = False) -> None:
         self._rules, self._folder = clip_rules(config, points_alone), folder
-        wanted = [*held_out(config), *range(config.data.cities)]
+        wanted = [*held_out_cities(config), *range(config.data.cities)]
         self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
         self._workers = config.compute.workers
         self._pool: concurrent.futures.ProcessPoolExecutor | None = None
@@ -159,7 +159,7 @@ def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) 
 
 def scored_shards(config: LearnConfig) -> list[int]:
     """Numbers of the shards to score: the held-out ones, or the first one trained on where nothing was held out."""
-    return [0] if config.data.scenes and not config.data.held_out_every else held_out(config)
+    return [0] if config.data.scenes and not config.data.held_out_every else held_out_cities(config)
 
 
 def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:

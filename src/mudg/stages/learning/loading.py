@@ -74,11 +74,11 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     model = published_files.load(Path(config.model), device, dtype)
     model.split = WorkSplit(frames_at_once=1)
     if config.memory_budget_gb:
-        model.split = _fitting(model, config.memory_budget_gb, 2 if bf16 else 4, guided=config.guidance != 1)
+        model.split = _choose_split(model, config.memory_budget_gb, 2 if bf16 else 4, guided=config.guidance != 1)
     return model
 
 
-def _fitting(model: PublishedMDM, budget_gb: float, bytes_per_value: int, guided: bool) -> WorkSplit:
+def _choose_split(model: PublishedMDM, budget_gb: float, bytes_per_value: int, guided: bool) -> WorkSplit:
     """How the model's work is cut to fit a memory budget in GB."""
     split, peak_bytes = memory_plan.choose(
         memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=guided

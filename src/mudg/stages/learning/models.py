@@ -84,7 +84,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         if not _network_is_default(config):
             raise UsageError("the shape of a published-type network cannot be changed", where="--start",
                              remedy="leave out the settings of the group network")  # fmt: skip
-        return learn_published.starting(config), set()
+        return learn_published.starting_model(config), set()
     before = mdm_files.load(config.start)
     if before.config.window != config.data.window:
         log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")

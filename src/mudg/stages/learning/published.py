@@ -22,7 +22,7 @@ from mudg.stages.config import LearnConfig
 from mudg.stages.learning import score as learn_score
 
 
-def starting(config: LearnConfig) -> PublishedMDM:
+def starting_model(config: LearnConfig) -> PublishedMDM:
     """The model of `config.start` in float32, to be trained at the configured size; nothing of it is drawn anew.
 
     Raises:

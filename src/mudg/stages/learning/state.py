@@ -98,7 +98,7 @@ class TrainingState:
 
     def resume(self, folder: Path, ranks: Ranks) -> bool:
         """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this together."""
-        saved = newest(folder, ranks)
+        saved = newest_checkpoint(folder, ranks)
         if saved is None:
             return False
         ranks.all_do(lambda: self.load(saved.path))
@@ -191,7 +191,7 @@ class RowFiles:
         return self._files[path]
 
 
-def newest(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
+def newest_checkpoint(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
     """The newest checkpoint that verifies, the same for all; only the leader hashes the files."""
 
     def find() -> dict[str, Any] | None:
