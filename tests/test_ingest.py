@@ -95,7 +95,7 @@ def test_words_of_the_command_line(words: list[str], out: str | None, expected: 
         ([], None, "no log"),
         (["log"], None, "no folder"),
         (["kitti", "log"], None, "no folder"),
-        (["waymoo", "log", "o"], None, "neither such a format"),
+        (["waymoo", "log", "o"], None, "no such format"),
         ([".", "o", "p"], None, "too many arguments"),
         ([".", "o"], "p", "too many arguments"),
     ],
@@ -248,7 +248,7 @@ def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) 
     for index, config in enumerate(
         (IngestConfig(frames="0:2"), IngestConfig(cameras=("front",)), IngestConfig(resolution="60"))
     ):
-        with pytest.raises(UsageError, match="taken as it is"):
+        with pytest.raises(UsageError, match="does not apply to a scene"):
             ingest.run(config, source, tmp_path / f"refused{index}")
         with pytest.raises(UsageError, match="settings of its own"):
             ingest.run(config, "city", tmp_path / f"city{index}")

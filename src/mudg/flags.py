@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 from pydantic import ValidationError
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 from mudg.base import config as configuration
 from mudg.base.errors import UsageError
@@ -125,7 +125,7 @@ class Convert(Common):
 class Synthesize(Output):
     """Flags of ``mudg synthesize``."""
 
-    scene: Positional[Path]
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory written by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
     """Point clouds written by fuse."""
@@ -138,7 +138,7 @@ class Synthesize(Output):
 class Fit(Output):
     """Flags of ``mudg fit``."""
 
-    scene: Positional[Path]
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory written by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
     """Point clouds written by fuse."""
@@ -151,7 +151,7 @@ class Fit(Output):
 class RenderFlags(Output):
     """Flags of ``mudg render``."""
 
-    scene: Positional[Path]
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory that the Gaussian scene was fitted to."""
     model: Annotated[Path, arg(metavar="FOLDER")]
     """Gaussian scene written by fit."""
@@ -162,7 +162,7 @@ class RenderFlags(Output):
 class Score(Output):
     """Flags of ``mudg score``."""
 
-    scene: Positional[Path]
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory that the views belong to."""
     views: Annotated[tuple[str, ...], arg(metavar="NAME=FOLDER")]
     """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render."""
@@ -175,7 +175,7 @@ class Score(Output):
 class RunOwn(Output):
     """Flags of ``mudg run`` without the settings of the steps."""
 
-    source: Positional[str]
+    source: Annotated[str, tyro.conf.Positional, arg(metavar="SOURCE")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
     fast: FlagCreatePairsOff[bool] = False
     """Use smaller images, fewer frames and fewer iterations: a first result in a minute or two."""
@@ -221,7 +221,7 @@ class Demo(DemoOwn):
 class Bench(Output):
     """Flags of ``mudg bench``."""
 
-    name: Positional[str]
+    name: Annotated[str, tyro.conf.Positional, arg(metavar="BENCHMARK")]
     """Benchmark to run: mdm (diffusion model), poses (correction of box tracks) or shift (complete methods off the recorded
     path)."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")]

@@ -1,4 +1,4 @@
-"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and movers, each pixel with a confidence.
+"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and dynamic objects, each pixel with a confidence.
 
 The result is a complete new scene; the given one is not touched. A label that a frame has already is kept, one that it lacks
 is made; a scene whose frames lack nothing is copied as it is. What made the labels is written into the scene's notes, so that

@@ -86,7 +86,7 @@ def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame
             return replace(labels, depth=found.dense.depth, depth_confidence=found.dense.confidence)
         reason = f"the network's depth does not fit the LiDAR (half of the returns off by more than {found.fit.residual:.0%})"
         if not np.isfinite(found.fit.residual):
-            reason = "the network's depth does not grow with the LiDAR's"
+            reason = "the network's depth does not increase with the LiDAR's"
     log.warn(f"frame {frame_id}: {reason}; its depth is filled from LiDAR instead")
     store.write_json(_mark(staging, frame_id), {"reason": reason})
     return labels
