@@ -233,7 +233,7 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
         fuse.run_many(FuseConfig(), scenes, scenes, jobs=1, overwrite=True)
     (tmp_path / "status.json").write_text("scenes/a\n")
     entries = [batch.Entry("c", str(scenes / "a"))]
-    for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status would replace")):
+    for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status file would replace")):
         with pytest.raises(UsageError, match=words):
             batch.run_batch("fuse", entries, tmp_path, fuse._one_of_many, jobs=1, listed=list_file)
     assert (tmp_path / "status.json").read_text() == "scenes/a\n"
