@@ -60,7 +60,8 @@ def start_model(
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
     sky = _painted_sky(views) if "sky" in kinds else None
-    log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} dynamic objects")
+    static = len(blocks[0]["means"])
+    log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
     return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree)
 
 

@@ -56,7 +56,7 @@ def unseen_maps(
     chosen = [recorded[i] for i in np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))]
     witnesses = [_witness(model, stored.view, raster) for stored in chosen]
     objects = [node for node in model.nodes if isinstance(node, RigidNode)]
-    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "finding surfaces that only virtual views show")]
+    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "finding unseen surfaces")]
 
 
 def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
