@@ -32,7 +32,7 @@ def perception_of(config: VirtualConfig) -> Perception:
         codec = mdm_files.load("embedded").codec
         return _compared(CodecFeatures(codec.requires_grad_(False)), _lpips())
     if not config.lpips_weights:
-        raise UsageError("LPIPS needs a file of its weights", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
+        raise UsageError("LPIPS needs a weight file", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
     trunk = lpips_network(config.lpips_weights)
     return _compared(trunk, _lpips(trunk.channel_weights))
 
