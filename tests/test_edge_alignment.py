@@ -17,7 +17,7 @@ from mudg.core import edge_alignment as edges
 from mudg.data.city import CityConfig, write_city
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
-from mudg.data.scene.alignment import camera_alignment, words
+from mudg.data.scene.alignment import camera_alignment, describe
 from mudg.stages import doctor
 
 TURNS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -92,17 +92,17 @@ def test_a_verdict_needs_a_peak_that_is_no_accident() -> None:
     assert verdict(side - 1, middle, everywhere) == "unknown"  # at the end of the range: a slope, no peak
     assert verdict(middle + 2, middle, 0.01 * everywhere) == "unknown"
     slope = edges.EdgeAlignment(0.1, (0.0, 2.0), 0.2, 900, "unknown", 6.0)
-    assert "end of the range" in words("front", slope)
-    assert "about as well" in words("front", replace(slope, best_turn_deg=(0.0, 1.0)))
+    assert "end of the range" in describe("front", slope)
+    assert "about as well" in describe("front", replace(slope, best_turn_deg=(0.0, 1.0)))
     told = edges._judge(np.full((side * side, 40), 4.0), 400)
-    assert "do not tell" in words("front", told) and "no turn" in words("front", told)
+    assert "do not tell" in describe("front", told) and "no turn" in describe("front", told)
 
 
 def test_too_little_to_tell_is_said(tmp_path: Path) -> None:
     scene = ToyStreet().write(tmp_path / "scene", labels=False, width=60, height=30)
     found = camera_alignment(scene)["front"]
     assert found.verdict == "unknown"
-    assert "too few" in words("front", found)
+    assert "too few" in describe("front", found)
     assert camera_alignment(replace(scene, sweeps=())) == {}
 
 

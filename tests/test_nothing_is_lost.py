@@ -27,7 +27,7 @@ from mudg.bench import shift, shift_page
 from mudg.core import trajectory
 from mudg.data.city import CityConfig
 from mudg.data.scene import read_scene, write_zip
-from mudg.models.mdm import model as mdm
+from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import (
@@ -58,7 +58,7 @@ from mudg.stages.config import (
 
 SMALL = MDMConfig(
     widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4, embed_width=16,
-    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+    codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(8, 16), refine_blocks=(1, 1), area_px=24576,
 )  # fmt: skip
 CITY = CityConfig(seed=3, n_frames=3, width=48, height=32, cameras=("front",), lidar_beams=8, lidar_azimuth_step_deg=4)
 
@@ -156,7 +156,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
     given["fitted"] = fit.run(config, given["scene"], given["fused"], root / "fitted")
     torch.manual_seed(0)
-    mdm.save(MDM(SMALL), root / "model", "", {})
+    files.save(MDM(SMALL), root / "model", "", {})
     given["model"] = root / "model"
     given["city"] = ingest.run(IngestConfig(city=CITY, contact_sheet=False), ingest.CITY, root / "city")
     return given

@@ -14,15 +14,18 @@ if TYPE_CHECKING:
     from mudg.core.raster.rasterize import rasterize
     from mudg.data.observations import read_observations
     from mudg.data.scene import read_scene
+    from mudg.fitted import FittedScene, Picture
     from mudg.stages.run import run_chain
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Camera": "mudg.base.types",
+    "FittedScene": "mudg.fitted",
     "Gaussians": "mudg.base.types",
     "MudgError": "mudg.base.errors",
     "Observation": "mudg.base.types",
+    "Picture": "mudg.fitted",
     "PointCloud": "mudg.base.types",
     "Render": "mudg.base.types",
     "Scene": "mudg.base.types",
@@ -37,9 +40,11 @@ _HOMES = {
 
 __all__ = [
     "Camera",
+    "FittedScene",
     "Gaussians",
     "MudgError",
     "Observation",
+    "Picture",
     "PointCloud",
     "Render",
     "Scene",

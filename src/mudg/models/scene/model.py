@@ -19,7 +19,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base.errors import InputError, UsageError
@@ -78,18 +80,29 @@ class SceneModel:
         """Names of the dynamic objects."""
         return tuple(node.name for node in self.nodes if node.kind != "static")
 
-    def without_nodes(self, names: Sequence[str]) -> SceneModel:
-        """A copy without the named dynamic objects (the rest keeps its parameters, not its moments).
+    def dynamic_object(self, name: str) -> RigidNode:
+        """The node of a dynamic object.
 
         Raises:
             UsageError: an object that the scene has no node for (it may be parked, and so part of the background).
         """
-        known = self.node_names()
-        for name in names:
-            if name not in known:
-                raise UsageError(f"the fitted scene has no dynamic object {name!r}",
-                                 expected="one of " + ", ".join(known) if known else "a scene with dynamic objects")  # fmt: skip
-        kept = [index for index, node in enumerate(self.nodes) if node.name not in names or node.kind == "static"]
+        for node in self.nodes:
+            if isinstance(node, RigidNode) and node.name == name:
+                return node
+        known = ", ".join(self.node_names())
+        raise UsageError(
+            f"the fitted scene has no dynamic object {name!r}",
+            expected=f"one of {known}" if known else "a scene with dynamic objects",
+        )
+
+    def without_nodes(self, names: Sequence[str]) -> SceneModel:
+        """A copy without the named dynamic objects (the rest keeps its parameters, not its moments).
+
+        Raises:
+            UsageError: an object that the scene has no node for.
+        """
+        gone = {self.dynamic_object(name).name for name in names}
+        kept = [index for index, node in enumerate(self.nodes) if node.name not in gone or node.kind == "static"]
         renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
         owner = renumber[self.table.labels["node"].long()]
@@ -98,6 +111,16 @@ class SceneModel:
         return SceneModel(
             table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts)
         )
+
+    def with_object_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:
+        """A copy with one dynamic object displaced in its own frame by a rigid 4x4; it shares the table of Gaussians.
+
+        Raises:
+            UsageError: an object that the scene has no node for.
+        """
+        moved = self.dynamic_object(name)
+        nodes = tuple(moved.moved(object_from_new) if node is moved else node for node in self.nodes)
+        return SceneModel(self.table, nodes, self.sky, self.classes, self.sh_degree, dict(self.facts))
 
     # -- state ------------------------------------------------------------------------------------------------------
 

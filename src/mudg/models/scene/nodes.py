@@ -252,6 +252,13 @@ class RigidNode:
     def after_step(self, share: float) -> None:
         """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning rate."""
 
+    def moved(self, object_from_new: NDArray[np.float64]) -> Self:
+        """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box stays."""
+        columns = {name: value.detach() for name, value in self.offsets.columns.items()}
+        columns |= {"shift": torch.zeros_like(columns["shift"]), "yaw": torch.zeros_like(columns["yaw"])}
+        keys = self.corrected_keys() @ object_from_new
+        return type(self)(self.name, self.label, self.size_m, self.times_s, keys, Table(columns), self.learn_pose)
+
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``Node``."""
         facts = {"name": self.name, "label": self.label, "size_m": list(self.size_m), "learn_pose": self.learn_pose}

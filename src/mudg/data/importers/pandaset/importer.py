@@ -47,13 +47,9 @@ from mudg.data.importers.pandaset.pandas_frame import read_frame
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
 CAMERAS: Final = {
-    "front_camera": "front",
-    "front_left_camera": "front_left",
-    "front_right_camera": "front_right",
-    "left_camera": "left",
-    "right_camera": "right",
-    "back_camera": "back",
-}
+    "front_camera": "front", "front_left_camera": "front_left", "front_right_camera": "front_right",
+    "left_camera": "left", "right_camera": "right", "back_camera": "back",
+}  # fmt: skip
 SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
 OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
 """Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
@@ -163,15 +159,8 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     origin, numbers = Source("pandaset", LICENCE, None, tuple(notes)), range(len(frames))
     content = SceneContent(
-        folder.resolve().name,
-        origin,
-        fits,
-        numbers,
-        convert,
-        lambda index: f"frame {frames[index]}",
-        motion.ego,
-        tracks,
-    )
+        folder.resolve().name, origin, fits, numbers, convert, lambda index: f"frame {frames[index]}", motion.ego, tracks
+    )  # fmt: skip
     return write_scene(content, out, options)
 
 

@@ -184,72 +184,47 @@ def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
 
 # --- the messages of the data set -----------------------------------------------------------------------------------
 
-_TRANSFORM = Message("Transform", {1: Field("values", "doubles")})
-_CAMERA_CALIBRATION = Message(
-    "CameraCalibration",
-    {
-        1: Field("name", "int"), 2: Field("intrinsic", "doubles"), 3: Field("extrinsic", "message", _TRANSFORM),
-        4: Field("width", "int"), 5: Field("height", "int"), 6: Field("direction", "int"),
-    },
+
+def _message(title: str, /, **fields: tuple[Any, ...]) -> Message:
+    """A description from fields by name: number, kind and, for messages, their description."""
+    return Message(title, {number: Field(field, *kind) for field, (number, *kind) in fields.items()})
+
+
+_TRANSFORM = _message("Transform", values=(1, "doubles"))
+_CAMERA_CALIBRATION = _message(
+    "CameraCalibration", name=(1, "int"), intrinsic=(2, "doubles"), extrinsic=(3, "message", _TRANSFORM),
+    width=(4, "int"), height=(5, "int"), direction=(6, "int")
 )  # fmt: skip
-_LASER_CALIBRATION = Message(
-    "LaserCalibration",
-    {
-        1: Field("name", "int"), 2: Field("inclinations", "doubles"), 3: Field("inclination_min", "double"),
-        4: Field("inclination_max", "double"), 5: Field("extrinsic", "message", _TRANSFORM),
-    },
+_LASER_CALIBRATION = _message(
+    "LaserCalibration", name=(1, "int"), inclinations=(2, "doubles"), inclination_min=(3, "double"),
+    inclination_max=(4, "double"), extrinsic=(5, "message", _TRANSFORM)
 )  # fmt: skip
-_STATS = Message("Stats", {2: Field("time_of_day", "text"), 3: Field("location", "text"), 4: Field("weather", "text")})
-CONTEXT: Final = Message(
-    "Context",
-    {
-        1: Field("name", "text"), 2: Field("cameras", "messages", _CAMERA_CALIBRATION),
-        3: Field("lasers", "messages", _LASER_CALIBRATION), 4: Field("stats", "message", _STATS),
-    },
+_STATS = _message("Stats", time_of_day=(2, "text"), location=(3, "text"), weather=(4, "text"))
+CONTEXT: Final = _message(
+    "Context", name=(1, "text"), cameras=(2, "messages", _CAMERA_CALIBRATION),
+    lasers=(3, "messages", _LASER_CALIBRATION), stats=(4, "message", _STATS)
 )  # fmt: skip
-_VELOCITY = Message(
-    "Velocity",
-    {
-        1: Field("v_x", "float"), 2: Field("v_y", "float"), 3: Field("v_z", "float"),
-        4: Field("w_x", "double"), 5: Field("w_y", "double"), 6: Field("w_z", "double"),
-    },
+_VELOCITY = _message(
+    "Velocity", v_x=(1, "float"), v_y=(2, "float"), v_z=(3, "float"), w_x=(4, "double"), w_y=(5, "double"),
+    w_z=(6, "double")
 )  # fmt: skip
-_PANOPTIC = Message("CameraSegmentationLabel", {1: Field("divisor", "int"), 2: Field("png", "bytes")})
-_CAMERA_IMAGE = Message(
-    "CameraImage",
-    {
-        1: Field("name", "int"), 2: Field("image", "bytes"), 3: Field("pose", "message", _TRANSFORM),
-        4: Field("velocity", "message", _VELOCITY), 5: Field("pose_time_s", "double"), 6: Field("shutter_s", "double"),
-        7: Field("trigger_s", "double"), 8: Field("done_s", "double"), 10: Field("panoptic", "message", _PANOPTIC),
-    },
+_PANOPTIC = _message("CameraSegmentationLabel", divisor=(1, "int"), png=(2, "bytes"))
+_CAMERA_IMAGE = _message(
+    "CameraImage", name=(1, "int"), image=(2, "bytes"), pose=(3, "message", _TRANSFORM),
+    velocity=(4, "message", _VELOCITY), pose_time_s=(5, "double"), shutter_s=(6, "double"), trigger_s=(7, "double"),
+    done_s=(8, "double"), panoptic=(10, "message", _PANOPTIC)
 )  # fmt: skip
-_RANGE_IMAGE = Message(
-    "RangeImage", {2: Field("ranges", "bytes"), 3: Field("projections", "bytes"), 4: Field("poses", "bytes")}
-)
-_LASER = Message(
-    "Laser",
-    {
-        1: Field("name", "int"),
-        2: Field("return1", "message", _RANGE_IMAGE),
-        3: Field("return2", "message", _RANGE_IMAGE),
-    },
-)
-_BOX = Message(
-    "Box",
-    {
-        1: Field("x", "double"), 2: Field("y", "double"), 3: Field("z", "double"), 4: Field("width", "double"),
-        5: Field("length", "double"), 6: Field("height", "double"), 7: Field("heading", "double"),
-    },
+_RANGE_IMAGE = _message("RangeImage", ranges=(2, "bytes"), projections=(3, "bytes"), poses=(4, "bytes"))
+_LASER = _message("Laser", name=(1, "int"), return1=(2, "message", _RANGE_IMAGE), return2=(3, "message", _RANGE_IMAGE))
+_BOX = _message(
+    "Box", x=(1, "double"), y=(2, "double"), z=(3, "double"), width=(4, "double"), length=(5, "double"),
+    height=(6, "double"), heading=(7, "double")
 )  # fmt: skip
-_LABEL = Message("Label", {1: Field("box", "message", _BOX), 3: Field("type", "int"), 4: Field("id", "text")})
-FRAME: Final = Message(
-    "Frame",
-    {
-        1: Field("context", "bytes"), 2: Field("timestamp_us", "int"), 3: Field("pose", "message", _TRANSFORM),
-        4: Field("images", "messages", _CAMERA_IMAGE), 5: Field("lasers", "messages", _LASER),
-        6: Field("labels", "messages", _LABEL),
-    },
+_LABEL = _message("Label", box=(1, "message", _BOX), type=(3, "int"), id=(4, "text"))
+FRAME: Final = _message(
+    "Frame", context=(1, "bytes"), timestamp_us=(2, "int"), pose=(3, "message", _TRANSFORM),
+    images=(4, "messages", _CAMERA_IMAGE), lasers=(5, "messages", _LASER), labels=(6, "messages", _LABEL)
 )  # fmt: skip
-_SHAPE = Message("MatrixShape", {1: Field("dims", "ints")})
-MATRIX_FLOAT: Final = Message("MatrixFloat", {1: Field("data", "floats"), 2: Field("shape", "message", _SHAPE)})
-MATRIX_INT: Final = Message("MatrixInt32", {1: Field("data", "ints"), 2: Field("shape", "message", _SHAPE)})
+_SHAPE = _message("MatrixShape", dims=(1, "ints"))
+MATRIX_FLOAT: Final = _message("MatrixFloat", data=(1, "floats"), shape=(2, "message", _SHAPE))
+MATRIX_INT: Final = _message("MatrixInt32", data=(1, "ints"), shape=(2, "message", _SHAPE))

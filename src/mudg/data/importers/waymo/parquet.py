@@ -133,17 +133,9 @@ class ParquetLog:
         for number, time in chosen:
             here = f"{self._root}: {self.name}, frame {number}"
             lasers = [] if self._lidar is None else [name for name, _ in self._lidar.rows(time, _LASER, LASERS)]
-            frames.append(
-                FrameRecord(
-                    number,
-                    time,
-                    records.transform_of(poses[time], here),
-                    records.by_name(shots.get(time, ()), time, here),
-                    records.each_once(lasers, here),
-                    tuple(boxes.get(time, ())),
-                    here,
-                )  # fmt: skip
-            )
+            pose, found = records.transform_of(poses[time], here), records.by_name(shots.get(time, ()), time, here)
+            names = records.each_once(lasers, here)
+            frames.append(FrameRecord(number, time, pose, found, names, tuple(boxes.get(time, ())), here))
         return frames
 
     def _shots(self) -> dict[int, list[tuple[str, records.CameraShot]]]:

@@ -19,6 +19,7 @@ from mudg.data.importers.common import rigid_pose
 from mudg.data.importers.waymo.messages import MATRIX_FLOAT, MATRIX_INT, Message, parse_message
 
 Matrix = NDArray[np.float64]
+Numbers = Sequence[float] | NDArray[np.float64]
 
 CAMERAS: Final[Mapping[int, str]] = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 LASERS: Final[Mapping[int, str]] = {1: "top", 2: "front", 3: "side_left", 4: "side_right", 5: "rear"}
@@ -171,7 +172,7 @@ class WaymoLog(Protocol):
 # --- records from the numbers of either form ----------------------------------------------------------------------------
 
 
-def transform_of(values: Sequence[float] | NDArray[np.float64], where: str) -> Matrix:
+def transform_of(values: Numbers, where: str) -> Matrix:
     """A rigid 4x4 from its sixteen numbers, row by row.
 
     Raises:
@@ -183,7 +184,7 @@ def transform_of(values: Sequence[float] | NDArray[np.float64], where: str) -> M
 
 
 def camera_of(
-    name: str, intrinsic: Sequence[float], extrinsic: Sequence[float], image: tuple[int, int, int], where: str
+    name: str, intrinsic: Sequence[float], extrinsic: Numbers, image: tuple[int, int, int], where: str
 ) -> CameraCalibration:
     """A calibration from its numbers; ``image`` is width, height and the direction of the shutter.
 
@@ -197,7 +198,7 @@ def camera_of(
 
 
 def laser_of(
-    name: str, beams: Sequence[float], limits: tuple[float, float], extrinsic: Sequence[float], where: str
+    name: str, beams: Sequence[float], limits: tuple[float, float], extrinsic: Numbers, where: str
 ) -> LaserCalibration:
     """A calibration from its numbers: inclinations of the beams, or none and their limits, in radians.
 

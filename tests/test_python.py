@@ -1,0 +1,84 @@
+"""What a notebook user does: the page docs/python.md as it stands, verbs as functions, edits of a fitted scene."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mudg
+from mudg import verbs
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import yaw_matrix
+
+
+@pytest.fixture(scope="module")
+def session(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Names that the page's code leaves behind, run from top to bottom in an empty folder."""
+    blocks = re.findall(r"```python\n(.*?)```", (repository / "docs" / "python.md").read_text(), re.DOTALL)
+    assert len(blocks) == 4
+    names: dict[str, Any] = {}
+    folder = tmp_path_factory.mktemp("notebook")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for block in blocks:
+            exec(compile(block, "docs/python.md", "exec"), names)
+    return {**names, "folder": folder}
+
+
+def test_the_page_runs_and_renders_what_it_says(session: dict[str, Any]) -> None:
+    picture, view = session["picture"], session["view"]
+    assert picture.rgb.shape == (80, 120, 3)
+    assert picture.rgb.dtype == np.uint8
+    assert picture.depth_m.shape == picture.classes.shape == picture.coverage.shape == (80, 120)
+    assert 0 < np.nanmedian(picture.depth_m) < 100
+    same = session["fitted"].render(view.camera, view.world_from_cam, view.time_s)
+    assert (same.rgb != picture.rgb).mean() > 0.2  # two metres aside looks different
+    assert session["depth_m"].shape == (1, 80, 120)
+
+
+def test_a_render_in_memory_is_the_render_of_the_command(session: dict[str, Any]) -> None:
+    stored = mudg.read_observations(session["folder"] / "views" / "front_shift+2.0")
+    view = stored[0].view
+    picture = session["fitted"].render(view.camera, view.world_from_cam, view.time_s)
+    assert np.abs(picture.rgb / 255 - stored[0].rgb.permute(1, 2, 0).numpy()).max() <= 1 / 255
+    both = np.isfinite(picture.depth_m) & np.isfinite(stored[0].depth[0].numpy())
+    assert both.any()
+    assert np.allclose(picture.depth_m[both], stored[0].depth[0].numpy()[both], rtol=1e-3)
+
+
+def test_objects_can_be_removed_and_moved(session: dict[str, Any]) -> None:
+    fitted, view = session["fitted"], session["view"]
+    assert fitted.method == "street_gaussians"
+    name = fitted.object_ids[0]
+    gone = fitted.without(name)
+    assert name not in gone.object_ids
+    assert len(gone) < len(fitted)
+    pose = fitted.object_pose(name, view.time_s)
+    moved = fitted.moved(name, yaw_matrix(0.0, (3.0, 0.0, 0.0)))
+    assert np.allclose(moved.object_pose(name, view.time_s), pose @ yaw_matrix(0.0, (3.0, 0.0, 0.0)), atol=1e-5)
+    assert np.array_equal(fitted.object_pose(name, view.time_s), pose)  # the original stays
+    assert fitted.object_pose(name, view.time_s + 1e4) is None
+    with pytest.raises(UsageError, match="no dynamic object"):
+        fitted.without("nobody")
+    with pytest.raises(InputError, match="not rigid"):
+        fitted.moved(name, np.diag([2.0, 1, 1, 1]))
+    with pytest.raises(InputError, match="rigid"):
+        fitted.render(view.camera, np.zeros((4, 4)), view.time_s)
+
+
+def test_verbs_check_settings_as_the_command_does(session: dict[str, Any], tmp_path: Path) -> None:
+    folder = session["folder"]
+    with pytest.raises(UsageError, match="unknown configuration key voxel"):
+        verbs.fuse(folder / "scene", tmp_path / "x", voxel=0.1)
+    with pytest.raises(UsageError, match="not valid"):
+        verbs.fuse(folder / "scene", tmp_path / "x", voxel_m=-1)
+    with pytest.raises(UsageError, match="unknown configuration key loss"):
+        verbs.fit(folder / "scene", folder / "fused", tmp_path / "x", loss={"nonsense": 1})
+    assert not (tmp_path / "x").exists()
+    assert verbs.fuse(folder / "scene", folder / "fused") == folder / "fused"  # verified and reused
+    assert verbs.doctor()["problems"] is not None
+    assert mudg.read_scene(folder / "scene").frames
