@@ -32,6 +32,10 @@ FLOORS = ("base", "core", "native", "data", "models", "report", "stages", "bench
 GROUPS = ("virtual", "loss", "densify", "poses", "objects", "appearance", "start", "optimizer", "compute", "network", "codec", "city")
 
 
+FILE_ENDINGS = tuple(f".{ending}" for ending in "py json jsonl yaml txt md png jpg mp4 html pt safetensors".split())
+FOREIGN_NAMES = ("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud")
+
+
 class Block(NamedTuple):
     """A fenced block of a page."""
 
@@ -174,7 +178,30 @@ def unknown_settings(text: str) -> list[str]:
     """Settings written as ``group.name`` that no verb has as a flag."""
     known = {flag for flags in FLAGS.values() for flag in flags}
     found = [m for code in code_in(text) for m in re.findall(rf"(?<![\w./-])((?:{'|'.join(GROUPS)})\.[a-z][a-z0-9_]*)", code)]
-    return [name for name in found if "--" + name.replace("_", "-") not in known and not name.endswith((".py", ".json", ".safetensors"))]
+    return [name for name in found if "--" + name.replace("_", "-") not in known and not name.endswith(FILE_ENDINGS)]
+
+
+@cache
+def source() -> dict[str, str]:
+    """The text of every module, keyed by its path."""
+    return {str(p): p.read_text(encoding="utf-8") for p in (REPOSITORY / "src" / "mudg").rglob("*.py")}
+
+
+def unknown_names(text: str) -> list[str]:
+    """Functions written as ``module.name`` and classes, with or without a member, that the package lacks."""
+    problems = []
+    for code in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text):
+        found = re.match(r"([a-z0-9_]+)\.([A-Za-z_]\w*)(?:\(|$)", code)
+        homes = [t for p, t in source().items() if found and p.endswith(f"/{found[1]}.py")]
+        if found and homes and found[1] not in GROUPS and not code.endswith(FILE_ENDINGS):
+            known = any(re.search(rf"^(?:def |class )?{found[2]}\b", t, re.MULTILINE) for t in homes)
+            problems += [] if known else [code]
+        found = re.match(r"([A-Z][a-z]+[A-Z]\w*)(?:\.(\w+))?(?:\(|$)", code)
+        if found:
+            homes = [t for t in source().values() if re.search(rf"^class {found[1]}\b", t, re.MULTILINE)]
+            known = any(found[2] is None or re.search(rf"\b{found[2]}\b", t) for t in homes)
+            problems += [] if known or found[1] in FOREIGN_NAMES else [code]
+    return problems
 
 
 def unknown_paths(text: str) -> list[str]:
@@ -216,11 +243,12 @@ def broken_links(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=name_of)
-def test_flags_settings_paths_and_links_exist(page: Path) -> None:
+def test_flags_settings_paths_names_and_links_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert not unknown_flags(text)
     assert not unknown_settings(text)
     assert not unknown_paths(text)
+    assert not unknown_names(text)
     assert not broken_links(page)
 
 
@@ -237,6 +265,10 @@ def test_what_does_not_exist_is_found(tmp_path: Path) -> None:
     assert not unknown_flags("`mudg fit --virtual.probability 0.4`, `--inplace`")
     assert unknown_settings("`virtual.probabilty`") == ["virtual.probabilty"]
     assert not unknown_settings("`virtual.probability`")
+    assert unknown_names("`losses.no_such` `NoSuch(a=1)` `SceneModel.no_such`") == [
+        "losses.no_such", "NoSuch(a=1)", "SceneModel.no_such",
+    ]  # fmt: skip
+    assert not unknown_names("`losses.object_map` `SceneModel.without_nodes` `run.json`")
     assert unknown_paths("`stages/no_such.py` `no_such.py` `models/no_such/`") == [
         "stages/no_such.py", "no_such.py", "models/no_such/",
     ]  # fmt: skip
