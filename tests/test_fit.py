@@ -262,7 +262,7 @@ def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
     with pytest.raises(UsageError, match="virtual observations"):
         fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no finished folders"):
+    with pytest.raises(InputError, match="no finished virtual views"):
         fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "empty")
 
 

@@ -201,7 +201,7 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
             learn.run(published_settings(converted, clips, **wrong), tmp_path / "run")
     with pytest.raises(UsageError, match="multiples of 4"):
         learn.run(published_settings(converted, clips, width=50), tmp_path / "run")
-    with pytest.raises(UsageError, match="cannot be described"):
+    with pytest.raises(UsageError, match="cannot be changed"):
         learn.run(published_settings(converted, clips, widths=(16, 32, 64)), tmp_path / "run")
     with pytest.raises(UsageError, match="without a refiner"):
         learn.run(published_settings(converted, clips, frozen="denoiser"), tmp_path / "refiner")

@@ -510,9 +510,9 @@ def test_the_reference_fits_only_where_it_was_taken(street):
     view = scene.frames_of("front")[1].view
     moved = view.world_from_cam.copy()
     moved[:3, 3] += [0.0, 1.0, 0.0]
-    assert synthesize.taken_there(view, recorded)
-    assert not synthesize.taken_there(View(view.camera, moved, view.time_s), recorded)
-    assert not synthesize.taken_there(view, [])
+    assert synthesize.recorded_at_pose(view, recorded)
+    assert not synthesize.recorded_at_pose(View(view.camera, moved, view.time_s), recorded)
+    assert not synthesize.recorded_at_pose(view, [])
 
 
 def test_short_trajectories_are_refused_in_words(street, tmp_path):

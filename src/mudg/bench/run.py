@@ -47,12 +47,12 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
     """Run one of `BENCHES`, or shift; returns the folder with `bench.json` and `bench.md`.
 
     Raises:
-        UsageError: there is no such measurement.
+        UsageError: there is no such benchmark.
     """
     if name == SHIFT:  # made of verbs that each keep their own folder
         return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
-        raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
+        raise UsageError("no such benchmark", expected=" or ".join((*BENCHES, SHIFT)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
     directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), to_dict(config), inputs, overwrite)

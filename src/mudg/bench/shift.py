@@ -148,7 +148,7 @@ def _refuse_foreign(out: Path) -> None:
         except (InputError, KeyError, TypeError):
             foreign = [name for name in names if name in _PAGES]
     if foreign:
-        raise UsageError("the output folder holds files of something else", where=str(out), got=", ".join(sorted(foreign)[:8]),
+        raise UsageError("the output folder holds files that do not belong to this run", where=str(out), got=", ".join(sorted(foreign)[:8]),
                          remedy="choose an empty --out")  # fmt: skip
 
 

@@ -67,7 +67,7 @@ def run(
     if replaces and not overwrite:
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
     if replaces and not _holds_model(to):
-        raise UsageError("the folder holds something else than a model", where=str(to), remedy="choose another --to")
+        raise UsageError("the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to")
     place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
     work, limit = (
         _from_folder(config, checkpoint, place)
@@ -122,8 +122,8 @@ def _from_file(
 def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Callable[[], None], int]:
     """The conversion of DepthLab's files, and the address space it may take."""
     if config.resolution != "auto" or config.towers:
-        raise UsageError("a folder is read as DepthLab, which has neither resolution nor towers", where=str(folder),
-                         remedy="leave out --resolution and --towers, or name a checkpoint file")  # fmt: skip
+        raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(folder),
+                         remedy="leave them out, or give a checkpoint file")  # fmt: skip
     files = convert_depthlab.find(folder).files()
     work = functools.partial(
         convert_depthlab.convert_folder, folder, to, DTYPES[config.dtype], config.shard_mb << 20
@@ -141,7 +141,7 @@ def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
             if mark in part:
                 return size
     raise UsageError(
-        "the file's name does not tell which resolution the model was trained at", where=str(checkpoint), expected="512 or 1024 in it",
+        "the training resolution is not in the file's name", where=str(checkpoint), expected="512 or 1024 in the name",
         remedy="add --resolution 320x512 or --resolution 576x1024",
     )  # fmt: skip
 
@@ -193,7 +193,7 @@ def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
         raise InputError(
             "this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where), got=", ".join(marks[:3]),
             expected="MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule that never "
-            "reaches pure noise and no dynamic rescale, and weighs its image attention by learnt factors",
+            "reaches pure noise and no dynamic rescale, and weights its image attention with learned factors",
             remedy="take the 512 or 1024 checkpoint",
         )  # fmt: skip
 
@@ -238,13 +238,13 @@ def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], wh
     scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
     if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
         raise InputError(
-            "the table of the dynamic rescale is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
+            "the dynamic rescale table is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
             got=f"{float(scale.min())} .. {float(scale.max())}",
         )  # fmt: skip
     if alpha_bar is not None and abs(float(alpha_bar.flatten()[-1])) > 1e-6:
         raise InputError(
             "the checkpoint's noise schedule keeps signal at its last step", where=f"{where}: alphas_cumprod[-1]", expected="0",
-            got=str(float(alpha_bar.flatten()[-1])), remedy="this is another model, though its tensors have the same names",
+            got=str(float(alpha_bar.flatten()[-1])), remedy="take a MuDG or DynamiCrafter checkpoint; this is another model",
         )  # fmt: skip
 
 

@@ -82,11 +82,11 @@ def find(folder: Path) -> Sources:
             raise InputError("a published file is missing", where=str(pickles), expected=name)
     marigolds = ("MarigoldPipeline", "MarigoldDepthPipeline")
     base = _only(
-        folder, [place for place in places if _told(place / "model_index.json", "_class_name") in marigolds],
+        folder, [place for place in places if _json_value(place / "model_index.json", "_class_name") in marigolds],
         "marigold-depth-v1-0, a folder of diffusers",
     )  # fmt: skip
     encoder = _only(
-        folder, [place for place in places if _told(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
+        folder, [place for place in places if _json_value(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
         "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers",
     )  # fmt: skip
     return Sources(pickles, base, encoder)
@@ -95,14 +95,14 @@ def find(folder: Path) -> Sources:
 def _only(folder: Path, found: list[Path], what: str) -> Path:
     if len(found) != 1:
         raise InputError(
-            "a part of DepthLab is missing" if not found else "a part of DepthLab is there more than once", where=str(folder),
+            "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once", where=str(folder),
             expected=f"one folder with {what}", got=", ".join(place.name for place in found) or "none",
-            remedy="lay the three folders side by side, as DepthLab's page says, and give the folder around them",
+            remedy="put the three folders into one, as DepthLab's page says, and give that folder",
         )  # fmt: skip
     return found[0]
 
 
-def _told(file: Path, key: str) -> object:
+def _json_value(file: Path, key: str) -> object:
     return folders.read_settings(file).get(key) if file.is_file() else None
 
 
@@ -123,7 +123,7 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
     try:
         vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError("the image encoder is not described", where=str(sources.encoder / "config.json"),
+        raise InputError("the image encoder has no description", where=str(sources.encoder / "config.json"),
                          got=str(error)[:300]) from error  # fmt: skip
     file = sources.base / marigold.SCHEDULE_FILE
     schedule = folders.read_settings(file)

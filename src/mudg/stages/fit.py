@@ -96,7 +96,7 @@ def run(
     """
     learns_virtual = "virtual" in METHODS[config.method].supervision
     if learns_virtual and observations is None:
-        raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and hand its folder on")
+        raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and add --observations FOLDER")
     refuse_overlap(
         out, {"scene": scene, "fused": fused, "observations": observations, "virtual.lpips-weights": config.virtual.lpips_weights}
     )
@@ -148,7 +148,7 @@ def _prepare(config: FitConfig, scene_path: Path, fused_path: Path, virtual: Map
     found = checkpoint.latest(out / "steps")
     if found is None:
         return start_state(config, scene, fused, views, classes)
-    log.info(f"continuing at step {found.step} of {config.iterations}")
+    log.info(f"resuming at step {found.step} of {config.iterations}")
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
     stats, appearance = found.tensors("stats"), Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
     return FitState(
@@ -502,7 +502,7 @@ def load_model(folder: Path) -> SceneModel:
     """
     folder = Path(folder)
     if not (folder / "model.json").is_file():
-        raise InputError("no fitted scene here", where=str(folder), expected="a folder made by `mudg fit`")
+        raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
     values = store.read_json(folder / "model.json")

@@ -90,7 +90,7 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path
     }
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
-        log.info(f"ingest: look at {folder.out / sheet.name}")
+        log.info(f"ingest: check {folder.out / sheet.name}")
     folder.finish({**summary, **({} if kind == CITY else _alignment(scene))})
     return folder.path
 
@@ -104,7 +104,7 @@ def _alignment(scene: Scene) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class IngestArguments:
     """What a command line asks for: settings, the log (empty with a list), and the folder to write."""
 
     config: IngestConfig
@@ -112,7 +112,7 @@ class Asked:
     out: Path
 
 
-def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False) -> Asked:
+def parse_arguments(words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False) -> IngestArguments:
     """Understand ``[FORMAT] LOG [OUT]`` beside ``--out``; with a list, ``[FORMAT] [OUT]``.
 
     Raises:
@@ -124,7 +124,7 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
     named = len(left) > 0 and left[0] in formats and (len(left) > logs + (out is None) or not Path(left[0]).exists())
     if named:
         if config.format not in ("auto", left[0]):
-            raise UsageError("two formats are given", got=f"{left[0]} and --format {config.format}")
+            raise UsageError("two formats were given", got=f"{left[0]} and --format {config.format}")
         config = replace(config, format=left.pop(0))
     usage = "mudg ingest [FORMAT] LOG OUT, or mudg ingest [FORMAT] --list FILE --out ROOT"
     source = "" if many or not left else left.pop(0)
@@ -134,11 +134,11 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
         out = Path(left.pop(0))
     if left:
         if not many and not Path(source).exists() and source != CITY:
-            raise UsageError("there is neither such a format nor such a log", expected=", ".join(formats), got=source)
-        raise UsageError("there are too many words", expected=usage, got=" ".join([source, *left]))
+            raise UsageError("no such format and no such log", expected=", ".join(formats), got=source)
+        raise UsageError("too many arguments", expected=usage, got=" ".join([source, *left]))
     if out is None:
         raise UsageError("no folder to write was given", expected=usage)
-    return Asked(config, source, out)
+    return IngestArguments(config, source, out)
 
 
 _OF_A_LINE = ("format", "frames", "cameras", "sequence", "poses", "boxes")
@@ -182,7 +182,7 @@ def _kind(config: IngestConfig, source: Path) -> str:
         return _SCENE
     for name, looks_like in RECOGNISERS.items():
         if looks_like(source):
-            log.info(f"ingest: {source} looks like {name}")
+            log.info(f"ingest: {source} recognised as {name}")
             return name
     inside = "a file"
     if source.is_dir():
@@ -286,7 +286,7 @@ def _refuse(config: IngestConfig, names: Sequence[str], what: str, remedy: str) 
 
 def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
     """Copy a scene, every file checked; held-out frames are kept as the scene has them."""
-    _refuse(config, _OF_A_LOG, "a scene is taken as it is", "leave it out")
+    _refuse(config, _OF_A_LOG, "this setting does not apply to a scene, which is copied unchanged", "leave it out")
     scene = read_scene(source)
     with SceneWriter(out, scene.id, scene.source) as writer:
         writer.copy_all_but_frames(scene)

@@ -85,7 +85,7 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunD
     opened: list[RunDir] = []
     settings = {name: value for name, value in to_dict(config).items() if name != "compute"}
 
-    def open_it() -> str:
+    def open_run() -> str:
         sources = [from_log.log_source(text) for text in config.data.scenes]
         _refuse_overlap(config, out, sources, overwrite)
         inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
@@ -96,7 +96,7 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunD
             opened[0].reused()
         return "" if opened[0].complete else str(opened[0].path)
 
-    path = ranks.leader_does(open_it)
+    path = ranks.leader_does(open_run)
     if not path:
         return None
     return opened[0] if ranks.leads else RunDir(out, Path(path), _OUTPUT, "", {})
@@ -198,7 +198,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
         average = {name: value.detach().clone() for name, value in trained.state_dict().items()}
     state = TrainingState(trained, optimizer, average)
     if state.resume(out, ranks):
-        log.info(f"learn: continues at step {state.step}")
+        log.info(f"learn: resuming at step {state.step}")
     if ranks.size > 1:
         log.info(f"learn: {ranks.size} processes, {config.compute.parallel}")
     return state, spread

@@ -69,7 +69,7 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     """
     cameras = config.cameras or tuple(scene.cameras)[:1]
     if not config.shifts_m:
-        raise UsageError("nothing to render: no shifts given", remedy="0 is the recorded drive")
+        raise UsageError("nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path")
     paths = []
     for camera in cameras:
         for shift_m in config.shifts_m:

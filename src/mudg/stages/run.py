@@ -83,7 +83,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     page = out / "report.html"
     return {
         "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
-        "text": _closing_words(out, page, ledger),
+        "text": _closing_text(out, page, ledger),
     }  # fmt: skip
 
 
@@ -206,7 +206,7 @@ def _use_all_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
-def _closing_words(out: Path, report: Path, ledger: _Ledger) -> str:
+def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     from mudg.stages import score
 
     rows = "\n".join(f"  {name:<26}{seconds:8.1f} s" for name, seconds in ledger.seconds().items())
@@ -241,7 +241,7 @@ class _Ledger:
                 before = {}
             else:
                 raise UsageError(
-                    "the output folder holds a run of other settings", where=str(out),
+                    "the output folder holds a run with other settings", where=str(out),
                     got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
                     remedy="choose another --out, or add --overwrite to replace it",
                 )  # fmt: skip
@@ -267,7 +267,7 @@ class _Ledger:
 
     @staticmethod
     def _foreign(out: Path) -> UsageError:
-        return UsageError("the output folder holds files of something else", where=str(out), remedy="choose an empty --out")
+        return UsageError("the output folder holds files that do not belong to this run", where=str(out), remedy="choose an empty --out")
 
     def has_report(self, key: str) -> bool:
         """Whether report.html was made of just this and is unchanged."""

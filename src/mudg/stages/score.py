@@ -212,7 +212,7 @@ def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Ob
         for method, index in nearest.items():
             distance_m = apart_m(sets[method].views[index], view)
             if distance_m > SAME_PLACE_M:
-                raise InputError("two methods rendered one trajectory from different places",
+                raise InputError("two methods rendered the same trajectory from different positions",
                                  where=f"{name}: {method}, view {index}", got=f"{distance_m:.3f} m apart")  # fmt: skip
             indices[method].append(index)
         camera = scene.cameras.get(view.camera.name, view.camera)

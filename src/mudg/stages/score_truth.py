@@ -89,7 +89,7 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
         return folder.reused()
     truth = truth_of(read_scene(scene))
     if not truth.exact:
-        raise InputError("only a generated city has truth at any view", where=str(scene))
+        raise InputError("only a generated city has ground truth at every view", where=str(scene))
     with log.task("truth", sum(map(len, trajectories))) as bar:
         for path in trajectories:
             masks = []
@@ -97,7 +97,7 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
                     if true is None or true.moving is None:
-                        raise InputError("the city has no truth here", where=f"{path.name}, {view.time_s:g} s")
+                        raise InputError("the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s")
                     masks.append(true.moving[0].numpy().astype(np.uint8))
                     if len(masks) <= writer.done:
                         writer.skip(view)  # an interrupted run wrote it
@@ -118,7 +118,7 @@ def stored_truth(folder: Path) -> Truth:
         stored = sets.get(name)
         if stored is None:
             raise InputError(
-                "the folder of truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
+                "the folder of ground truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
             )
         index = min(range(len(stored)), key=lambda i: abs(stored.views[i].time_s - view.time_s))
         there = stored.views[index]
@@ -126,7 +126,7 @@ def stored_truth(folder: Path) -> Truth:
         same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
         if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
             raise InputError(
-                "the stored truth shows another view", where=f"{folder / name}, view {index}",
+                "the stored ground truth shows another view", where=f"{folder / name}, view {index}",
                 expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
                 got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
             )  # fmt: skip

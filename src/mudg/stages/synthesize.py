@@ -181,7 +181,7 @@ def windows(frames: int, window: int, overlap: int) -> list[range]:
         UsageError: the overlap leaves no new frame per window.
     """
     if overlap >= window:
-        raise UsageError("windows overlap wholly", expected=f"overlap < {window}", got=str(overlap))
+        raise UsageError("the overlap is as long as a window", expected=f"overlap < {window}", got=str(overlap))
     if frames <= window:
         return [range(frames)]
     starts = list(range(0, frames - window, window - overlap)) + [frames - window]
@@ -294,7 +294,7 @@ class ViewMaker:
         config: SynthesizeConfig, renders: Renders | None = None,
     ) -> None:  # fmt: skip
         if not recorded:
-            log.warn("synthesize: no recorded image may be used; holes take the nearest point's colour")
+            log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
         self._rules, self._full_size = rules, config.full_size
         self._renders = renders
@@ -321,7 +321,7 @@ class ViewMaker:
             made = enlarge(made, size, None if self._model.points_alone else (condition, fine))
             made_views = tuple(views)
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
-        if self._model.points_alone and not taken_there(views[0], self._recorded):
+        if self._model.points_alone and not recorded_at_pose(views[0], self._recorded):
             usable[0] = False
         trust = made.confidence * usable
         observations = [
@@ -331,7 +331,7 @@ class ViewMaker:
         return sample, condition, observations
 
 
-def taken_there(view: View, recorded: Sequence[Photo]) -> bool:
+def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:
     """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
 
     The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a

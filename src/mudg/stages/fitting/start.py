@@ -47,7 +47,7 @@ def start_model(
         InputError: the fused cloud has no points at all.
     """
     if len(fused.static) == 0:
-        raise InputError("the fused cloud has no static points to start from", where=scene.root, remedy="check the LiDAR of the scene")
+        raise InputError("the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene")
     kinds = METHODS[config.method].nodes
     blocks = [_static_columns(fused.static, views, classes, config)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]
@@ -60,7 +60,7 @@ def start_model(
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
     sky = _painted_sky(views) if "sky" in kinds else None
-    log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} objects")
+    log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} dynamic objects")
     return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree)
 
 

@@ -56,7 +56,7 @@ def unseen_maps(
     chosen = [recorded[i] for i in np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))]
     witnesses = [_witness(model, stored.view, raster) for stored in chosen]
     objects = [node for node in model.nodes if isinstance(node, RigidNode)]
-    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "what virtual views add")]
+    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "finding surfaces that only virtual views show")]
 
 
 def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
@@ -91,7 +91,7 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
             exists[inside] = pose is not None
             if pose is not None:
                 moved[inside] = geometry.transform_points(pose, local)
-        seen |= exists & _looks_at_or_through(witness, moved)
+        seen |= exists & _sees_or_sees_past(witness, moved)
     coarse = ~seen.reshape(shape)
     return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
 
@@ -169,7 +169,7 @@ def _seeds_of(
     ]  # fmt: skip
 
 
-def _looks_at_or_through(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     camera = witness.view.camera
     uv, z = geometry.project(witness.view, points)
     with np.errstate(invalid="ignore"):

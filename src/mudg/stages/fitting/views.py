@@ -142,7 +142,7 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
             raise UsageError(f"the scene has no camera named {name!r}", where=scene.root, expected=", ".join(scene.cameras))
     frames = tuple(f for f in scene.frames_in("train") if not cameras or f.view.camera.name in cameras)
     if not frames:
-        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a smaller held-out share")
+        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a larger --test-every, or 0")
     return frames
 
 
@@ -205,10 +205,10 @@ def virtual_sets(path: Path) -> dict[str, ObservationSet]:
     """
     sets = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
     if not sets:
-        raise InputError("no finished folders of observations here", where=str(path), remedy="run `mudg synthesize` first")
+        raise InputError("this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first")
     for found in sets.values():
         if found.kind == "recorded":
-            raise InputError("recorded views among the virtual ones: held-out truth must not be learnt from", where=str(found.path),
+            raise InputError("recorded views among the virtual ones: held-out views must not be trained on", where=str(found.path),
                              expected="views of kind virtual", got=f"kind recorded, source {found.source}",
                              remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
     return sets
@@ -282,10 +282,10 @@ class _SweepCache:
             sweeps = [sweep for sweep in self._scene.sweeps if sweep.sensor == sensor]
             nearest = min(sweeps, key=lambda sweep: abs(sweep.time_s - view.time_s))
             if abs(nearest.time_s - view.time_s) <= NEAREST_SWEEP_S:
-                clouds.append(self._at(nearest, view.time_s))
+                clouds.append(self._points_at(nearest, view.time_s))
         return visible_lidar(view, np.concatenate(clouds)) if clouds else None
 
-    def _at(self, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
+    def _points_at(self, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
         """World points of a sweep, the points of every tracked box carried from when they were measured to ``time_s``."""
         if sweep.id not in self._read:
             points = scenefile.read_points(self._scene, sweep)

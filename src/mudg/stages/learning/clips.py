@@ -25,7 +25,7 @@ from mudg.models.mdm.codec import CLASSES
 from mudg.stages.config import LearnConfig
 
 
-def held_out(config: LearnConfig) -> list[int]:
+def held_out_cities(config: LearnConfig) -> list[int]:
     """Numbers of the shards used for scoring only."""
     return [from_city.HELD_OUT + n for n in range(config.data.held_out)]
 
@@ -57,7 +57,7 @@ class MakingClips:
 
     def __init__(self, config: LearnConfig, folder: Path, points_alone: bool = False) -> None:
         self._rules, self._folder = clip_rules(config, points_alone), folder
-        wanted = [*held_out(config), *range(config.data.cities)]
+        wanted = [*held_out_cities(config), *range(config.data.cities)]
         self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
         self._workers = config.compute.workers
         self._pool: concurrent.futures.ProcessPoolExecutor | None = None
@@ -96,8 +96,8 @@ def await_shard(folder: Path, city: int, patience_s: float = 900.0) -> None:
     started = time.monotonic()
     while not path.is_file():
         if time.monotonic() - started > patience_s:
-            raise ResourceError("training clips are not arriving", where=str(path), expected=f"within {patience_s:.0f} s",
-                                remedy="look for an error of the generating processes above")  # fmt: skip
+            raise ResourceError("no training clips arrived", where=str(path), expected=f"within {patience_s:.0f} s",
+                                remedy="see the errors of the generating processes above")  # fmt: skip
         time.sleep(0.5)
 
 
@@ -149,7 +149,7 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
 def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) -> LearnConfig:
     """The configuration in terms of shards: clips of logs lie as those of cities do, one clip per shard."""
     if not scored:
-        log.warn("learn: nothing is held out; scores are of a clip that was trained on")
+        log.warn("learn: no clip is held out; the scored clip was also trained on")
     data = replace(
         config.data, cities=train, first_cities=train, clips_per_city=1, width=rules.width, height=rules.height,
         held_out=max(1, scored),
@@ -159,7 +159,7 @@ def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) 
 
 def scored_shards(config: LearnConfig) -> list[int]:
     """Numbers of the shards to score: the held-out ones, or the first one trained on where nothing was held out."""
-    return [0] if config.data.scenes and not config.data.held_out_every else held_out(config)
+    return [0] if config.data.scenes and not config.data.held_out_every else held_out_cities(config)
 
 
 def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
@@ -197,9 +197,9 @@ def draw_clips(
         clip = clip_shards.read_clip(folder, *picks[place])
         if clip.rgb.shape[-2:] != (config.data.height, config.data.width):
             raise InputError(
-                "training clips are of another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
+                "the training clips have another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
                 expected=f"{config.data.width}x{config.data.height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
-                remedy="give another --data.clips",
+                remedy="choose another --data.clips",
             )  # fmt: skip
         if config.data.augment:
             clip = clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))

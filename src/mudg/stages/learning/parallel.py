@@ -114,7 +114,7 @@ class Ranks:
             raise failure
         if failed:
             raise ResourceError("another process of this training failed", got=f"{failed:.0f} of {self.size}",
-                                remedy="see its own message above or in the launcher's logs")  # fmt: skip
+                                remedy="see its message above or in the launcher's logs")  # fmt: skip
 
     def share(self, clips: int, parts: int) -> list[slice]:
         """Which clips of a batch of `clips` this process takes, in `parts` portions one after another.
@@ -144,9 +144,9 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         UsageError: the launcher's variables are not numbers.
     """
     if device == "cuda" and not torch.cuda.is_available():
-        raise ResourceError("no CUDA device here", where="--compute.device cuda", remedy="leave the flag out")
+        raise ResourceError("no CUDA device was found", where="--compute.device cuda", remedy="leave the flag out")
     if dist.is_available() and dist.is_initialized():
-        yield _place(dist.get_rank(), dist.get_world_size(), device)
+        yield _ranks_on_device(dist.get_rank(), dist.get_world_size(), device)
         return
     try:
         size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
@@ -155,9 +155,9 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
             "the launcher's variables are not numbers", where="WORLD_SIZE, RANK", got=str(error)
         ) from error
     if size == 1:
-        yield _place(0, 1, device)
+        yield _ranks_on_device(0, 1, device)
         return
-    place = _place(rank, size, device)
+    place = _ranks_on_device(rank, size, device)
     dist.init_process_group("nccl" if device == "cuda" else "gloo", timeout=PATIENCE)
     was_quiet = log.is_quiet()
     log.set_quiet(was_quiet or rank > 0)
@@ -169,7 +169,7 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         time.sleep(PARTING_S)
 
 
-def _place(rank: int, size: int, device: str) -> Ranks:
+def _ranks_on_device(rank: int, size: int, device: str) -> Ranks:
     if device == "cuda":
         chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(chosen)
@@ -273,7 +273,7 @@ def first_row(value: Tensor) -> int:
     (placement,) = value.placements  # type: ignore[attr-defined]
     if placement != Shard(0):
         raise ResourceError(
-            "a tensor is cut in a way that checkpoints do not know", expected="Shard(0)", got=str(placement)
+            "a tensor is sharded in a way that checkpoints do not support", expected="Shard(0)", got=str(placement)
         )
     per_rank = -(-value.shape[0] // value.device_mesh.size())  # type: ignore[attr-defined]
     return min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]

@@ -22,7 +22,7 @@ from mudg.stages.config import LearnConfig
 from mudg.stages.learning import score as learn_score
 
 
-def starting(config: LearnConfig) -> PublishedMDM:
+def starting_model(config: LearnConfig) -> PublishedMDM:
     """The model of `config.start` in float32, to be trained at the configured size; nothing of it is drawn anew.
 
     Raises:
@@ -33,7 +33,7 @@ def starting(config: LearnConfig) -> PublishedMDM:
     frames = model.config.window
     if config.data.window != frames or config.optimizer.full_window_share < 1:
         raise UsageError(
-            "a published-type model is trained on clips of exactly the length that its image tokens are made for",
+            "a published-type model needs clips of exactly the length of its image tokens",
             where="--data.window, --optimizer.full-window-share", expected=f"{frames} frames in all steps",
             got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
             remedy=f"--data.window {frames} --optimizer.full-window-share 1",
