@@ -32,8 +32,12 @@ FLOORS = ("base", "core", "native", "data", "models", "report", "stages", "bench
 GROUPS = ("virtual", "loss", "densify", "poses", "objects", "appearance", "start", "optimizer", "compute", "network", "codec", "city")
 
 
-FILE_ENDINGS = tuple(f".{ending}" for ending in "py json jsonl yaml txt md png jpg mp4 html pt safetensors".split())
+FILE_ENDINGS = tuple(f".{ending}" for ending in "py json jsonl yaml txt md png jpg mp4 html pt ckpt safetensors".split())
 FOREIGN_NAMES = ("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud")
+
+
+SLOW = ("docs/bench_shift.md", "docs/results.md", "docs/training.md")
+"""Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats."""
 
 
 class Block(NamedTuple):
@@ -47,6 +51,10 @@ class Block(NamedTuple):
 
 def name_of(page: Path) -> str:
     return page.relative_to(REPOSITORY).as_posix()
+
+
+def takes_long(page: Path) -> bool:
+    return page.parent.name == "formats" or name_of(page) in SLOW
 
 
 def blocks(text: str) -> Iterator[Block]:
@@ -107,7 +115,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, set[str]]:
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, id=name_of(page), marks=pytest.mark.slow if page.parent.name == "formats" else ())
+        pytest.param(page, id=name_of(page), marks=pytest.mark.slow if takes_long(page) else ())
         for page in PAGES
         if page.name != "python.md"  # its code runs in test_python.py
     ],
