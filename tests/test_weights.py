@@ -297,7 +297,7 @@ def test_conversion_in_its_own_process(tmp_path, complete):
     with pytest.raises(UsageError, match="exists"):
         convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
     (tmp_path / "photos").mkdir()
-    with pytest.raises(UsageError, match="something else"):
+    with pytest.raises(UsageError, match="do not belong to a model"):
         convert.run(ConvertConfig(), path, tmp_path / "photos", overwrite=True, network=TINY)
 
 
@@ -325,7 +325,7 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
     cases = (
         (["nothing.ckpt", "--to", "m"], 3, "no such checkpoint"),
         ([str(tmp_path / "512.ckpt"), "--to", str(tmp_path / "there")], 2, "the folder exists"),
-        ([str(tmp_path / "512.ckpt"), "--to", str(tmp_path / "there"), "--overwrite"], 2, "something else"),
+        ([str(tmp_path / "512.ckpt"), "--to", str(tmp_path / "there"), "--overwrite"], 2, "do not belong to a model"),
     )
     for words, code, message in cases:
         assert cli.main(["convert", *words]) == code
