@@ -28,11 +28,11 @@ FLAGS: dict[str, list[str]] = json.loads((REPOSITORY / "tests" / "house" / "cli.
 
 FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--standalone": "torchrun",
                  "--version": "mudg", "--help": "every verb", "--help-all": "mudg run, mudg demo"}  # fmt: skip
-FLOORS = ("base", "core", "native", "data", "models", "report", "stages", "bench", "docs", "tests", "tools", "build_backend", "src")
-GROUPS = ("virtual", "loss", "densify", "poses", "objects", "appearance", "start", "optimizer", "compute", "network", "codec", "city")
+FOLDERS = "base core native data models report stages bench docs tests tools build_backend src".split()
+GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
 
 
-FILE_ENDINGS = tuple(f".{ending}" for ending in "py json jsonl yaml txt md png jpg mp4 html pt ckpt safetensors".split())
+FILE_ENDINGS = tuple(".py .json .jsonl .yaml .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
 FOREIGN_NAMES = ("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud")
 
 
@@ -70,7 +70,9 @@ def commands(block: Block) -> list[str]:
 
 
 def has_example(text: str) -> bool:
-    return any((b.language == "console" and commands(b)) or (b.language == "python" and not b.skip) for b in blocks(text))
+    return any(
+        (b.language == "console" and commands(b)) or (b.language == "python" and not b.skip) for b in blocks(text)
+    )
 
 
 # --- examples run -------------------------------------------------------------------------------------------------------
@@ -185,7 +187,9 @@ def unknown_flags(text: str) -> list[str]:
 def unknown_settings(text: str) -> list[str]:
     """Settings written as ``group.name`` that no verb has as a flag."""
     known = {flag for flags in FLAGS.values() for flag in flags}
-    found = [m for code in code_in(text) for m in re.findall(rf"(?<![\w./-])((?:{'|'.join(GROUPS)})\.[a-z][a-z0-9_]*)", code)]
+    found = [
+        m for code in code_in(text) for m in re.findall(rf"(?<![\w./-])((?:{'|'.join(GROUPS)})\.[a-z][a-z0-9_]*)", code)
+    ]
     return [name for name in found if "--" + name.replace("_", "-") not in known and not name.endswith(FILE_ENDINGS)]
 
 
@@ -213,15 +217,17 @@ def unknown_names(text: str) -> list[str]:
 
 
 def unknown_paths(text: str) -> list[str]:
-    """Files of the source tree that do not exist: Python, C++ and documentation paths, and folders that end in a slash."""
+    """Files of the source tree that do not exist: Python and C++ paths, and folders that end in a slash."""
     roots = (REPOSITORY, REPOSITORY / "src" / "mudg", REPOSITORY / "src", REPOSITORY / "docs",
              REPOSITORY / "src" / "mudg" / "data")  # fmt: skip
-    names = {p.name for folder in ("src", "tests", "docs", "bench", "tools") for p in (REPOSITORY / folder).rglob("*.py")}
+    names = {
+        p.name for folder in ("src", "tests", "docs", "bench", "tools") for p in (REPOSITORY / folder).rglob("*.py")
+    }
     problems = []
     for code in re.findall(r"(?<!`)`([^`\s]+)`(?!`)", text):
         path = code.split(":")[0].split("#")[0]
-        is_folder = path.endswith("/") and path.count("/") > 1 and path.split("/")[0] in FLOORS
-        if not (path.endswith((".py", ".cpp", ".h")) or is_folder or (path.split("/")[0] in FLOORS and "*" in path)):
+        is_folder = path.endswith("/") and path.count("/") > 1 and path.split("/")[0] in FOLDERS
+        if not (path.endswith((".py", ".cpp", ".h")) or is_folder or (path.split("/")[0] in FOLDERS and "*" in path)):
             continue
         if "/" not in path:
             problems += [path] if path not in names else []
