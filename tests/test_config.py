@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from mudg.base import config
 from mudg.base.errors import InputError, UsageError
+from mudg.stages.config import BenchConfig, FuseConfig, SynthesizeConfig
 
 
 @dataclass(frozen=True, kw_only=True, config=config.STRICT)
@@ -90,5 +91,27 @@ def test_keys_that_moved_are_refused_with_their_new_name(tmp_path):
             config.load(Cart, yaml_path=tmp_path / "old.yaml")
     with pytest.raises(UsageError, match=r"cart\.wheel_count is now called cart\.wheels\.count"):
         config.load(Fleet, overrides={"cart": {"wheel_count": 3}})
+    with pytest.raises(UsageError, match="3 configuration keys") as several:
+        config.load(Fleet, overrides={"cart": {"horn": True, "wheels": "wood", "wheel_count": 3}})
+    listed = ("cart.wheels -> cart.wheels.kind", "cart.wheel_count -> cart.wheels.count", "leave out:", "cart.horn")
+    assert [line.strip() for line in several.value.remedy.splitlines()[1:]] == list(listed)
     assert config.load(Cart, overrides={"wheels": {"count": 3}}) == Cart(wheels=Wheels(count=3))
     assert "MOVED" not in config.dump_yaml(Cart())
+
+
+def test_settings_of_older_versions_are_refused_by_every_command_that_had_them():
+    for kind, old in (
+        (SynthesizeConfig, "strength"),
+        (BenchConfig, "ablation_steps"),
+        (FuseConfig, "colour_from_held_out"),
+    ):
+        with pytest.raises(UsageError, match=f"configuration key {old} (was removed|is now called)"):
+            config.load(kind, overrides={old: 1})
+
+
+def test_differences_tell_values_from_settings_of_another_version():
+    old = {"steps": 3, "loss": {"ssim": 0.2}, "far_m": 1.0, "kind": "a", "wide": 1, "tall": 2}
+    first, second = config.differences(old, {"steps": 4, "loss": {"ssim": 0.2}, "kind": {"name": "a"}})
+    assert "far_m, kind, tall and 1 more" in first and second == "steps: 3 there, 4 asked"
+    assert config.differences({"a": {"b": 1}}, {"a": {"b": 2}}) == ["a.b: 1 there, 2 asked"]
+    assert config.differences(old, old) == []

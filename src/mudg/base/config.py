@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -56,8 +56,10 @@ def load(
     if yaml_path is not None:
         content = _read_yaml(yaml_path)
         content.pop("verb", None)
+        _refuse_moved(content, str(yaml_path), config_type)
         values = _merge(values, content, str(yaml_path), config_type)
     if overrides:
+        _refuse_moved(overrides, "flags", config_type)
         values = _merge(values, dict(overrides), "flags", config_type)
     return build(config_type, values, str(yaml_path or "configuration"))
 
@@ -103,15 +105,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 def _merge(
     base: dict[str, Any], new: Mapping[str, Any], where: str, config_type: Any, path: str = ""
 ) -> dict[str, Any]:
-    known = {f.name: f for f in dataclasses.fields(config_type)} if dataclasses.is_dataclass(config_type) else {}
-    types = typing.get_type_hints(config_type) if known else {}
-    moved: Mapping[str, str | None] = getattr(config_type, "MOVED", {})
+    known = _types_of_fields(config_type)
     merged = dict(base)
     for name, value in new.items():
-        group = types.get(name)
+        group = known.get(name)
         is_group, is_mapping = dataclasses.is_dataclass(group), isinstance(value, Mapping)
-        if name in moved and (name not in known or (is_group and not is_mapping)):
-            raise _moved_error(f"{path}{name}", moved[name], where, path)
         if known and name not in known:
             near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
             what, expected = f"unknown configuration key {path}{name}", "one of " + ", ".join(known)
@@ -124,19 +122,58 @@ def _merge(
     return merged
 
 
-def _moved_error(old: str, new: str | None, where: str, path: str) -> UsageError:
-    """What to say about a key that a class lists in ``MOVED``."""
-    if new is None:
-        return UsageError(f"the configuration key {old} was removed", where=where, remedy="leave it out")
-    return UsageError(f"the configuration key {old} is now called {path}{new}", where=where,
-        remedy="rename it (a dot is one level of YAML)")  # fmt: skip
+def _types_of_fields(config_type: Any) -> dict[str, Any]:
+    hints = typing.get_type_hints(config_type) if dataclasses.is_dataclass(config_type) else {}
+    return {f.name: hints[f.name] for f in dataclasses.fields(config_type)} if hints else {}
 
 
-def differences(old: Any, new: Any, path: str = "") -> list[str]:
-    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value."""
+def _refuse_moved(values: Mapping[str, Any], where: str, config_type: Any) -> None:
+    """UsageError that names all keys that a class lists in ``MOVED``, each with its new name."""
+    moved = dict(_moved_keys(values, config_type))
+    if not moved:
+        return
+    if len(moved) == 1:
+        ((old, new),) = moved.items()
+        what = f"the configuration key {old} " + ("was removed" if new is None else f"is now called {new}")
+        remedy = "leave it out" if new is None else "rename it (a dot is one level of YAML)"
+    else:
+        what = f"{len(moved)} configuration keys of an older version were renamed or removed"
+        renamed = [f"{old} -> {new}" for old, new in moved.items() if new is not None]
+        removed = [old for old, new in moved.items() if new is None]
+        lists = {"rename (a dot is one level of YAML):": renamed, "leave out:": removed}
+        remedy = "\n    ".join(line for title, keys in lists.items() if keys for line in (title, *keys))
+    raise UsageError(what, where=where, remedy=remedy)
+
+
+def _moved_keys(values: Mapping[str, Any], config_type: Any, path: str = "") -> Iterator[tuple[str, str | None]]:
+    """Dotted old and new names (None: removed) of the keys in ``values`` that are not called so any more."""
+    known, moved = _types_of_fields(config_type), getattr(config_type, "MOVED", {})
+    for name, value in values.items():
+        is_group, is_mapping = dataclasses.is_dataclass(known.get(name)), isinstance(value, Mapping)
+        if name in moved and (name not in known or (is_group and not is_mapping)):
+            yield f"{path}{name}", None if moved[name] is None else f"{path}{moved[name]}"
+        elif is_group and is_mapping:
+            yield from _moved_keys(value, known[name], f"{path}{name}.")
+
+
+def differences(old: Any, new: Any) -> list[str]:
+    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value; settings that only one of them has
+    (another version named them differently) are counted in one line, which comes first."""
+    values, lonely = [], []
+    _collect_differences(old, new, "", values, lonely)
+    if not lonely:
+        return values
+    named = ", ".join(lonely[:3]) + (f" and {len(lonely) - 3} more" if len(lonely) > 3 else "")
+    return [f"settings that only one of the two has, as after a change of version: {named}", *values]
+
+
+def _collect_differences(old: Any, new: Any, path: str, values: list[str], lonely: list[str]) -> None:
     if isinstance(old, dict) and isinstance(new, dict):
-        found = []
-        for name in sorted(set(old) | set(new), key=str):
-            found += differences(old.get(name), new.get(name), f"{path}.{name}".lstrip("."))
-        return found
-    return [] if old == new else [f"{path}: {old!r} there, {new!r} asked"]
+        for name in sorted(old.keys() | new.keys(), key=str):
+            inside = f"{path}.{name}".lstrip(".")
+            if name not in old or name not in new or isinstance(old[name], dict) != isinstance(new[name], dict):
+                lonely.append(inside)
+            else:
+                _collect_differences(old[name], new[name], inside, values, lonely)
+    elif old != new:
+        values.append(f"{path}: {old!r} there, {new!r} asked")

@@ -93,7 +93,8 @@ def run(
     """
     learns_virtual = "virtual" in METHODS[config.method].supervision
     if learns_virtual and observations is None:
-        raise UsageError(f"{config.method} needs virtual observations", remedy="run `mudg synthesize` and add --observations FOLDER")
+        remedy = "run `mudg synthesize` and give its folder as --observations, or choose --method street_gaussians"
+        raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
     refuse_overlap(
         out, {"scene": scene, "fused": fused, "observations": observations, "virtual.lpips-weights": config.virtual.lpips_weights}
     )

@@ -47,7 +47,9 @@ def read_description(path: Path | str) -> dict[str, Any]:
     """
     where = folder_of(path) / MODEL_FILE
     if not where.is_file():
-        raise InputError("no diffusion model here", where=str(where.parent), expected=f"a file {MODEL_FILE}")
+        inside = (where.parent / "model" / MODEL_FILE).is_file()
+        raise InputError("no diffusion model here", where=str(where.parent), expected=f"a file {MODEL_FILE}",
+                         remedy=f"give {where.parent / 'model'}" if inside else "")  # fmt: skip
     content = store.read_json(where)
     if not isinstance(content, dict) or content.get("schema") != 1 or not isinstance(content.get("files"), dict):
         raise InputError("not a model description of this version", where=str(where))

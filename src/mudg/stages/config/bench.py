@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -14,6 +15,8 @@ from mudg.base.config import STRICT
 class BenchConfig:
     """Measure on generated cities against exact ground truth: the diffusion model, the correction of box tracks, or complete
     methods off the recorded path."""
+
+    MOVED: ClassVar[Mapping[str, str | None]] = {"ablation_steps": None, "ablation_cities": None}
 
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn."""

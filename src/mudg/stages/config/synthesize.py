@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -13,6 +14,8 @@ from mudg.base.config import STRICT
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SynthesizeConfig:
     """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
+
+    MOVED: ClassVar[Mapping[str, str | None]] = {"start": None, "strength": None}
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""
