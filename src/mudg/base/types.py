@@ -76,6 +76,11 @@ class Camera:
             raise InputError("principal point is far outside the image", where=owner, got=f"cx={self.cx}, cy={self.cy}")
 
     @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy, as ``geometry.pinhole`` takes them."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
     def matrix(self) -> Matrix:
         """Intrinsics f64[3, 3]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])

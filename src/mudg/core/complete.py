@@ -25,6 +25,7 @@ from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 
 from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import pixel_rays
 from mudg.base.types import View
 
 
@@ -108,9 +109,7 @@ def beyond_reach(
 
 def ray_elevation(view: View) -> NDArray[np.float32]:
     """Elevation of each pixel's ray above the horizontal plane, radians, f32[H, W]."""
-    camera = view.camera
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    x, y = pixel_rays(view.camera)
     up = view.world_from_cam[2, :3]
     rise = up[0] * x[None] + up[1] * y[:, None] + up[2]
     return np.arcsin(rise / np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)).astype(np.float32)

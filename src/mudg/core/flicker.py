@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mudg.base import palette
+from mudg.base import geometry, palette
 from mudg.base.types import View
 
 MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"))
@@ -69,13 +69,13 @@ def pixel_motion(frame: TrueFrame, following: TrueFrame) -> PixelMotion:
     height, width = frame.ids.shape
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     static = ~torch.isin(frame.ids, torch.tensor(MOVABLE)) & (frame.depth[0] < 90.0)
-    fx, fy, cx, cy = frame.intrinsics.float()
     z = frame.depth[0]
-    points = torch.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z, torch.ones_like(z)])
+    ray_x, ray_y = geometry.pinhole_ray(frame.intrinsics.float(), columns, rows)
+    points = torch.stack([ray_x * z, ray_y * z, z, torch.ones_like(z)])
     pose = (torch.linalg.inv(following.world_from_cam) @ frame.world_from_cam).float()
     x, y, ahead, _ = torch.einsum("ij,jhw->ihw", pose, points)
-    fx, fy, cx, cy = following.intrinsics.float()
-    there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[None]
+    u, v = geometry.pinhole(following.intrinsics.float(), x, y, ahead)
+    there = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], -1)[None]
     within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)
     depth_there = _sample_at(following.depth, there, "nearest")[0]
     return PixelMotion(there, within & static & ((depth_there / ahead - 1).abs() < 0.03))

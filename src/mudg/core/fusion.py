@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from mudg.base import palette
 from mudg.base.errors import InputError
-from mudg.base.geometry import invert, yaw_of
+from mudg.base.geometry import invert, pinhole, yaw_of
 from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core.visible import RULES, nearer_depth
 from mudg.core.zbuffer import DrawLimits, PointLayer, draw_points
@@ -297,8 +297,7 @@ def _pixels(
     camera = view.camera
     ids = np.flatnonzero((xyz_cam[:, 2] > rules.near_m) & (xyz_cam[:, 2] < rules.far_m) & known)
     x, y, z = xyz_cam[ids].T
-    column = np.floor(camera.fx * x / z + camera.cx)
-    row = np.floor(camera.fy * y / z + camera.cy)
+    column, row = (np.floor(place) for place in pinhole(camera.intrinsics, x, y, z))
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     return ids[inside], column[inside].astype(np.intp), row[inside].astype(np.intp), z[inside]
 
@@ -328,10 +327,8 @@ def hidden_points(
     nearest, index = draw_points([PointLayer(np.ascontiguousarray(xyz_cam[stands]), np.eye(4))], View(camera, np.eye(4), 0.0), DrawLimits())
     nearest[index < 0] = np.inf
     nearer = nearer_depth(nearest, rule, rule.reach(camera, gap_deg))
-    z = xyz_cam[:, 2]
-    column = np.floor(camera.fx * xyz_cam[:, 0] / z + camera.cx).astype(np.intp).clip(0, camera.width - 1)
-    row = np.floor(camera.fy * xyz_cam[:, 1] / z + camera.cy).astype(np.intp).clip(0, camera.height - 1)
-    return rule.hides(nearer[row, column], z)
+    column, row = (np.floor(place).astype(np.intp) for place in pinhole(camera.intrinsics, *xyz_cam.T))
+    return rule.hides(nearer[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)], xyz_cam[:, 2])
 
 
 def measure_beam_gap(xyz_lidar: NDArray[np.floating], default_deg: float = 0.4) -> float:

@@ -141,4 +141,5 @@ def nearer_depth(nearest: NDArray[np.float32], rule: HidingRule, reach: tuple[in
 
 def _minimum(values: NDArray[np.float32], size: int, axis: int, shift: int) -> NDArray[np.float32]:
     """Running minimum over ``size`` cells along an axis, the window moved by ``shift``; nothing lies beyond the edge."""
-    return ndimage.minimum_filter1d(values, size, axis=axis, origin=shift, mode="constant", cval=np.inf)
+    found = ndimage.minimum_filter1d(values, size, axis=axis, origin=shift, mode="constant", cval=np.inf)
+    return np.asarray(found, np.float32)

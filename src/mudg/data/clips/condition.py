@@ -28,7 +28,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import palette
+from mudg.base import geometry, palette
 from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.core.pictures import resize_area
@@ -129,13 +129,13 @@ def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tenso
     Returns x, y f32[K,H,W] in pixels of the other view and z f32[K,H,W] metres (not positive = behind it).
     """
     camera, target = view.camera, other.camera
-    u = (torch.arange(camera.width, dtype=torch.float32) + 0.5 - camera.cx) / camera.fx
-    v = (torch.arange(camera.height, dtype=torch.float32) + 0.5 - camera.cy) / camera.fy
+    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
+    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
     m = torch.from_numpy((other.cam_from_world @ view.world_from_cam).astype(np.float32))
     turned = [m[i, 0] * u[None, :] + m[i, 1] * v[:, None] + m[i, 2] for i in range(3)]
     px, py, pz = (turned[i] * depth + m[i, 3] for i in range(3))
     safe = pz.clamp(min=0.1)
-    return target.fx * px / safe + target.cx, target.fy * py / safe + target.cy, pz
+    return *geometry.pinhole(target.intrinsics, px, py, safe), pz
 
 
 def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> Tensor:

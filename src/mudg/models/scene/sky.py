@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from mudg.base import geometry
 from mudg.base.types import View
 from mudg.core.table import Table
 
@@ -55,9 +56,7 @@ class SkyNode:
 
     def _grid(self, view: View, height: int, width: int) -> NDArray[np.float32]:
         """Sampling positions in the padded panorama, ``f32[height, width, 2]`` in [-1, 1]."""
-        camera = view.camera.resized(width, height)
-        x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
-        y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
+        x, y = geometry.pixel_rays(view.camera.resized(width, height))
         # Written out: a matrix product of this shape wakes the threads of BLAS at every step of a fit.
         right, down, ahead = view.world_from_cam[:3, 0], view.world_from_cam[:3, 1], view.world_from_cam[:3, 2]
         rays = x[None, :, None] * right + (y[:, None, None] * down + ahead)

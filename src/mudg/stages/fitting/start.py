@@ -213,7 +213,7 @@ def _painted_sky(views: Sequence[StoredView]) -> SkyNode:
         camera = stored.view.camera
         row, column = stored.sky[::2, ::2].nonzero()
         row, column = row * 2, column * 2
-        rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))], 1)
+        rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
         directions.append(rays @ stored.view.world_from_cam[:3, :3].T)
         colors.append(stored.rgb[row, column].astype(np.float32) / 255)
     if directions:
