@@ -16,7 +16,7 @@ from collections.abc import Callable
 import torch
 
 from mudg.base import seeds
-from mudg.models.published.model import PublishedConfig, PublishedLatents, PublishedMDM, choose_trainable
+from mudg.models.published.model import PublishedConfig, PublishedLatents, PublishedMDM
 from mudg.stages.learning import memory_plan
 
 
@@ -81,7 +81,9 @@ def main() -> None:
             measured(f"decoding 16 frames, {at_once} at once", decoding, options.device, 1)
     if options.training_batch:
         batch = options.training_batch
-        moving = choose_trainable(model, 2 if height > 320 else 1)
+        frozen = model.temporal_parameters("transformers") if height > 320 else set()
+        model.requires_grad_(False)
+        moving = [p.requires_grad_(True) for name, p in model.trained_part().named_parameters() if name not in frozen]
         model.net.train()
         model.net.checkpointing = True
         truth = {m: draw(batch, frames, channels, h, w) for m in ("rgb", "depth", "semantics")}

@@ -242,20 +242,20 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     begun = RunDir.open(tmp_path / "begun", annotate._OUTPUT, settings, annotate.inputs_of(config, tmp_path / "plain"))
     aside = tmp_path / "begun" / "labelled"
     first = [frame.id for frame in plain.frames[:2]]
-    assert list(annotate.label_and_put_aside(config, plain, first, aside)) == first
-    stamps = {name: annotate.aside_file(aside, name).stat().st_mtime_ns for name in first}
+    assert list(annotate.label_into_staging(config, plain, first, aside)) == first
+    stamps = {name: annotate.staged_labels(aside, name).stat().st_mtime_ns for name in first}
     begun.pause()
     made: list[str] = []
-    real = annotate.label_and_put_aside
+    real = annotate.label_into_staging
 
     def watched(*args: object) -> Iterator[str]:
-        assert stamps == {name: annotate.aside_file(aside, name).stat().st_mtime_ns for name in first}
+        assert stamps == {name: annotate.staged_labels(aside, name).stat().st_mtime_ns for name in first}
         for name in real(*args):  # type: ignore[arg-type]
             made.append(name)
             yield name
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(annotate, "label_and_put_aside", watched)
+        patch.setattr(annotate, "label_into_staging", watched)
         again = annotate.run(config, tmp_path / "plain", tmp_path / "begun")
     assert made == [frame.id for frame in plain.frames[2:]]
     for path in sorted((whole / "labels").rglob("*.*")):
@@ -314,7 +314,7 @@ def test_a_frame_without_lidar_keeps_its_depth(tmp_path: Path) -> None:
 
 
 def test_a_depth_network_needs_depth_and_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no depth is asked for"):
+    with pytest.raises(UsageError, match="contradicts"):
         annotate_depth.digests(AnnotateConfig(depth=False, depth_network="x"))
     with pytest.raises(ResourceError, match="weights"):
         annotate_depth.digests(AnnotateConfig(depth_network=str(tmp_path)))

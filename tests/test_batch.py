@@ -50,8 +50,8 @@ def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "names no scenes"), ("# nothing\n", "names no scenes"), ("a/x\nb/x\n", "one folder"), ("a b\n", "no setting"),
-        ("a speed=3\n", "no setting"), ("'a\n", "cannot be split"), ("a name=../up\n", "folder name"),
+        ("", "list is empty"), ("# nothing\n", "list is empty"), ("a/x\nb/x\n", "the same folder"), ("a b\n", "unknown setting"),
+        ("a speed=3\n", "unknown setting"), ("'a\n", "cannot parse the line"), ("a name=../up\n", "folder name"),
     ],
 )  # fmt: skip
 def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words: str) -> None:

@@ -8,9 +8,10 @@ import torch
 
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, Track, View
+from mudg.core import visible
 from mudg.data.clips import condition as clips
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
 RULES = ConditionRules(48, 32, occluder_m=0.0)
@@ -47,10 +48,10 @@ def image_of_wall(view, x_m):
 def test_warp_of_a_plane_is_exact():
     """A striped wall 10 m ahead, seen from 1.5 m beside: the warped recorded image equals the true one."""
     recorded, target = view_at(), view_at(y=1.5)
-    source = WarpSource(recorded, clips._tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0,
+    source = WarpSource(recorded, clips.image_tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0,
                     torch.zeros(32, 48, dtype=torch.uint8))  # fmt: skip
     rgb, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
-    truth = clips._tensor(image_of_wall(target, 10.0))
+    truth = clips.image_tensor(image_of_wall(target, 10.0))
     assert float(found.float().mean()) > 0.85
     assert float((rgb - truth).abs()[:, found].max()) < 0.01
 
@@ -80,7 +81,7 @@ def test_shine_through_is_removed_and_edges_stay():
     valid = np.ones((20, 20), bool)
     depth[10, 10] = 30.0  # a far point seen through a near wall
     depth[:, :6] = 30.0  # an ordinary edge: far on one side only
-    kept = clips.remove_shine_through(depth, valid)
+    kept = visible.seen_pixels(depth, valid, visible.RULES["condition"])
     assert not kept[10, 10]
     assert int((~kept).sum()) == 1
 
@@ -90,25 +91,25 @@ def test_condition_of_a_wall():
     cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
     recorded = [Photo(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
     target = view_at(y=2.0, time_s=0.1)
-    condition = build_condition(cloud, [], [target], recorded, RULES)
+    condition = build_conditions(cloud, [], [target], recorded, RULES)[0]
     valid = condition.valid[0, 0]
     assert condition.color.shape == (1, 3, 32, 48)
     assert bool(valid[-8:].all())
     assert not bool(valid[:4].any())
     assert torch.allclose(condition.depth[0, 0][valid], torch.tensor(12.0), atol=1e-4)
     assert torch.allclose(condition.depth, torch.full_like(condition.depth, 12.0), atol=1e-3)
-    truth = clips._tensor(image_of_wall(target, 12.0))
+    truth = clips.image_tensor(image_of_wall(target, 12.0))
     warped = condition.warped[0, 0]
     assert float((condition.color[0] - truth).abs()[:, warped].max()) < 0.02
     assert bool(warped[:4, 10:38].all())
-    assert torch.equal(condition.reference, clips._tensor(recorded[1].rgb))
+    assert torch.equal(condition.reference, clips.image_tensor(recorded[1].rgb))
 
 
 def test_backdrop_of_the_recorded_view_is_the_image():
     cloud = FusedCloud(wall(12.0, stripes), {})
     recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
-    condition = build_condition(cloud, [], [view_at()], recorded, RULES)
-    assert torch.allclose(condition.backdrop[0], clips._tensor(recorded[0].rgb), atol=1e-5)
+    condition = build_conditions(cloud, [], [view_at()], recorded, RULES)[0]
+    assert torch.allclose(condition.backdrop[0], clips.image_tensor(recorded[0].rgb), atol=1e-5)
 
 
 def test_moving_things_take_no_colour_from_another_time():
@@ -125,17 +126,17 @@ def test_moving_things_take_no_colour_from_another_time():
     old, fresh = Photo(view_at(time_s=0.0), red), Photo(view_at(time_s=1.0), red)
     target = view_at(time_s=1.0)
     car = (slice(14, 18), slice(22, 26))
-    held = build_condition(cloud, [track], [target], [old], RULES)
+    held = build_conditions(cloud, [track], [target], [old], RULES)[0]
     assert torch.equal(held.color[0][:, car[0], car[1]].amax((1, 2)), torch.tensor([0.0, 1.0, 0.0]))
     assert not bool(held.warped[0, 0][car].any())
-    now = build_condition(cloud, [track], [target], [fresh], RULES)
+    now = build_conditions(cloud, [track], [target], [fresh], RULES)[0]
     assert torch.allclose(now.color[0][:, car[0], car[1]].amax((1, 2)), torch.tensor([1.0, 0.0, 0.0]), atol=1e-5)
 
 
 def test_published_condition_is_zero_where_nothing_was_seen():
     cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
     recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
-    condition = build_condition(cloud, [], [view_at(y=1.0)], recorded, replace(RULES, published=True))
+    condition = build_conditions(cloud, [], [view_at(y=1.0)], recorded, replace(RULES, published=True))[0]
     hole = ~condition.valid
     assert bool(hole.any())
     assert float(condition.depth[hole].abs().max()) == 0
@@ -145,20 +146,20 @@ def test_published_condition_is_zero_where_nothing_was_seen():
 
 def test_nothing_in_view_gives_a_far_grey_nothing_not_an_error():
     cloud = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
-    condition = build_condition(cloud, [], [view_at()], [], RULES)
+    condition = build_conditions(cloud, [], [view_at()], [], RULES)[0]
     assert not bool(condition.valid.any())
     assert float(condition.depth.min()) == RULES.far_m
     with pytest.raises(InputError):
-        build_condition(cloud, [], [], [], RULES)
+        build_conditions(cloud, [], [], [], RULES)[0]
 
 
 def test_sizes_follow_the_rules_and_mixed_image_sizes_work():
     cloud = FusedCloud(wall(12.0, stripes), {})
     big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
     recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
-    condition = build_condition(cloud, [], [view_at(y=0.5, camera=big)], recorded, RULES)
+    condition = build_conditions(cloud, [], [view_at(y=0.5, camera=big)], recorded, RULES)[0]
     assert condition.views[0].camera.width == 48
-    truth = clips._tensor(image_of_wall(view_at(y=0.5), 12.0))
+    truth = clips.image_tensor(image_of_wall(view_at(y=0.5), 12.0))
     warped = condition.warped[0, 0]
     assert float((condition.color[0] - truth).abs()[:, warped].mean()) < 0.02
 
@@ -168,13 +169,13 @@ def test_fine_grid_gives_the_same_geometry_and_cleaner_colour():
     big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
     recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
     target = view_at(y=0.5, camera=big)
-    plain = build_condition(cloud, [], [target], recorded, RULES)
+    plain = build_conditions(cloud, [], [target], recorded, RULES)[0]
     small, fine = clips.build_conditions(cloud, [], [target], recorded, replace(RULES, fine_width=96, fine_height=64))
     assert fine.color.shape[-2:] == (64, 96)
     assert small.color.shape == plain.color.shape
     assert torch.equal(small.depth, plain.depth)
     assert torch.equal(small.valid, plain.valid)
-    truth = clips._tensor(image_of_wall(target, 12.0))
+    truth = clips.image_tensor(image_of_wall(target, 12.0))
     truth = torch.nn.functional.interpolate(truth[None], size=(32, 48), mode="area")[0]
     both = plain.warped[0, 0] & small.warped[0, 0]
     error = [float((c.color[0] - truth).abs()[:, both].mean()) for c in (small, plain)]

@@ -14,7 +14,6 @@ from mudg.core.complete import (
     complete_depth,
     conjugate_gradients,
     ray_elevation,
-    visible_depth,
 )
 
 HEIGHT, WIDTH, FOCAL = 60, 90, 80.0
@@ -148,29 +147,6 @@ def test_what_does_not_answer_is_far() -> None:
     assert abs(dense.depth[20, 10] / 12 - 1) < 0.01
 
 
-def test_points_seen_through_a_nearer_surface_are_dropped() -> None:
-    view = View(CAMERA, np.eye(4), 0.0)
-    u, v = np.meshgrid(np.arange(20, 60) + 0.5, np.arange(10, 50) + 0.5)
-    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1).reshape(-1, 3)
-    fence = rays[(np.round(v.ravel()) % 3) == 1] * 5  # rows of a near surface
-    behind = rays[(np.round(v.ravel()) % 3) == 2] * 20  # between them shines a far one
-    beside = np.array([[0.5, 0.0, 1]]) * 20
-    depth = visible_depth(view, np.concatenate([fence, behind, beside, [[np.nan] * 3]]), gap_deg=3.0)
-    known = np.isfinite(depth)
-    inner = np.zeros_like(known)
-    inner[14:46, 24:56] = True
-    assert (depth[known & inner] < 5.01).all()
-    assert (known & inner).sum() > 300
-    assert depth[30, 85] == pytest.approx(20)
-
-
-def test_of_two_points_in_a_pixel_the_nearer_stays() -> None:
-    view = View(CAMERA, np.eye(4), 0.0)
-    depth = visible_depth(view, np.array([[0.01, 0.01, 9.0], [0.005, 0.005, 4.0]], np.float32))
-    assert depth[30, 45] == 4
-    assert np.isfinite(depth).sum() == 1
-
-
 def test_conjugate_gradients_solve_what_a_direct_solver_solves() -> None:
     rng = np.random.default_rng(0)
     factor = sparse.random(80, 80, 0.1, random_state=1, dtype=np.float32)
@@ -186,8 +162,6 @@ def test_bad_input_is_named() -> None:
         complete_depth(rgb[:-1], depth, sky)
     with pytest.raises(InputError, match="positive"):
         complete_depth(rgb, np.where(np.isfinite(depth), -depth, np.nan).astype(np.float32), sky)
-    with pytest.raises(InputError, match="shape"):
-        visible_depth(View(CAMERA, np.eye(4), 0.0), np.zeros((3, 2)))
     with pytest.raises(UsageError):
         CompletionRules(rounds=0)
     with pytest.raises(UsageError):

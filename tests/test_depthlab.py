@@ -138,7 +138,7 @@ def test_the_command_converts_in_a_process_of_its_own(published: tuple[Path, dic
 def test_flags_that_mean_nothing_for_a_folder_are_refused(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for config in (ConvertConfig(resolution="320x512"), ConvertConfig(towers="x")):
-        with pytest.raises(UsageError, match="neither resolution nor towers"):
+        with pytest.raises(UsageError, match="do not apply to a DepthLab folder"):
             convert.run(config, tmp_path / "in", tmp_path / "out")
     with pytest.raises(InputError, match="a part of DepthLab is missing"):
         convert.run(ConvertConfig(), tmp_path / "in", tmp_path / "out")
@@ -215,7 +215,7 @@ def test_a_converted_folder_that_changed_is_refused(converted: Path, tmp_path: P
     wide = {**told["parts"]["vae"]["config"], "latent_channels": 8}
     for other, message in (
         ({"schema": 2}, "not a DepthLab model of this version"),
-        ({"sampling": {"steps": 50}}, "sampling of a DepthLab model is not described"),
+        ({"sampling": {"steps": 50}}, "the field 'processing_px' is missing"),
         ({"parts": {**told["parts"], "vae": {}}}, "not whole"),
         (
             {"parts": {**told["parts"], "mapping_layer": {**told["parts"]["mapping_layer"], "config": {"a": 1}}}},

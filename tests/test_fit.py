@@ -109,7 +109,7 @@ def test_same_in_same_out(world, tmp_path):
 
 @pytest.mark.parametrize("densify", ["gradient", "mcmc"])
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, densify):
-    """Ctrl-C before and after virtual views join, a densification and an opacity reset; learnt poses and all. Bit for bit."""
+    """Ctrl-C and SIGTERM before and after virtual views join, a densification and an opacity reset; learnt poses and all. Bit for bit."""
     config = settings("mudg_s", iterations=26, poses__learn=True, densify__kind=densify)
     schedule, stops = fit.densify_schedule(config), [3, 4, 9, 10, 11, 12, 21]
     if densify == "gradient":
@@ -126,7 +126,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     def ctrl_c(model, step, *rest):
         adam_step(model, step, *rest)
         if step == stops[0]:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM if step % 2 else signal.SIGINT)
 
     monkeypatch.setattr(fit, "adam_step", ctrl_c)
     while stops:
@@ -262,7 +262,7 @@ def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
     with pytest.raises(UsageError, match="virtual observations"):
         fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no finished folders"):
+    with pytest.raises(InputError, match="no finished virtual views"):
         fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "empty")
 
 
@@ -386,8 +386,8 @@ def test_lidar_pixels_agree_with_exact_depth(world):
 def test_a_point_behind_a_nearer_one_is_no_depth_of_this_camera():
     view = View(camera(width=SIZE[0], height=SIZE[1]), geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
     points = np.array([[5.0, 0.0, 0.0], [20.0, 0.02, 0.0], [20.0, -6.0, 0.0]], np.float32)
-    assert sorted(fit_views.visible_lidar(view, points).depth_m.tolist()) == [5.0, 20.0]
-    assert len(fit_views.visible_lidar(view, points[:0]).pixel) == 0
+    assert sorted(fit_views.lidar_pixels(view, points, 0.6).depth_m.tolist()) == [5.0, 20.0]
+    assert len(fit_views.lidar_pixels(view, points[:0], 0.6).pixel) == 0
 
 
 def test_what_only_virtual_views_see():

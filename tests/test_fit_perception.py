@@ -55,7 +55,7 @@ def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
 
 
 def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="file of its weights"):
+    with pytest.raises(UsageError, match="weight file"):
         perception_of(VirtualConfig(perception="lpips"))
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
     with pytest.raises(InputError, match="incomplete"):

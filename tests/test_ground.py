@@ -1,4 +1,4 @@
-"""The ground plane, and the map of what is joined to the driven path: known streets, tilted, noisy, with and without kerbs."""
+"""The ground plane, and the map of what is reachable from the driven path: known streets, tilted, noisy, with and without kerbs."""
 
 from __future__ import annotations
 
@@ -82,10 +82,10 @@ def test_the_road_is_joined_to_the_path_and_the_sidewalk_is_not(slope: tuple[flo
     assert ground is not None
     places = np.random.default_rng(6).uniform((-25, -8.5), (25, 8.5), (4000, 2))
     places = np.c_[places, places @ slope + np.where(np.abs(places[:, 1]) > KERB_AT_M, 0.12, 0)]
-    joined, _, raised = ground.at(places)
+    reachable, _, raised = ground.under(places)
     from_kerb = np.abs(places[:, 1]) - KERB_AT_M
-    assert joined[from_kerb < -2 * CELL_M].mean() > 0.98
-    assert joined[from_kerb > 2 * CELL_M].mean() < 0.02
+    assert reachable[from_kerb < -2 * CELL_M].mean() > 0.98
+    assert reachable[from_kerb > 2 * CELL_M].mean() < 0.02
     beyond = (from_kerb > 2 * CELL_M) & (from_kerb < 2)
     assert np.median(raised[beyond]) == pytest.approx(0.12, abs=0.05 + 3 * abs(slope[1]))
     assert np.median(raised[from_kerb < -3]) < 0.06
@@ -95,9 +95,9 @@ def test_without_a_kerb_all_is_joined_and_walls_are_no_ground() -> None:
     xyz, path = street(np.random.default_rng(7), kerb_m=0.0)
     ground = map_ground(xyz, path, path[0])
     assert ground is not None
-    assert ground.at(np.array([[5.0, 7, 0], [-20, -7, 0]]))[0].all()
-    joined, _, raised = ground.at(np.array([[5.0, 7, 3], [500, 0, 0], [np.nan, 0, 0]]))
-    assert not joined.any()
+    assert ground.under(np.array([[5.0, 7, 0], [-20, -7, 0]]))[0].all()
+    reachable, _, raised = ground.under(np.array([[5.0, 7, 3], [500, 0, 0], [np.nan, 0, 0]]))
+    assert not reachable.any()
     assert (raised == 0).all()
 
 
@@ -107,8 +107,8 @@ def test_a_vehicle_that_stood_and_sees_no_ground_around_it_is_joined_to_what_it_
     seen = xyz[np.linalg.norm(xyz[:, :2] - here[:, :2], axis=1) > 3.5]
     ground = map_ground(seen, here, here[0])
     assert ground is not None
-    joined, _, _ = ground.at(np.array([[here[0, 0] + 8, 0.5, 0], [here[0, 0] + 8, 6.5, 0.12]]))
-    assert joined.tolist() == [True, False]
+    reachable, _, _ = ground.under(np.array([[here[0, 0] + 8, 0.5, 0], [here[0, 0] + 8, 6.5, 0.12]]))
+    assert reachable.tolist() == [True, False]
 
 
 def test_a_lowered_kerb_joins_a_sidewalk_but_not_directly() -> None:
@@ -118,8 +118,8 @@ def test_a_lowered_kerb_joins_a_sidewalk_but_not_directly() -> None:
     ground = map_ground(xyz, path, path[0])
     assert ground is not None
     far, at_it, other_side, road = np.array([[-12, 6, 0.12], [10, 4.6, 0.04], [-12, -6, 0.12], [-12, 3, 0]], float)
-    joined, direct, _ = ground.at(np.stack([far, at_it, other_side, road]))
-    assert joined.tolist() == [True, True, False, True]
+    reachable, direct, _ = ground.under(np.stack([far, at_it, other_side, road]))
+    assert reachable.tolist() == [True, True, False, True]
     assert direct.tolist() == [False, True, False, True]
 
 
@@ -128,7 +128,7 @@ def test_the_order_of_returns_changes_nothing() -> None:
     one, other = (map_ground(points, path, path[0]) for points in (xyz, xyz[np.random.default_rng(1).permutation(len(xyz))]))
     assert one is not None
     assert other is not None
-    assert (one.joined == other.joined).mean() > 0.999
+    assert (one.reachable == other.reachable).mean() > 0.999
     assert above_plane(one.plane, path) == pytest.approx(above_plane(other.plane, path), abs=1e-3)
 
 

@@ -85,8 +85,8 @@ def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp
     ],
 )
 def test_words_of_the_command_line(words: list[str], out: str | None, expected: tuple[str, str, str]) -> None:
-    asked = ingest.asked(words, Path(out) if out else None, IngestConfig())
-    assert (asked.config.format, asked.log, str(asked.out)) == expected
+    config, log, folder = ingest.parse_arguments(words, Path(out) if out else None, IngestConfig())
+    assert (config.format, log, str(folder)) == expected
 
 
 @pytest.mark.parametrize(
@@ -95,16 +95,16 @@ def test_words_of_the_command_line(words: list[str], out: str | None, expected: 
         ([], None, "no log"),
         (["log"], None, "no folder"),
         (["kitti", "log"], None, "no folder"),
-        (["waymoo", "log", "o"], None, "neither such a format"),
-        ([".", "o", "p"], None, "too many words"),
-        ([".", "o"], "p", "too many words"),
+        (["waymoo", "log", "o"], None, "no such format"),
+        ([".", "o", "p"], None, "too many arguments"),
+        ([".", "o"], "p", "too many arguments"),
     ],
 )
 def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:
     with pytest.raises(UsageError, match=expected):
-        ingest.asked(words, Path(out) if out else None, IngestConfig())
+        ingest.parse_arguments(words, Path(out) if out else None, IngestConfig())
     with pytest.raises(UsageError, match="two formats"):
-        ingest.asked(["custom", "log", "o"], None, IngestConfig(format="kitti"))
+        ingest.parse_arguments(["custom", "log", "o"], None, IngestConfig(format="kitti"))
     with pytest.raises(UsageError, match="no such format") as caught:
         ingest.run(IngestConfig(format="rosbag"), "log", Path("o"))
     assert "kitti" in caught.value.expected
@@ -248,7 +248,7 @@ def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) 
     for index, config in enumerate(
         (IngestConfig(frames="0:2"), IngestConfig(cameras=("front",)), IngestConfig(resolution="60"))
     ):
-        with pytest.raises(UsageError, match="taken as it is"):
+        with pytest.raises(UsageError, match="does not apply to a scene"):
             ingest.run(config, source, tmp_path / f"refused{index}")
         with pytest.raises(UsageError, match="settings of its own"):
             ingest.run(config, "city", tmp_path / f"city{index}")

@@ -122,7 +122,7 @@ def test_schedules(clips):
 
 
 def test_clips_that_never_come_are_an_error(tmp_path):
-    with pytest.raises(ResourceError, match="not arriving"):
+    with pytest.raises(ResourceError, match="no training clips arrived"):
         learn_clips.await_shard(tmp_path, 1, patience_s=0.0)
 
 

@@ -11,21 +11,20 @@ import pytest
 import torch
 from test_learn_parallel import SAME, environment, losses_of
 from toy_clips import write_clips
-from toy_published import published_settings, tiny_model, write_tiny
+from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import ConditionRules, build_condition
+from mudg.data.clips.condition import ConditionRules, build_conditions
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
 from mudg.models.mdm.model import BatchPart, LossSettings
 from mudg.models.published import files as published_files
-from mudg.models.published import model as published
-from mudg.models.published.model import PAPER_DROPOUT, RELEASED_DROPOUT, ContextDropout, PublishedMDM
+from mudg.models.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
 from mudg.stages import convert, fuse, learn, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
@@ -91,15 +90,6 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     assert len(made) == 5 and bool(torch.isfinite(made[4].rgb).all())
 
 
-def test_settings_of_the_frozen_layers_agree_with_the_published_stages():
-    """By names here, by modules in `choose_trainable`."""
-    model = tiny_model()
-    for which in ("transformers", "all"):
-        moving = {id(p) for p in published.choose_trainable(model, 2, which)}
-        named = {n for n, p in model.trained_part().named_parameters() if id(p) not in moving}
-        assert named == model.temporal_parameters(which)
-
-
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     """With dropout inside the network on; terms too, and they have the same names in every part."""
     settings = published_settings(converted, clips)
@@ -109,7 +99,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     @torch.no_grad()
     def losses(step, part):
         drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, step, 2, 4, "batch", part)]
-        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings())
+        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(None, 1.0, 0.2))
 
     for step in range(2):
         whole, parts = losses(step, slice(0, 2)), [losses(step, slice(n, n + 1)) for n in (0, 1)]
@@ -132,7 +122,7 @@ def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
         for clip in drawn
     ]
     with torch.no_grad():
-        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings()).terms for some in (drawn, nothing))
+        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings(None, 1.0, 0.2)).terms for some in (drawn, nothing))
     assert {"depth", "semantics"} & set(terms)
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 
@@ -188,9 +178,9 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
         learn.run(published_settings(converted, clips, reference_dropout=0.8), tmp_path / "run")
     assert given and not any(given)
     assert dropped == [pytest.approx(0.8)]
-    assert ContextDropout.of(0.2) == PAPER_DROPOUT
-    assert ContextDropout.of(0.1) == RELEASED_DROPOUT
-    assert ContextDropout.of(0.0) == ContextDropout(0.05, 0.0, 0.0)
+    assert ContextDropout.for_reference(0.2) == PAPER_DROPOUT
+    assert ContextDropout.for_reference(0.1) == ContextDropout(0.05, 0.05, 0.05)  # as the released training code
+    assert ContextDropout.for_reference(0.0) == ContextDropout(0.05, 0.0, 0.0)
 
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
@@ -201,7 +191,7 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
             learn.run(published_settings(converted, clips, **wrong), tmp_path / "run")
     with pytest.raises(UsageError, match="multiples of 4"):
         learn.run(published_settings(converted, clips, width=50), tmp_path / "run")
-    with pytest.raises(UsageError, match="cannot be described"):
+    with pytest.raises(UsageError, match="cannot be changed"):
         learn.run(published_settings(converted, clips, widths=(16, 32, 64)), tmp_path / "run")
     with pytest.raises(UsageError, match="without a refiner"):
         learn.run(published_settings(converted, clips, frozen="denoiser"), tmp_path / "refiner")
@@ -223,7 +213,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     recorded = synthesize.recorded_images(log.scene, SynthesizeConfig(given_classes=False))
     views = [log.frame(name).view for name in window.frames]
     conditions = ConditionRules(48, 32, 72, 48, published=True)
-    wanted = build_condition(log.cloud, log.scene.tracks, views, recorded, conditions)
+    wanted = build_conditions(log.cloud, log.scene.tracks, views, recorded, conditions)[0]
     for name in ("color", "depth", "valid", "reference"):
         assert torch.equal(getattr(clip.condition, name), getattr(wanted, name)), name
     assert float((clip.condition.reference - clip.rgb[0]).abs().mean()) < 0.03  # frame 0's own image

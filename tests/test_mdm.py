@@ -183,7 +183,7 @@ def test_loss_falls_when_a_clip_is_learnt(config):
     totals = []
     for step in range(40):
         # the same draws at every fourth step: a falling loss cannot come from an easier draw
-        losses = model.loss([clip], BatchPart(0, step % 4, 0, 1), LossSettings())
+        losses = model.loss([clip], BatchPart(0, step % 4, 0, 1), LossSettings(None, 1.0, 0.2))
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
@@ -196,7 +196,7 @@ def test_loss_has_gradients_everywhere():
     condition = some_condition()
     ids = torch.randint(0, 19, (1, 3, 16, 24), generator=torch.Generator().manual_seed(0))
     clip = Clip(condition, condition.color, condition.depth, torch.ones_like(condition.valid), ids[0])
-    losses = model.loss([clip], BatchPart(0, 0, 0, 1), LossSettings())
+    losses = model.loss([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, 0.2))
     losses.total.backward()
     trained = [(n, p) for n, p in model.named_parameters() if not n.startswith("codec.")]
     dead = [n for n, p in trained if p.grad is None or not bool(p.grad.abs().sum() > 0)]

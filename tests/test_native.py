@@ -17,7 +17,7 @@ from torch import Tensor
 from mudg import native
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.core import losses, native_ops
-from mudg.core.table import AdamColumn, torch_adam
+from mudg.core.table import AdamColumn, torch_adam_columns
 
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
 
@@ -273,6 +273,11 @@ def test_box_mean_keeps_constants_and_wants_odd_sizes() -> None:
         native_ops.box_mean(torch.zeros(1, 4, 4), 4)
 
 
+def adam(parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int) -> None:
+    """A step on one column."""
+    native_ops.adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step)
+
+
 def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     prediction, target = _images((3, 20, 20))
     parameter, gradient = torch.ones(4, 3), torch.full((4, 3), 0.5)
@@ -280,7 +285,7 @@ def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.Mon
     monkeypatch.setattr(native, "_loaded", None)
     monkeypatch.setattr(native, "_problem", "not built: test")
     assert native_ops.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
-    native_ops.adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
+    adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
     torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
     torch.testing.assert_close(native_ops.box_mean(prediction, 3), native_ops.torch_box_mean(prediction, 3))
     cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
@@ -369,77 +374,49 @@ def test_class_loss_and_sky_refuse_what_does_not_fit() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1,), (1000,), (257, 3), (40, 16, 3), (0, 4)])
-@pytest.mark.parametrize("sparse", [False, True])
-def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: bool) -> None:
+def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...]) -> None:
     generator = torch.Generator().manual_seed(0)
     parameter = torch.randn(shape, generator=generator)
-    visible = torch.rand(shape[:1], generator=generator) > 0.4 if sparse else None
     mine = [parameter.clone(), torch.zeros(shape), torch.zeros(shape)]
     exact = [t.double() for t in mine]
     for step in range(1, 6):
         gradient = torch.randn(shape, generator=generator)
-        native_ops.adam(mine[0], gradient, mine[1], mine[2], 1e-2, step, visible)
-        torch_adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
+        adam(mine[0], gradient, mine[1], mine[2], 1e-2, step)
+        torch_adam_columns([AdamColumn(exact[0], gradient.double(), exact[1], exact[2], 1e-2)], step)
     for got, want in zip(mine, exact):
         torch.testing.assert_close(got.double(), want, rtol=2e-6, atol=2e-6)
-    if visible is not None:
-        assert torch.equal(mine[0][~visible], parameter[~visible])
-        assert mine[1][~visible].abs().sum() == 0
-
-
-def test_sparse_adam_leaves_invisible_rows_and_their_moments_alone(isa: str) -> None:
-    generator = torch.Generator().manual_seed(1)
-    tensors = [torch.rand(300, 7, generator=generator) for _ in range(3)]
-    before, visible = [t.clone() for t in tensors], torch.rand(300, generator=generator) > 0.5
-    gradient = torch.randn(300, 7, generator=generator)
-    gradient[~visible] = float("nan")  # never looked at
-    exact = [t.double() for t in tensors]
-    native_ops.adam(tensors[0], gradient, tensors[1], tensors[2], 1e-2, 7, visible)
-    torch_adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, 7, visible)
-    for now, old, want in zip(tensors, before, exact):
-        assert torch.equal(now[~visible], old[~visible])
-        torch.testing.assert_close(now[visible].double(), want[visible], rtol=2e-6, atol=2e-6)
 
 
 @needs_native
 def test_adam_moves_every_element_alike_wherever_it_lies(pool: Any) -> None:
-    """Same history, same result: bit for bit, at any position, number of threads, dense or sparse."""
+    """Same history, same result: bit for bit, at any position, number of threads and shape."""
     native.set_threads(3)
     values = [torch.full((70_001,), x) for x in (0.3, 0.01, 0.02)]
-    native_ops.adam(values[0], torch.full((70_001,), 0.7), values[1], values[2], 1e-3, 4)
+    adam(values[0], torch.full((70_001,), 0.7), values[1], values[2], 1e-3, 4)
     assert all(len(torch.unique(value)) == 1 for value in values)
     rows = [torch.full((701, 5), x) for x in (0.3, 0.01, 0.02)]
-    visible = torch.arange(701) % 3 != 0
-    native_ops.adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4, visible)
-    for dense, sparse in zip(values, rows):
-        assert (sparse[visible] == dense[0]).all()
+    adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4)
+    for long, wide in zip(values, rows):
+        assert (wide == long[0]).all()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 1.0])
-def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str, share: float) -> None:
-    """Bit for bit; narrow and wide columns; invisible rows are not looked at."""
+def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str) -> None:
+    """Bit for bit; narrow and wide columns."""
     generator = torch.Generator().manual_seed(2)
-    rows, visible = 1037, torch.rand(1037, generator=generator) < share
-    shapes = [(rows,), (rows, 3), (rows, 4), (rows, 15, 3), (rows, 16), (rows, 17)]
+    shapes = [(1037,), (1037, 3), (1037, 4), (1037, 15, 3), (1037, 16), (1037, 17)]
     together = [[torch.rand(shape, generator=generator) for _ in range(4)] for shape in shapes]
-    for values in together:
-        values[1][~visible] = float("nan")
-    alone = [[t[visible].clone() for t in values] for values in together]
-    before = [[t.clone() for t in values] for values in together]
-    native_ops.adam_columns([AdamColumn(*values, rate=0.1 * i) for i, values in enumerate(together, 1)], 3, visible)
-    for i, values in enumerate(alone, 1):
-        native_ops.adam(values[0], values[1], values[2], values[3], 0.1 * i, 3)
-    for values, expected, old in zip(together, alone, before):
-        for k in (0, 2, 3):
-            assert torch.equal(values[k][visible], expected[k])
-            assert torch.equal(values[k][~visible], old[k][~visible])
+    alone = [[t.clone() for t in values] for values in together]
+    native_ops.adam_columns([AdamColumn(*values, rate=0.1 * i) for i, values in enumerate(together, 1)], 3)
+    for i, (values, expected) in enumerate(zip(together, alone), 1):
+        adam(*expected, 0.1 * i, 3)
+        assert all(torch.equal(values[k], expected[k]) for k in (0, 2, 3))
 
 
 @needs_native
 def test_adam_tells_autograd_that_values_have_changed() -> None:
     weight = torch.ones(5, requires_grad=True)
     loss = (weight * weight).sum()
-    native_ops.adam(weight.detach(), torch.ones(5), torch.zeros(5), torch.zeros(5), 0.1, 1)
+    adam(weight.detach(), torch.ones(5), torch.zeros(5), torch.zeros(5), 0.1, 1)
     with pytest.raises(RuntimeError, match="inplace"):
         loss.backward()
 
@@ -447,7 +424,7 @@ def test_adam_tells_autograd_that_values_have_changed() -> None:
 @needs_native
 def test_adam_drops_moments_too_small_to_matter() -> None:
     parameter, first, second = torch.ones(40), torch.full((40,), 1e-37), torch.full((40,), 1e-37)
-    native_ops.adam(parameter, torch.zeros(40), first, second, 0.1, 500)
+    adam(parameter, torch.zeros(40), first, second, 0.1, 500)
     assert first.abs().max() == 0
     assert second.max() == 0
     assert torch.isfinite(parameter).all()
@@ -456,8 +433,6 @@ def test_adam_drops_moments_too_small_to_matter() -> None:
 def test_adam_refuses_what_does_not_fit() -> None:
     a, b = torch.zeros(4, 2), torch.zeros(4, 3)
     with pytest.raises(InputError, match="one shape"):
-        native_ops.adam(a, b, a, a, 0.1, 1)
-    with pytest.raises(InputError, match="visible"):
-        native_ops.adam(a, a, a, a, 0.1, 1, torch.ones(3, dtype=torch.bool))
+        adam(a, b, a, a, 0.1, 1)
     with pytest.raises(UsageError, match="from 1"):
-        native_ops.adam(a, a, a, a, 0.1, 0)
+        adam(a, a, a, a, 0.1, 0)

@@ -233,7 +233,7 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
         fuse.run_many(FuseConfig(), scenes, scenes, jobs=1, overwrite=True)
     (tmp_path / "status.json").write_text("scenes/a\n")
     entries = [batch.Entry("c", str(scenes / "a"))]
-    for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status would replace")):
+    for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status file would replace")):
         with pytest.raises(UsageError, match=words):
             batch.run_batch("fuse", entries, tmp_path, fuse._one_of_many, jobs=1, listed=list_file)
     assert (tmp_path / "status.json").read_text() == "scenes/a\n"
@@ -294,7 +294,7 @@ def test_the_chain_takes_the_scene_in_its_own_folder_and_leaves_it_alone(
     assert before.items() <= tree(out).items()
     (out / "run.json").unlink()
     (out / "mine.md").write_text("mine")
-    with pytest.raises(UsageError, match="something else"):
+    with pytest.raises(UsageError, match="do not belong to this run"):
         run.run_chain(RunConfig(), out / "scene", out, overwrite=True)
     with pytest.raises(UsageError, match="an input"):
         run.run_chain(RunConfig(), out / "scene", out / "scene", overwrite=True)
@@ -304,7 +304,7 @@ def test_the_chain_does_not_take_the_folder_of_a_verb_for_its_own(world: dict[st
     folder = copied(world, ("fused",), tmp_path)["fused"]
     before = tree(tmp_path)
     for overwrite in (False, True):
-        with pytest.raises(UsageError, match="something else"):
+        with pytest.raises(UsageError, match="do not belong to this run"):
             run.run_chain(RunConfig(), "city", folder, overwrite=overwrite)
     assert tree(tmp_path) == before
 
@@ -314,7 +314,7 @@ def test_the_comparison_of_methods_leaves_other_folders_alone(tmp_path: Path) ->
         folder = tmp_path / name.partition(".")[2]
         folder.mkdir()
         (folder / name).write_text("{}")
-        with pytest.raises(UsageError, match="something else"):
+        with pytest.raises(UsageError, match="do not belong to this run"):
             bench.run("shift", BenchConfig(), folder, overwrite=True)
         assert (folder / name).read_text() == "{}"
 
@@ -445,7 +445,7 @@ def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(tmp_path: Path,
             convert.run(ConvertConfig(), tmp_path / "512.ckpt", out, overwrite=True)
     (tmp_path / "fit").mkdir()
     store.write_json(tmp_path / "fit" / "model.json", {"schema": 1, "nodes": []})
-    with pytest.raises(UsageError, match="something else"):
+    with pytest.raises(UsageError, match="do not belong to a model"):
         convert.run(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "fit", overwrite=True)
     with counted_writes(monkeypatch, stop_at=2), pytest.raises(KeyboardInterrupt):
         converted("float16", overwrite=True)

@@ -57,10 +57,15 @@ def finished_run(out: Path) -> Path:
     return out
 
 
+def written(out: Path) -> Path:
+    """The report of a finished run."""
+    return run_report.write_page(out, run_report.film(out))
+
+
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     out = finished_run(tmp_path_factory.mktemp("run"))
-    return run_report.write_report(out).read_text(encoding="utf-8")
+    return written(out).read_text(encoding="utf-8")
 
 
 class Outline(html.parser.HTMLParser):
@@ -252,7 +257,7 @@ def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
 def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = finished_run(tmp_path)
     monkeypatch.setattr(run_report, "video_encoders", list)
-    page = run_report.write_report(out).read_text(encoding="utf-8")
+    page = written(out).read_text(encoding="utf-8")
     outline(page)
     assert "<video" not in page
     assert page.count("data:image/jpeg") == 2
@@ -260,11 +265,11 @@ def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytes
 
 def test_an_unscored_run_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="file not found"):
-        run_report.write_report(tmp_path)
+        written(tmp_path)
 
 
 def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = finished_run(tmp_path)
-    large = run_report.write_report(out).stat().st_size
+    large = written(out).stat().st_size
     monkeypatch.setattr(run_report, "BUDGET_BYTES", 1000)
-    assert run_report.write_report(out).stat().st_size < large
+    assert written(out).stat().st_size < large

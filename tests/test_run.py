@@ -199,7 +199,7 @@ def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dic
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, verbs: dict[str, Any]) -> None:
     (tmp_path / "holiday.jpg").write_text("x")
-    with pytest.raises(UsageError, match="something else"):
+    with pytest.raises(UsageError, match="do not belong to this run"):
         run.run_chain(RunConfig(), "city", tmp_path)
     assert verbs["calls"] == []
     assert sorted(p.name for p in tmp_path.iterdir()) == ["holiday.jpg"]

@@ -47,7 +47,7 @@ def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
     made.finish({"psnr": 30.0})
     again = run(tmp_path / "r")
     assert again.complete
-    assert again.summary() == {"psnr": 30.0}
+    assert store.read_json(again.path / "run.json")["summary"] == {"psnr": 30.0}
     (made.path / "out.txt").write_text("altered")
     with pytest.raises(IntegrityError, match="--overwrite"):
         run(tmp_path / "r")

@@ -158,7 +158,7 @@ def test_methods_must_stand_in_the_same_place(tmp_path: Path, scene: Path) -> No
     here = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
     there = toy_views.write_views(scene, tmp_path / "b", "b", (3.0,))
     (there / "front_shift+3.0").rename(there / "front_shift+2.0")
-    with pytest.raises(InputError, match="different places"):
+    with pytest.raises(InputError, match="different positions"):
         score.run(ScoreConfig(), scene, {"a": here, "b": there}, tmp_path / "score")
 
 

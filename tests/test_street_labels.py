@@ -17,7 +17,9 @@ from toy_scene import ToyStreet
 from mudg.base import checkpoint, geometry
 from mudg.base.errors import InputError, IntegrityError, ResourceError
 from mudg.base.palette import CLASSES, ID
-from mudg.core.complete import ray_elevation, visible_depth
+from mudg.core.complete import ray_elevation
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.labels import street_net
 from mudg.models.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
 from mudg.models.labels.inputs import TRAIN_ID_OF
@@ -53,7 +55,7 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     assert np.median(found.upwards[wall]) < 0.1
     assert np.median(found.height_m[wall]) > 0.5
     assert (found.elevation_rad == ray_elevation(given.view)).all()
-    measured = np.isfinite(visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg))
+    measured = np.isfinite(visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg))
     assert ((found.away_deg == 0) == measured).all()
     car = truth == ID["car"]
     inside = (found.box == 1) & found.in_box
@@ -66,8 +68,8 @@ def test_evidence_tells_ground_beyond_a_kerb() -> None:
     found = gather(given)
     near = (found.away_deg < 0.3) & (found.depth_m < 20)
     road, wall = (truth == ID["road"]) & near, (truth == ID["building"]) & near & (found.height_m > 1)
-    assert found.joined[road].mean() > 0.95
-    assert not found.joined[wall].any()
+    assert found.reachable[road].mean() > 0.95
+    assert not found.reachable[wall].any()
     assert (found.raised_m[wall] == 0).all()
 
 
@@ -299,8 +301,9 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
     with pytest.raises(ResourceError, match="weights are missing"):
         street_net.load(tmp_path)
     for field, value, words in (
-        ("widths", [8, 8, 8, 8, 9], "not possible"), ("widths", "8", "not possible"), ("blocks", [1] * 4, "not possible"),
-        ("blocks", [1, 1, 1, 1, 10**9], "not possible"), ("temperature", 0, "positive"), ("focal_px", "x", "positive"),
+        ("widths", [8, 8, 8, 8, 9], r"widths\[4\]\n.*multiple of 8"), ("widths", "8", r"widths\n.*array"),
+        ("blocks", [1] * 4, "the field 4 is missing"), ("blocks", [1, 1, 1, 1, 10**9], r"blocks\[4\]\n.*1024"),
+        ("temperature", 0, r"temperature\n.*greater than 0"), ("focal_px", "x", "value is not a number"), ("depth", 3, "unknown field"),
         ("widths", [8, 8, 8, 8, 16], "do not fit"),
     ):  # fmt: skip
         shutil.rmtree(tmp_path / "bad", ignore_errors=True)

@@ -1,6 +1,7 @@
 """synthesize: every frame is made, windows join, interruptions leave no trace, sizes fit."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -195,15 +196,15 @@ def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
     scene, cloud = read_scene(root / "scene"), read_fused(root / "fused")
     view = trajectory.shifted(scene, "front", 1.0).views[2]
     rules = ConditionRules(96, 64)
-    renders = synthesize.Renders(fitted)
+    model = fit.load_model(fitted)
     plain = build_conditions(cloud, scene.tracks, [view], [], rules)[0]
-    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=renders.sparse)[0]
+    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=partial(synthesize.rendered_points, model))[0]
     assert bool(helped.valid[plain.valid].all())
     assert int(helped.valid.sum()) > int(plain.valid.sum())
     near = torch.from_numpy(ndimage.binary_dilation(plain.valid[0, 0].numpy(), iterations=rules.measured_reach_px))
     new = helped.valid[0, 0] & ~plain.valid[0, 0]
     assert not bool((new & near).any())
-    shown = renders.sparse(view.resized(96, 64))
+    shown = synthesize.rendered_points(model, view.resized(96, 64))
     assert torch.equal(helped.depth[0, 0][new], shown.depth[new])
     assert torch.equal(helped.semantics[0, 0][new], shown.semantics[new])
     run = lambda name, **more: synthesize.run(  # noqa: E731

@@ -81,7 +81,6 @@ def test_reversing_keeps_the_vehicles_left():
     scene = drive([geometry.yaw_matrix(0.0, (-float(i), 0.0, 0.0)) for i in range(4)])
     move = trajectory.shifted(scene, "front", 1.0).views[1].center_world - trajectory.recorded(scene, "front").views[1].center_world
     assert move.tolist() == pytest.approx([0.0, 1.0, 0.0])
-    assert np.abs(trajectory.heading_against_path_rad(scene.ego)).tolist() == pytest.approx([math.pi] * 4)
 
 
 def test_a_banked_road_shifts_horizontally():
@@ -107,11 +106,6 @@ def test_names_and_origin():
     assert trajectory.shifted(scene, "front", 2.0).name == "front_shift+2.0"
     assert trajectory.shifted(scene, "front", -4.0).name == "front_shift-4.0"
     assert trajectory.shifted(scene, "front", -4.0).origin == "shifted"
-
-
-def test_heading_follows_the_path_on_the_circle():
-    angles = trajectory.heading_against_path_rad(circle().ego)
-    assert np.abs(angles[1:-1]).max() < 1e-9
 
 
 def test_errors_in_words():

@@ -81,19 +81,19 @@ def shot(
 
 
 def points_at(world: CityWorld, view: View, frame: int, sweeps: int) -> tuple[NDArray[np.float32], float]:
-    """Points f32[N, 3] of the sweeps around a frame, movers as they stand at the view's time, and the largest beam gap, degrees."""
+    """Points f32[N, 3] of the sweeps around a frame, dynamic objects where they are at the view's time; and the largest beam gap, deg."""
     rules = FusionRules()
-    movers = [track for track in world.tracks() if judge_track(track, rules).moving]
+    dynamic = [track for track in world.tracks() if judge_track(track, rules).moving]
     total = world.config.n_frames
     first = min(max(0, frame - sweeps // 2), max(0, total - sweeps))
     parts, gap_deg = [np.zeros((0, 3))], 0.6
     for index in range(first, min(total, first + sweeps)):
         sweep = world.lidar_sweep(index)
-        owner, owned = separate(SweepShots(sweep.time_s, sweep.world_from_lidar, sweep.points, ()), movers, rules)
+        owner, owned = separate(SweepShots(sweep.time_s, sweep.world_from_lidar, sweep.points, ()), dynamic, rules)
         parts.append(geometry.transform_points(sweep.world_from_lidar, sweep.points.xyz)[owner == STATIC])
         gap_deg = GAP_SPREAD * measure_beam_gap(sweep.points.xyz)
         for number, local in owned.items():
-            pose = movers[number].pose_at(view.time_s)
+            pose = dynamic[number].pose_at(view.time_s)
             if pose is not None:
                 parts.append(geometry.transform_points(pose, local))
     return np.concatenate(parts).astype(np.float32), gap_deg
@@ -127,7 +127,7 @@ def _misplaced(track: Track, rng: np.random.Generator) -> Track:
 def save(path: Path, made: Sample) -> None:
     """Write a sample: measured planes in half precision."""
     arrays = {"rgb": made.rgb, "truth": made.truth}
-    for name, value in made.evidence.arrays().items():
+    for name, value in dataclasses.asdict(made.evidence).items():
         arrays[name] = value.astype(np.float16) if value.dtype == np.float32 else value
     store.write_safetensors(path, arrays)
 
@@ -136,5 +136,5 @@ def load(path: Path) -> Sample:
     """Read what ``save`` wrote."""
     arrays = store.read_safetensors(path)
     evidence = {f.name: arrays[f.name] for f in dataclasses.fields(Evidence)}
-    whole = {n: v.astype(np.float32) if v.dtype == np.float16 else v for n, v in evidence.items()}
-    return Sample(arrays["rgb"], Evidence(**whole), arrays["truth"])
+    arrays_f32 = {n: v.astype(np.float32) if v.dtype == np.float16 else v for n, v in evidence.items()}
+    return Sample(arrays["rgb"], Evidence(**arrays_f32), arrays["truth"])

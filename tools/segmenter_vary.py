@@ -64,17 +64,17 @@ def disturbed(evidence: Evidence, rng: np.random.Generator, rules: Rules) -> Evi
     height = evidence.height_m + rng.normal(0, 0.05) + rng.normal(0, 0.004) * np.minimum(evidence.depth_m, 60)
     if rng.random() < rules.no_ground or not np.isfinite(height).all():
         height = np.zeros_like(evidence.height_m)
-    joined, luck = evidence.joined, rng.random()
+    reachable, luck = evidence.reachable, rng.random()
     if luck < rules.no_kerb:  # lowered, or hidden behind parked cars
-        joined = np.abs(evidence.height_m) < LOW_M
+        reachable = np.abs(evidence.height_m) < LOW_M
     elif luck < rules.no_kerb + rules.kerb_everywhere:
-        joined = joined & (evidence.depth_m < rng.uniform(2, 30))
+        reachable = reachable & (evidence.depth_m < rng.uniform(2, 30))
     raised = evidence.raised_m * rng.uniform(0.4, 1.6) + np.abs(rng.normal(0, 0.02)) * (evidence.raised_m > 0)
     kept = np.ones(256, bool)
     kept[1:] = rng.random(255) >= (1.0 if rng.random() < rules.no_boxes else rng.uniform(0, 0.5))
     kept = kept[evidence.box]
     evidence = dataclasses.replace(
-        evidence, height_m=height.astype(np.float32), joined=joined, raised_m=raised.astype(np.float32),
+        evidence, height_m=height.astype(np.float32), reachable=reachable, raised_m=raised.astype(np.float32),
         rough=evidence.rough * np.float32(rng.uniform(0.5, 1.5)),
         box=np.where(kept, evidence.box, 0).astype(np.uint8), in_box=evidence.in_box & kept,
     )  # fmt: skip
@@ -83,7 +83,7 @@ def disturbed(evidence: Evidence, rng: np.random.Generator, rules: Rules) -> Evi
     zero = np.zeros_like(evidence.height_m)
     return dataclasses.replace(
         evidence, height_m=zero, depth_m=zero + np.float32(np.nan), away_deg=zero + 90, upwards=zero, beside_m=zero,
-        joined=np.zeros_like(joined), direct=np.zeros_like(joined), raised_m=zero,
+        reachable=np.zeros_like(reachable), direct=np.zeros_like(reachable), raised_m=zero,
         silent=np.zeros_like(evidence.silent), rough=zero, in_box=np.zeros_like(evidence.in_box),
     )  # fmt: skip
 
@@ -107,7 +107,7 @@ def _cropped(
 
 
 def _window(evidence: Evidence, window: tuple[slice, slice]) -> Evidence:
-    arrays = {name: value[window] if value.ndim == 2 else value for name, value in evidence.arrays().items()}
+    arrays = {name: value[window] if value.ndim == 2 else value for name, value in dataclasses.asdict(evidence).items()}
     return Evidence(**arrays)
 
 

@@ -35,11 +35,11 @@ TERMINATED = 143
 def _ingest(args: f.Ingest) -> dict[str, Any]:
     from mudg.stages import ingest
 
-    asked = ingest.asked(args.words, args.out, args.settings, many=args.list is not None)
+    config, log, out = ingest.parse_arguments(args.words, args.out, args.settings, many=args.list is not None)
     if args.list is not None:
-        return ingest.run_many(asked.config, args.list, asked.out, args.shard, args.jobs, args.overwrite)
+        return ingest.run_many(config, args.list, out, args.shard, args.jobs, args.overwrite)
     _only_with_list(args)
-    return {"scene": ingest.run(asked.config, asked.log, asked.out, overwrite=args.overwrite)}
+    return {"scene": ingest.run(config, log, out, overwrite=args.overwrite)}
 
 
 def _annotate(args: f.Annotate) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def _fuse(args: f.Fuse) -> dict[str, Any]:
 
 def _only_with_list(args: f.Many) -> None:
     if args.shard or args.jobs:
-        raise UsageError("--shard and --jobs go with --list", remedy="leave them out, or give --list FILE")
+        raise UsageError("--shard and --jobs need --list", remedy="leave them out, or give --list FILE")
 
 
 def _scene_of(args: f.Annotate | f.Fuse) -> Path:
@@ -121,7 +121,7 @@ def _score(args: f.Score) -> dict[str, Any]:
 def _name_and_folder(item: str) -> tuple[str, Path]:
     name, separator, folder = item.partition("=")
     if not separator or not name or not folder:
-        raise UsageError("--views takes names with their folders", expected="NAME=FOLDER", got=item)
+        raise UsageError("an entry of --views is not a name and a folder", expected="NAME=FOLDER", got=item)
     return name, Path(folder)
 
 
@@ -161,74 +161,74 @@ class Verb:
 
 VERBS: dict[str, Verb] = {
     "demo": Verb(
-        "The whole chain on the built-in city; ends with a report page.",
-        ("mudg demo", "mudg demo --fast --out /tmp/look", "mudg demo --seed 7 --out city7"),
+        "Run all steps on the built-in city and write a report page.",
+        ("mudg demo", "mudg demo --fast --out runs/first", "mudg demo --seed 7 --out city7"),
         _demo,
     ),
     "run": Verb(
-        "The whole chain on your own driving log or scene.",
+        "Run all steps on your own driving log or scene and write a report page.",
         ("mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti", "mudg run scenes/a --out runs/a --fast"),
         _run,
     ),
     "doctor": Verb(
-        "What this machine offers; with a scene, what is wrong with it.",
+        "Report what this machine offers, or check a scene or log for errors.",
         ("mudg doctor", "mudg doctor runs/kitti/scene", "mudg doctor --json"),
         _doctor,
     ),
     "ingest": Verb(
-        "Driving log (or the built-in city) -> scene directory.",
+        "Convert a driving log, or the built-in city, to a scene directory.",
         ("mudg ingest city scenes/city", "mudg ingest ~/kitti/2011_09_26_drive_0001_sync scenes/kitti --resolution 960",
          "mudg ingest custom my_log scenes/mine --cameras front --frames 0:40",
          "mudg ingest kitti --list drives.txt --out scenes --shard 0/4 --jobs 2"),
         _ingest,
     ),
     "annotate": Verb(
-        "Scene without labels -> semantics, sky and depth, each with a confidence.",
+        "Add missing labels to a scene: semantics, sky and depth, with confidences.",
         ("mudg annotate scenes/kitti --out scenes/kitti_labelled", "mudg annotate --list scenes --out labelled"),
         _annotate,
     ),
     "fuse": Verb(
-        "Scene -> one coloured cloud of the static world, one per moving object.",
+        "Fuse LiDAR and images: a static coloured point cloud, one more per dynamic object.",
         ("mudg fuse scenes/city --out runs/fused", "mudg fuse --list labelled --out fused --jobs 2"),
         _fuse,
     ),
     "learn": Verb(
-        "Train a diffusion model on generated cities, or go on with one on your own logs.",
+        "Train a diffusion model on generated cities, or fine-tune one on your own logs.",
         ("mudg learn --out runs/mdm", "mudg learn --config recipe.yaml --out runs/mdm",
          "mudg learn --data.scenes runs/kitti --start embedded --optimizer.lr 1e-4 --steps 500 --out runs/tuned",
          "torchrun --nproc-per-node 8 -m mudg learn --compute.parallel fsdp --config recipe.yaml --out runs/mdm"),
         _learn,
     ),
     "convert": Verb(
-        "Published checkpoint -> model folder for synthesize or annotate.",
+        "Convert a published checkpoint to a model folder for synthesize or annotate.",
         ("mudg convert 1024-mdm-checkpoint.ckpt --to models/mudg_1024",
          "mudg convert model.ckpt --to models/dc_512 --resolution 320x512 --dtype bfloat16",
          "mudg convert checkpoints --to weights/depthlab"),
         _convert,
     ),
     "synthesize": Verb(
-        "Dense RGB, depth and semantics on trajectories nobody drove.",
+        "Generate dense RGB, depth and semantics on laterally shifted trajectories.",
         ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",),
         _synthesize,
     ),
     "fit": Verb(
-        "Scene (and virtual views) -> dynamic 3D Gaussian scene.",
+        "Fit a dynamic 3D Gaussian scene to recorded (and virtual) views.",
         ("mudg fit scenes/city --fused runs/fused --method street_gaussians --out runs/plain",
          "mudg fit scenes/city --fused runs/fused --observations runs/virtual --out runs/mudg_s"),
         _fit,
     ),
     "render": Verb(
-        "Fitted scene -> RGB, depth and semantics on any shifted trajectory.",
+        "Render RGB, depth and semantics of a fitted scene on shifted trajectories.",
         ("mudg render scenes/city --model runs/mudg_s --shifts-m 0 3 -3 --out runs/render",),
         _render,
     ),
     "score": Verb(
-        "Renders against truth -> metrics, tables, error pictures.",
+        "Compare views with ground truth: metrics, tables, error images.",
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
         _score,
     ),
     "bench": Verb(
-        "Measurements against exact truth: mdm, poses, shift.",
+        "Run a benchmark against exact ground truth: mdm, poses or shift.",
         ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses",
          "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift"),
         _bench,
@@ -237,9 +237,9 @@ VERBS: dict[str, Verb] = {
 
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
-    ("the steps, one by one", ("ingest", "annotate", "fuse", "learn", "synthesize", "fit", "render", "score")),
-    ("measure", ("bench",)),
-    ("models from elsewhere", ("convert",)),
+    ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "synthesize", "fit", "render", "score")),
+    ("benchmarks", ("bench",)),
+    ("published models", ("convert",)),
 )
 
 
@@ -249,11 +249,11 @@ SECTIONS = (
 def overview() -> str:
     """The text of ``mudg --help``."""
     lines = [
-        f"mudg {version()}: from a driving log to lane-shifted RGB, depth and semantic video",
-        "and a dynamic 3D Gaussian scene that stays good off the recorded path.",
+        f"mudg {version()}: turns a driving log into laterally shifted RGB, depth and semantic video",
+        "and a dynamic 3D Gaussian scene that also renders well beside the recorded path.",
         "",
         "usage: mudg VERB [arguments]",
-        "       mudg VERB --help     all flags of one verb, with their defaults",
+        "       mudg VERB --help     all settings of one verb, with their defaults",
         "       mudg --version",
     ]
     for title, names in SECTIONS:
@@ -261,10 +261,10 @@ def overview() -> str:
         lines += [f"  {name:<12}{VERBS[name].summary}" for name in names]
     lines += [
         "",
-        "Settings: defaults < --config FILE.yaml < flags; the resolved settings lie beside every result as run.yaml.",
-        "Every step reuses a finished result that verifies, and continues an interrupted one.",
-        "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerics, 130 interrupted;",
-        "with --list, 10 + n: n scenes failed (99: 89 or more).",
+        "Settings: flags override --config FILE.yaml, which overrides the defaults. Every result holds its settings in run.yaml.",
+        "Repeat a command to resume it: finished results are verified and reused, interrupted ones are continued.",
+        "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerical error, 130 interrupted;",
+        "with --list: 10 + number of failed scenes (99: 89 or more).",
     ]
     return "\n".join(lines)
 
@@ -295,7 +295,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _complain(f"error: {error}")
         return error.exit_code
     except KeyboardInterrupt as interrupt:
-        _complain(f"stopped. Repeat the same command to continue: mudg {shlex.join(words)}")
+        _complain(f"stopped. Repeat the same command to resume: mudg {shlex.join(words)}")
         return TERMINATED if isinstance(interrupt, Terminated) else INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

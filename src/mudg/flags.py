@@ -1,4 +1,4 @@
-"""What every command takes on the command line: one frozen dataclass each, read by tyro. Imports no torch."""
+"""The command-line flags of every verb: one frozen dataclass each, parsed by tyro. Imports no torch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 from pydantic import ValidationError
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 from mudg.base import config as configuration
 from mudg.base.errors import UsageError
@@ -27,9 +27,9 @@ class Common:
     """Flags that every command has."""
 
     config: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
-    """Read settings from this YAML file (flags still win). The run.yaml beside any result is such a file."""
+    """Read settings from this YAML file; flags on the command line win. The run.yaml beside any result is such a file."""
     quiet: FlagCreatePairsOff[bool] = False
-    """No progress bars and no messages, only warnings and the result."""
+    """Show warnings and the result only: no progress bars, no messages."""
     json: FlagCreatePairsOff[bool] = False
     """Print the result as JSON on stdout."""
     debug: FlagCreatePairsOff[bool] = False
@@ -41,26 +41,28 @@ class Output(Common):
     """Flags of commands that write a folder."""
 
     out: Annotated[Path, arg(metavar="FOLDER")]
-    """Folder to write, apart from everything that is read. A finished result of the same settings and inputs is verified and reused."""
+    """Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and
+    reused."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace the result of other settings or inputs in --out instead of refusing. The new result is made beside the old one and takes
-    its place when it is finished (until then the disk holds both); files that are not of the old result stay."""
+    """Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is
+    finished, so the disk must hold both. Files that do not belong to the old result are kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Many(Common):
-    """Flags of commands that go over a list of scenes too."""
+    """Flags of commands that can also process a list of scenes."""
 
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace the result of other settings or inputs in the output folder instead of refusing. The new result is made beside the old
-    one and takes its place when it is finished (until then the disk holds both); files that are not of the old result stay."""
+    """Replace a result of other settings or inputs in the output folder instead of refusing. The old result stays until the new
+    one is finished, so the disk must hold both. Files that do not belong to the old result are kept."""
     list: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Many at once: a file with one source a line (SOURCE [name=NAME] ...), or a folder of them. Each goes to OUT/NAME; the exit
-    code is 0, or 10 + the number that failed."""
+    """Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to
+    OUT/NAME. The exit code is 0, or 10 + the number of failures."""
     shard: Annotated[str, arg(metavar="i/n")] = ""
-    """With --list: take every n-th entry from the i-th on, i from 0 to n-1."""
+    """With --list: process every n-th entry, starting with entry i; i counts from 0 to n-1. Use it to split a list over
+    machines."""
     jobs: Annotated[int, arg(metavar="INT")] = 0
-    """With --list: scenes worked on at a time (0 = one per processor)."""
+    """With --list: number of scenes processed at the same time (0 = one per processor)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,9 +70,10 @@ class Ingest(Many):
     """Flags of ``mudg ingest``."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional, arg(metavar="[FORMAT] LOG [OUT]")] = ()
-    """A dataset log, a scene, or the word city; its format is recognised unless named before it; the folder to write after it."""
+    """LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not recognised.
+    OUT: the folder to write."""
     out: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Folder to write, where it is not given after the log. A finished result of the same settings and inputs is reused."""
+    """Folder to write, if it is not given after LOG. A finished result of the same settings and inputs is reused."""
     settings: Annotated[stage_config.IngestConfig, arg(name="")]
 
 
@@ -79,7 +82,7 @@ class Annotate(Many):
     """Flags of ``mudg annotate``."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
-    """Scene made by ingest."""
+    """Scene directory written by ingest."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Folder to write. A finished result of the same settings and inputs is verified and reused."""
     settings: Annotated[stage_config.AnnotateConfig, arg(name="")]
@@ -90,7 +93,7 @@ class Fuse(Many):
     """Flags of ``mudg fuse``."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
-    """Scene made by ingest or annotate."""
+    """Scene directory written by ingest or annotate."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Folder to write. A finished result of the same settings and inputs is verified and reused."""
     settings: Annotated[stage_config.FuseConfig, arg(name="")]
@@ -108,13 +111,13 @@ class Convert(Common):
     """Flags of ``mudg convert``."""
 
     checkpoint: Annotated[Path, tyro.conf.Positional, arg(metavar="CKPT")]
-    """Checkpoint of MuDG, or of DynamiCrafter-512 or -1024: .ckpt, .pt or .safetensors; or the folder that holds DepthLab's files,
-    Marigold's folder and the image encoder's."""
+    """Checkpoint file of MuDG, DynamiCrafter-512 or DynamiCrafter-1024 (.ckpt, .pt or .safetensors); or, for DepthLab, the folder
+    that contains DepthLab's files, Marigold's folder and the image encoder's folder."""
     to: Annotated[Path, arg(metavar="FOLDER")]
     """Model folder to write."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace a model that is there already, when the new one is finished (until then the disk holds both); files that are not of the
-    model stay."""
+    """Replace the model that --to already holds. The old model stays until the new one is finished, so the disk must hold both.
+    Files that do not belong to the model are kept."""
     settings: Annotated[stage_config.ConvertConfig, arg(name="")]
 
 
@@ -122,12 +125,12 @@ class Convert(Common):
 class Synthesize(Output):
     """Flags of ``mudg synthesize``."""
 
-    scene: Positional[Path]
-    """Scene made by ingest or annotate."""
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
+    """Scene directory written by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Clouds made by fuse."""
+    """Point clouds written by fuse."""
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Scene made by fit: its renders tell what stands where LiDAR measured nothing."""
+    """Gaussian scene written by fit. Its renders supply the geometry where LiDAR measured nothing."""
     settings: Annotated[stage_config.SynthesizeConfig, arg(name="")]
 
 
@@ -135,12 +138,12 @@ class Synthesize(Output):
 class Fit(Output):
     """Flags of ``mudg fit``."""
 
-    scene: Positional[Path]
-    """Scene made by ingest or annotate."""
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
+    """Scene directory written by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Clouds made by fuse."""
+    """Point clouds written by fuse."""
     observations: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Output of synthesize: virtual views to learn from (method mudg_s)."""
+    """Virtual views written by synthesize; required by method mudg_s."""
     settings: Annotated[stage_config.FitConfig, arg(name="")]
 
 
@@ -148,10 +151,10 @@ class Fit(Output):
 class RenderFlags(Output):
     """Flags of ``mudg render``."""
 
-    scene: Positional[Path]
-    """The scene the model was fitted to."""
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
+    """Scene directory that the Gaussian scene was fitted to."""
     model: Annotated[Path, arg(metavar="FOLDER")]
-    """Model made by fit."""
+    """Gaussian scene written by fit."""
     settings: Annotated[stage_config.RenderConfig, arg(name="")]
 
 
@@ -159,12 +162,12 @@ class RenderFlags(Output):
 class Score(Output):
     """Flags of ``mudg score``."""
 
-    scene: Positional[Path]
-    """The scene that was rendered."""
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
+    """Scene directory that the views belong to."""
     views: Annotated[tuple[str, ...], arg(metavar="NAME=FOLDER")]
-    """Methods to compare, each a name and its output of render or synthesize, e.g. mudg_s=runs/render."""
+    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render."""
     fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Clouds made by fuse, for the baseline that needs no model (not given: no baseline)."""
+    """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     settings: Annotated[stage_config.ScoreConfig, arg(name="")]
 
 
@@ -172,16 +175,17 @@ class Score(Output):
 class RunOwn(Output):
     """Flags of ``mudg run`` without the settings of the steps."""
 
-    source: Positional[str]
+    source: Annotated[str, tyro.conf.Positional, arg(metavar="SOURCE")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
     fast: FlagCreatePairsOff[bool] = False
-    """Smaller pictures, fewer frames and iterations: a first look in a minute or two."""
+    """Use smaller images, fewer frames and fewer iterations: a first result in a minute or two."""
     seed: Annotated[int | None, arg(metavar="INT")] = None
-    """Seed of every random draw in the chain (not given: city 3, draws 0, or what --config says)."""
+    """Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     cameras: tuple[str, ...] = ()
-    """Cameras to move sideways (not given: the first one)."""
+    """Cameras for which shifted trajectories are made (not given: the first camera)."""
     shifts_m: tuple[float, ...] = ()
-    """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+    """Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides). They apply to synthesize, render
+    and score."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,13 +200,14 @@ class DemoOwn(Output):
     """Flags of ``mudg demo`` without the settings of the steps."""
 
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("mudg_demo")
-    """Folder to write. Repeat the same command to continue an interrupted demo."""
+    """Folder to write. Repeat the same command to resume an interrupted demo."""
     fast: FlagCreatePairsOff[bool] = False
-    """Smaller pictures, fewer frames and iterations: about 90 seconds instead of 5 minutes on 2 cores."""
+    """Use smaller images, fewer frames and fewer iterations: about 90 seconds instead of 5 minutes on 2 cores."""
     seed: Annotated[int | None, arg(metavar="INT")] = None
-    """Seed of the city and of every random draw in the chain (not given: city 3, draws 0, or what --config says)."""
+    """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     shifts_m: tuple[float, ...] = ()
-    """Lateral shifts to synthesize, render and score, metres, positive to the left (not given: 2, 3, 4 to both sides)."""
+    """Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides). They apply to synthesize, render
+    and score."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,8 +221,9 @@ class Demo(DemoOwn):
 class Bench(Output):
     """Flags of ``mudg bench``."""
 
-    name: Positional[str]
-    """mdm, poses or shift."""
+    name: Annotated[str, tyro.conf.Positional, arg(metavar="BENCHMARK")]
+    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks) or shift (complete methods off the recorded
+    path)."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")]
 
 
@@ -226,7 +232,7 @@ class Doctor(Common):
     """Flags of ``mudg doctor``."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
-    """Scene, or log in the neutral layout, to check; without it, the machine is reported."""
+    """Scene directory, or log in the custom format, to check (not given: report on this machine)."""
 
 
 FLAGS: dict[str, type[Common]] = {
@@ -235,7 +241,7 @@ FLAGS: dict[str, type[Common]] = {
 }  # fmt: skip
 
 CHAINS: dict[str, type[Common]] = {"demo": DemoOwn, "run": RunOwn}
-"""Commands that run several steps: what their --help lists. Some 200 settings of the steps are listed by --help-all."""
+"""Commands that run several steps, with the flags that --help lists. --help-all adds some 200 settings of the steps."""
 
 
 def parse(verb: str, words: Sequence[str], description: str) -> Common:
@@ -243,7 +249,7 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
 
     Raises:
         UsageError: unknown or invalid setting. InputError: --config cannot be read.
-        SystemExit: --help (0), or a flag that does not exist or fit (2); it has been said already.
+        SystemExit: --help (0), or an unknown or malformed flag (2); the message has been printed.
     """
     if verb in CHAINS and {"-h", "--help"} & set(words):
         return _own_help(verb, description)
@@ -267,8 +273,8 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
 def _own_help(verb: str, description: str) -> Common:
     """Print the flags of a chain itself, and where those of its steps are listed."""
     note = (
-        f"Every setting of a step is a flag, too, with the step's name before it: --fit.iterations 3000, --ingest.resolution 960.\n"
-        f"They are listed by mudg {verb} --help-all, and without that name by mudg fit --help and so on."
+        f"Every setting of a step is also a flag here, prefixed with the step's name: --fit.iterations 3000, --ingest.resolution 960.\n"
+        f"mudg {verb} --help-all lists them all; mudg fit --help and so on list those of one step, without the prefix."
     )
     _explain(CHAINS[verb], {})
     return tyro.cli(CHAINS[verb], args=["--help"], prog=f"mudg {verb}", description=f"{description}\n\n{note}")
@@ -285,7 +291,7 @@ def _settings(kind: type[Any], words: Sequence[str]) -> Any:
     with contextlib.redirect_stderr(io.StringIO()):
         try:
             known, _ = early.parse_known_args(list(words))
-        except SystemExit:  # malformed: the real parser says it better
+        except SystemExit:  # malformed: the real parser has the better message
             return kind()
     whole_chain = kind is stage_config.RunConfig
     config = stage_config.run_preset(known.fast) if whole_chain else kind()
@@ -338,10 +344,10 @@ def _texts_below_fields(source: str | None) -> dict[str, dict[str, str]]:
     for node in ast.parse(Path(source).read_bytes()).body:
         if not isinstance(node, ast.ClassDef):
             continue
-        of = texts.setdefault(node.name, {})
+        by_field = texts.setdefault(node.name, {})
         for field, below in zip(node.body, node.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
                 value = below.value
                 if isinstance(value, ast.Constant) and isinstance(value.value, str):
-                    of[field.target.id] = " ".join(value.value.split())
+                    by_field[field.target.id] = " ".join(value.value.split())
     return texts

@@ -32,11 +32,7 @@ class Checkpoint:
 
     def tensors(self, name: str) -> dict[str, Tensor]:
         """Load one named group of tensors (writable copies)."""
-        import torch
-
-        return {
-            k: torch.from_numpy(v.copy()) for k, v in store.read_safetensors(self.path / f"{name}.safetensors").items()
-        }
+        return store.read_tensors(self.path / f"{name}.safetensors")
 
 
 def save(
@@ -99,10 +95,6 @@ def latest(folder: Path) -> Checkpoint | None:
             problems.append(str(error))
             log.warn(f"checkpoint {path} does not verify and is skipped:\n{error}")
     if problems:
-        raise IntegrityError(
-            "no checkpoint verifies",
-            where=str(folder),
-            got=f"{len(problems)} damaged",
-            remedy="restore the folder from a copy, or delete it to start again",
-        )
+        raise IntegrityError("no checkpoint verifies", where=str(folder), got=f"{len(problems)} damaged",
+            remedy="restore the folder from a copy, or delete it to start again")  # fmt: skip
     return None

@@ -18,11 +18,9 @@ def rigid(value: Any, where: str) -> Matrix:
     matrix = np.array(value, np.float64)
     problem = geometry.rigid_problem(matrix)
     if problem:
-        raise InputError(
-            "pose is not a rigid motion", where=where, got=problem,
+        raise InputError("pose is not a rigid motion", where=where, got=problem,
             expected="f64[4, 4]: a right-handed rotation (orthonormal within 1e-4) and a translation in metres",
-            remedy="remove scale or mirroring from the matrix; check row against column order",
-        )  # fmt: skip
+            remedy="remove scale or mirroring from the matrix; check row against column order")  # fmt: skip
     matrix.setflags(write=False)
     return matrix
 
@@ -53,10 +51,9 @@ def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[
         raise InputError("times and poses do not pair up", where=f"{owner}: {name}", expected=expected, got=got)
     problem = increasing_problem(times) if np.isfinite(times).all() else shortened(times)
     if problem is not None:
-        raise InputError(
-            "times do not increase", where=f"{owner}: times_s", expected="finite seconds, strictly increasing",
-            got=problem, remedy="sort the poses by time and drop duplicates",
-        )  # fmt: skip
+        raise InputError("times do not increase", where=f"{owner}: times_s",
+            expected="finite seconds, strictly increasing", got=problem,
+            remedy="sort the poses by time and drop duplicates")  # fmt: skip
     if not geometry.all_rigid(matrices):
         for index, matrix in enumerate(matrices):
             rigid(matrix, f"{owner}: {name}[{index}]")

@@ -12,7 +12,8 @@ Conventions, stated once:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +23,7 @@ from mudg.base.errors import InputError
 if TYPE_CHECKING:
     from scipy.spatial import ConvexHull
 
-    from mudg.base.types import View
+    from mudg.base.types import Camera, View
 
 Matrix = NDArray[np.float64]
 
@@ -163,6 +164,29 @@ def yaw_of(world_from_object: Matrix) -> float:
     return float(np.arctan2(world_from_object[1, 0], world_from_object[0, 0]))
 
 
+def pinhole(intrinsics: Iterable[Any], x: Any, y: Any, z: Any) -> tuple[Any, Any]:
+    """Pixels (u, v) of camera coordinates: ``(fx x / z + cx, fy y / z + cy)``. The one pinhole formula of the package; its twins are the
+    native library's and ``core.zbuffer``'s, which repeats that one in float32.
+
+    Args:
+        intrinsics: fx, fy, cx, cy (``Camera.intrinsics``).
+        x, y, z: arrays or tensors that broadcast, metres; z must not be 0.
+    """
+    fx, fy, cx, cy = intrinsics
+    return fx * x / z + cx, fy * y / z + cy
+
+
+def pinhole_ray(intrinsics: Iterable[Any], u: Any, v: Any) -> tuple[Any, Any]:
+    """Inverse of ``pinhole`` up to depth: x / z and y / z of pixels (arrays or tensors)."""
+    fx, fy, cx, cy = intrinsics
+    return (u - cx) / fx, (v - cy) / fy
+
+
+def pixel_rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """x / z f64[W] of the pixel columns' centres and y / z f64[H] of the rows'."""
+    return pinhole_ray(camera.intrinsics, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+
+
 def project(view: View, xyz_world: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
     """Pinhole projection of world points.
 
@@ -179,7 +203,7 @@ def project(view: View, xyz_world: NDArray[np.floating]) -> tuple[Matrix, Matrix
     z = xyz_cam[:, 2]
     in_front = z > 0
     safe_z = np.where(in_front, z, 1.0)
-    uv = np.stack([camera.fx * xyz_cam[:, 0] / safe_z + camera.cx, camera.fy * xyz_cam[:, 1] / safe_z + camera.cy], 1)
+    uv = np.stack(pinhole(camera.intrinsics, xyz_cam[:, 0], xyz_cam[:, 1], safe_z), 1)
     uv[~in_front] = np.nan
     return uv, z
 
@@ -188,7 +212,8 @@ def unproject(view: View, uv_px: NDArray[np.floating], depth_m: NDArray[np.float
     """Inverse of ``project``: pixels ``[N, 2]`` and depths ``[N]`` (camera z) to world points f64[N, 3]."""
     camera = view.camera
     uv, z = np.asarray(uv_px, np.float64), np.asarray(depth_m, np.float64)
-    xyz_cam = np.stack([(uv[:, 0] - camera.cx) / camera.fx * z, (uv[:, 1] - camera.cy) / camera.fy * z, z], 1)
+    x, y = pinhole_ray(camera.intrinsics, uv[:, 0], uv[:, 1])
+    xyz_cam = np.stack([x * z, y * z, z], 1)
     return transform_points(view.world_from_cam, xyz_cam)
 
 
@@ -217,7 +242,7 @@ def box_hull(view: View, world_from_box: Matrix, size_m: ArrayLike, near_m: floa
                 u = (near_m - corners[i, 2]) / (corners[j, 2] - corners[i, 2])
                 points.append(corners[i : i + 1] + u * (corners[j : j + 1] - corners[i : i + 1]))
     kept = np.concatenate(points)
-    uv = np.c_[camera.fx * kept[:, 0] / kept[:, 2] + camera.cx, camera.fy * kept[:, 1] / kept[:, 2] + camera.cy]
+    uv = np.stack(pinhole(camera.intrinsics, *kept.T), 1)
     if not len(uv) or (uv.max(0) < 0).any() or uv[:, 0].min() > camera.width or uv[:, 1].min() > camera.height:
         return None
     try:

@@ -2,6 +2,8 @@
 
     run_side_by_side    named tasks at the same time, each with its own progress, stopped and resumed like a verb
     run_in_processes    one function over many arguments, several processes at a time
+    process_pool        the processes themselves, for work that goes on beside other work
+    computed_ahead      one function over numbers in order, several threads at a time
     run_limited         one call on a foreign file, under a limit of address space
     Interruption        Ctrl-C and SIGTERM wait for the end of a step
     one_torch_thread    results that do not depend on how many cores are free
@@ -24,6 +26,7 @@ import sys
 import threading
 import time
 import types
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -165,7 +168,7 @@ def error_from_record(record: Mapping[str, Any]) -> MudgError:
 def run_in_processes(
     function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[tuple[int, Result]]:
-    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each.
+    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each; ``processes`` = 1 is this one.
 
     Yields:
         Index of the arguments and the result, as they come.
@@ -173,23 +176,28 @@ def run_in_processes(
     Raises:
         ResourceError: a process ended from outside. Whatever the function raises; calls that have not begun are dropped.
     """
-    context = multiprocessing.get_context("spawn")
-    with (
-        child_environment(1),
-        concurrent.futures.ProcessPoolExecutor(processes, mp_context=context, initializer=_prepare_child) as pool,
-    ):
+    if processes == 1:
+        with one_torch_thread():
+            for index, items in enumerate(arguments):
+                yield index, function(*items)
+        return
+    with child_environment(1), process_pool(processes) as pool:
         futures = {pool.submit(function, *items): index for index, items in enumerate(arguments)}
         try:
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
-            raise ResourceError(
-                "a process ended without a word, most likely for want of memory", got=str(error),
-                remedy="take fewer processes, or a machine with more memory; repeat the command to resume",
-            ) from error  # fmt: skip
+            raise ResourceError("a process ended without a word, most likely for want of memory", got=str(error),
+                remedy="take fewer processes, or a machine with more memory; repeat the command to resume") from error  # fmt: skip
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def process_pool(processes: int) -> concurrent.futures.ProcessPoolExecutor:
+    """A pool of quiet processes of one torch thread each."""
+    context = multiprocessing.get_context("spawn")
+    return concurrent.futures.ProcessPoolExecutor(processes, mp_context=context, initializer=_prepare_child)
 
 
 def _prepare_child() -> None:
@@ -197,6 +205,18 @@ def _prepare_child() -> None:
 
     log.set_quiet(True)
     torch.set_num_threads(1)
+
+
+def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Iterator[Result]:
+    """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads, each with one torch thread."""
+    with one_torch_thread(), concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        waiting: deque[concurrent.futures.Future[Result]] = deque()
+        for number in range(count):
+            waiting.append(pool.submit(compute, number))
+            if len(waiting) > 2 * threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 # ---- one call under a limit of memory --------------------------------------------------------------------------------
@@ -219,16 +239,14 @@ def run_limited(
     """
     if sys.platform != "linux":
         log.warn("this system has no limit of address space; a hostile file may take all memory")
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context, initializer=_prepare_child) as pool:
+    with process_pool(1) as pool:
         try:
             return pool.submit(_limited, work, limit_bytes, where, out_of_memory).result()
         except BrokenProcessPool as error:
-            raise ResourceError(
-                "the converting process was ended from outside, most likely for want of memory", where=str(where),
+            raise ResourceError("the converting process was ended from outside, most likely for want of memory",
+                where=str(where),
                 expected=f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most",
-                remedy="close other programs, or convert on a machine with more memory",
-            ) from error  # fmt: skip
+                remedy="close other programs, or convert on a machine with more memory") from error  # fmt: skip
 
 
 def _limited(
@@ -247,10 +265,9 @@ def _limited(
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and not out_of_memory(error):
             raise
-        raise ResourceError(
-            "conversion needs more memory than it may take", where=str(where), expected=f"<= {limit_bytes / 1e9:.1f} GB",
-            got=(str(error).splitlines() or [""])[0][:200], remedy="raise --memory-gb, unless the file should be small",
-        ) from error  # fmt: skip
+        raise ResourceError("conversion needs more memory than it may take", where=str(where),
+            expected=f"<= {limit_bytes / 1e9:.1f} GB", got=(str(error).splitlines() or [""])[0][:200],
+            remedy="raise --memory-gb, unless the file should be small") from error  # fmt: skip
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
@@ -372,10 +389,9 @@ def _raise(child: _Child) -> None:
     code = child.process.exitcode
     if code == 1:
         raise RuntimeError(f"{child.task.name} failed; what went wrong is written above")
-    raise ResourceError(
-        f"the process of {child.task.name} ended without a word", got=f"exit code {code}" + (", killed" if code == -9 else ""),
-        remedy="repeat the command to continue; MUDG_THREADS=1 does one thing at a time and takes less memory",
-    )  # fmt: skip
+    raise ResourceError(f"the process of {child.task.name} ended without a word",
+        got=f"exit code {code}" + (", killed" if code == -9 else ""),
+        remedy="repeat the command to continue; MUDG_THREADS=1 does one thing at a time and takes less memory")  # fmt: skip
 
 
 # ---- in the child --------------------------------------------------------------------------------------------------

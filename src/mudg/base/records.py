@@ -7,12 +7,14 @@ single fields are plain functions that raise ``InputError`` and are attached wit
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import difflib
 import functools
-from collections.abc import Callable, Collection, Iterable, Iterator
+import json
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Final, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from mudg.base.errors import InputError, MudgError
 
@@ -32,6 +34,7 @@ _MEANINGS: Final = {
     "list_type": ("value is not a list", "[...]"),
     "dict_type": ("value is not an object", "{...}"),
     "model_type": ("record is not an object", "{...}"),
+    "unexpected_keyword_argument": ("unknown field", "a field that this version knows"),
 }
 """Pydantic's name of a problem -> what is wrong, what was expected."""
 
@@ -102,6 +105,36 @@ def parse_record(record: type[RecordType], value: object, where: str) -> RecordT
         return record.model_validate(value)
     except ValidationError as error:
         raise first_problem(error, where) from error
+
+
+def parse_dataclass(kind: type[Value], values: object, where: str) -> Value:
+    """Check the JSON values of a dataclass and of those nested in it; the file must state every field, and no other.
+
+    Args:
+        kind: the dataclass; lists become its tuples, no other types are converted.
+        where: as in ``parse_record``.
+
+    Raises:
+        InputError: the first field that is missing, unknown, or of a wrong type or range.
+    """
+    try:
+        made = TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
+    except ValidationError as error:
+        raise first_problem(error, where) from error
+    _compare_fields(values, dataclasses.asdict(made), where)  # type: ignore[call-overload]
+    return made
+
+
+def _compare_fields(stated: Any, complete: Mapping[str, Any], where: str) -> None:
+    try:
+        refuse_unknown(stated, complete)
+    except InputError as problem:
+        raise problem.located(place(where)) from problem
+    for name, value in complete.items():
+        if name not in stated:
+            raise InputError(f"the field {name!r} is missing", where=place(where), got=", ".join(stated) or "an empty object")
+        if isinstance(value, Mapping):
+            _compare_fields(stated[name], value, place(where, name))
 
 
 def first_problem(error: ValidationError, where: str, error_type: type[ErrorType] = InputError) -> ErrorType:

@@ -50,16 +50,10 @@ class Replacement:
             ResourceError: the folder is a mount point, or its parent cannot be written.
         """
         if os.path.ismount(self.folder):
-            raise ResourceError(
-                "a mount point cannot be replaced", where=str(self.folder), remedy="choose an --out inside it"
-            )
-        try:
+            raise ResourceError("a mount point cannot be replaced", where=str(self.folder),
+                remedy="choose an --out inside it")  # fmt: skip
+        with store.disk_errors("the new result cannot be made beside the old one", self.folder.parent):
             self.staging.mkdir(exist_ok=True)
-        except OSError as error:
-            raise ResourceError(
-                "the new result cannot be made beside the old one", where=str(self.folder.parent), got=str(error),
-                remedy="choose another --out",
-            ) from error  # fmt: skip
         return self.staging
 
     def swap(self, own_names: OwnNames) -> None:
@@ -75,10 +69,9 @@ class Replacement:
         except OSError as error:
             if self.retired.exists() and not self.folder.exists():
                 self.retired.rename(self.folder)
-            raise ResourceError(
-                "the new result cannot take the place of the old one", where=str(self.folder), got=str(error),
-                remedy=f"it is finished and lies in {self.staging}; repeat the command, or move it",
-            ) from error  # fmt: skip
+            raise ResourceError("the new result cannot take the place of the old one", where=str(self.folder),
+                got=str(error),
+                remedy=f"it is finished and lies in {self.staging}; repeat the command, or move it") from error  # fmt: skip
         store.fsync_directory(self.folder.parent)
         self._remove_retired(own_names)
 
@@ -103,10 +96,8 @@ class Replacement:
             self.staging.rename(self.folder)
             store.fsync_directory(self.folder.parent)
         elif self.staging.exists() or not is_finished(self.folder):
-            raise UsageError(
-                "a cut-off replacement and another folder are in each other's way", where=str(self.folder),
-                got=f"the replaced result in {self.retired}", remedy="move one of them elsewhere",
-            )  # fmt: skip
+            raise UsageError("a cut-off replacement and another folder are in each other's way", where=str(self.folder),
+                got=f"the replaced result in {self.retired}", remedy="move one of them elsewhere")  # fmt: skip
         log.warn(f"{self.folder}: finished replacing the old result, which had been cut off")
         self._remove_retired(own_names)
 
@@ -114,13 +105,11 @@ class Replacement:
         if not self.retired.is_dir():
             return
         own = own_names(self.retired)
-        try:
+        remedy = f"the new one is in place; move what you need from here to {self.folder}"
+        with store.disk_errors("the old result cannot be removed", self.retired, remedy):
             kept = [self._hand_over(name) for name in sorted(set(all_names(self.retired)) - set(own))]
             remove_files(self.retired, own)
             self.retired.rmdir()
-        except OSError as error:
-            raise ResourceError("the old result cannot be removed", where=str(self.retired), got=str(error),
-                                remedy=f"the new one is in place; move what you need from here to {self.folder}") from error  # fmt: skip
         if kept:
             more = f" and {len(kept) - 8} more" if len(kept) > 8 else ""
             log.warn(f"{self.folder}: kept files that are not of the old result: {', '.join(kept[:8])}{more}")

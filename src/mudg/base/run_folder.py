@@ -74,7 +74,7 @@ def refuse_overlaps(outs: Sequence[Path | str], inputs: Mapping[str, Path | str 
 
 def _refuse(relation: str, out: str, name: str, given: Path | str) -> None:
     raise UsageError(f"the output {relation} an input", where=f"output: {out}", got=f"{name}: {given}",
-                     remedy="choose an output apart from everything that is read")  # fmt: skip
+        remedy="choose an output apart from everything that is read")  # fmt: skip
 
 
 def _line_of(path: Path) -> list[object]:
@@ -350,10 +350,6 @@ class RunDir:
         Replacement.at(self.out).swap(functools.partial(own_names, self._output))
         self.path = self.out
 
-    def summary(self) -> dict[str, Any]:
-        """The summary that ``finish`` recorded."""
-        return store.read_json(self.path / _STATE).get("summary", {})
-
     def reused(self) -> Path:
         """Say that an earlier result is used again, and return its path."""
         log.info(f"{self.verb}: reused {self.path} (verified)")
@@ -372,9 +368,8 @@ def _verified(path: Path, overwrite: bool) -> bool:
         if overwrite:
             return False
         remedy = "add --overwrite to make it again, or choose another --out"
-        raise IntegrityError(
-            error.what, where=error.where, expected=error.expected, got=error.got, remedy=remedy
-        ) from error
+        raise IntegrityError(error.what, where=error.where, expected=error.expected, got=error.got,
+            remedy=remedy) from error  # fmt: skip
     return True
 
 
@@ -389,11 +384,9 @@ def _refuse_other(
     with contextlib.suppress(OSError, yaml.YAMLError):
         old = yaml.safe_load((path / _SETTINGS).read_text()) or {}
         found += differences(old, {"verb": verb, **json.loads(store.json_text(dict(config)))})
-    raise UsageError(
-        "the output folder holds the result of another configuration", where=str(path),
+    raise UsageError("the output folder holds the result of another configuration", where=str(path),
         got="; ".join(found[:8]) or "another program version",
-        remedy="choose another --out, or add --overwrite to replace it",
-    )  # fmt: skip
+        remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
 
 
 def _refuse_while_others_work(lock: Path) -> None:
@@ -402,7 +395,6 @@ def _refuse_while_others_work(lock: Path) -> None:
         return
     pid, host = owner
     if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
-        raise ResourceError(
-            "another process is working in this folder", where=str(lock.parent), got=f"pid {pid} on {host}",
-            remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}",
-        )  # fmt: skip
+        raise ResourceError("another process is working in this folder", where=str(lock.parent),
+            got=f"pid {pid} on {host}",
+            remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}")  # fmt: skip

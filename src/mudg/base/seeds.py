@@ -26,8 +26,8 @@ def numpy_rng(run_seed: int, step: int, purpose: str) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(key(run_seed, step, purpose)))
 
 
-def torch_generator(run_seed: int, step: int, purpose: str, device: str = "cpu") -> torch.Generator:
-    """Return a fresh torch generator on ``device`` for this (run seed, step, purpose)."""
+def torch_generator(run_seed: int, step: int, purpose: str) -> torch.Generator:
+    """Return a fresh torch generator (on the CPU) for this (run seed, step, purpose)."""
     import torch
 
-    return torch.Generator(device=device).manual_seed(key(run_seed, step, purpose))
+    return torch.Generator().manual_seed(key(run_seed, step, purpose))

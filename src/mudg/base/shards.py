@@ -62,9 +62,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         raise InputError("not a valid safetensors file", where=str(path), got=str(error)) from error
 
 
-def read_shards(
-    folder: Path, files: Mapping[str, str], *, verify: bool = True, remedy: str = "make the model again"
-) -> dict[str, Tensor]:
+def read_shards(folder: Path, files: Mapping[str, str], *, remedy: str = "make the model again") -> dict[str, Tensor]:
     """The tensors of files written by `write_shards`, checked against their sha256.
 
     Raises:
@@ -73,7 +71,7 @@ def read_shards(
     tensors: dict[str, Tensor] = {}
     for name, digest in files.items():
         path = folder / Path(name).name
-        if not path.is_file() or (verify and store.sha256_file(path) != digest):
+        if not path.is_file() or store.sha256_file(path) != digest:
             raise IntegrityError("a weight file is missing or altered", where=str(path), expected=f"sha256 {digest[:16]}...",
                                  remedy=remedy)  # fmt: skip
         tensors |= read_tensors(path)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError, IntegrityError, ResourceError
 
 if TYPE_CHECKING:
+    from PIL import Image
     from torch import Tensor
 
 MANIFEST = "manifest.json"
@@ -43,13 +44,22 @@ def fsync_directory(path: Path) -> None:
             os.close(fd)
 
 
-def _make_parent(path: Path) -> None:
+@contextlib.contextmanager
+def disk_errors(what: str, where: Path, remedy: str = "choose another --out") -> Iterator[None]:
+    """Turn an OSError of this block into a ResourceError that says what could not be done, where, and what to do."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
     except OSError as error:
-        raise ResourceError(
-            "cannot create a folder", where=str(path.parent), got=str(error), remedy="choose another --out"
-        ) from error
+        raise ResourceError(what, where=str(where), got=str(error), remedy=remedy) from error
+
+
+def _writing(path: Path) -> contextlib.AbstractContextManager[None]:
+    return disk_errors("writing failed", path, "free disk space or choose another --out")
+
+
+def _make_parent(path: Path) -> None:
+    with disk_errors("cannot create a folder", path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
 
 
 _umask_lock = threading.Lock()
@@ -74,25 +84,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     _make_parent(path)
-    try:
+    with disk_errors("cannot write here", path):
         fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
-    except OSError as error:
-        raise ResourceError(
-            "cannot write here", where=str(path), got=str(error), remedy="choose another --out"
-        ) from error
     os.close(fd)
     temporary = Path(name)
     try:
-        yield temporary
-        with temporary.open("rb+") as handle:
-            os.fsync(handle.fileno())
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-        fsync_directory(path.parent)
-    except OSError as error:
-        raise ResourceError(
-            "writing failed", where=str(path), got=str(error), remedy="free disk space or choose another --out"
-        ) from error
+        with _writing(path):
+            yield temporary
+            with temporary.open("rb+") as handle:
+                os.fsync(handle.fileno())
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(path)
+            fsync_directory(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -103,18 +106,22 @@ def atomic_write(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options: Any) -> None:
+    """Write a picture, u8[H, W, 3] or Pillow's, completely or not at all; the suffix names the format, ``options`` are Pillow's."""
+    from PIL import Image
+
+    with atomic_path(path) as temporary:
+        (Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture).save(temporary, **options)
+
+
 def write_in_tree(path: Path, content: bytes) -> None:
     """Write a file of a tree that is still under a temporary name. ``sync_tree`` must follow before the tree is renamed.
 
     One journal flush for a thousand small files instead of a thousand.
     """
     _make_parent(path)
-    try:
+    with _writing(path):
         Path(path).write_bytes(content)
-    except OSError as error:
-        raise ResourceError(
-            "writing failed", where=str(path), got=str(error), remedy="free disk space or choose another --out"
-        ) from error
 
 
 def sync_tree(folder: Path) -> None:
@@ -125,17 +132,13 @@ def sync_tree(folder: Path) -> None:
     if hasattr(os, "sync"):
         os.sync()
         return
-    try:
+    with _writing(folder):
         for path in sorted(Path(folder).rglob("*")):
             if path.is_dir():
                 fsync_directory(path)
             elif path.is_file():
                 with path.open("rb+") as handle:
                     os.fsync(handle.fileno())
-    except OSError as error:
-        raise ResourceError(
-            "writing failed", where=str(folder), got=str(error), remedy="free disk space or choose another --out"
-        ) from error
     fsync_directory(folder)
 
 
@@ -186,9 +189,8 @@ def _no_constants(name: str) -> Any:
 def parse_json(text: str | bytes, where: str) -> Any:
     """Parse strict JSON (no NaN, no duplicate keys, bounded size and nesting); InputError names ``where``."""
     if len(text) > _MAX_JSON_BYTES:
-        raise InputError(
-            "JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes", got=f"{len(text)}"
-        )
+        raise InputError("JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes",
+            got=f"{len(text)}")  # fmt: skip
     try:
         return json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constants)
     except (ValueError, RecursionError) as error:
@@ -226,9 +228,7 @@ def sha256_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def write_safetensors(
-    path: Path, tensors: Mapping[str, NDArray[Any] | Tensor], metadata: Mapping[str, str] | None = None
-) -> None:
+def write_safetensors(path: Path, tensors: Mapping[str, NDArray[Any] | Tensor]) -> None:
     """Write named arrays (numpy or torch, any device) as one safetensors file, atomically."""
     from safetensors.numpy import save as save_numpy
 
@@ -237,12 +237,19 @@ def write_safetensors(
         if not isinstance(value, np.ndarray):
             value = value.detach().cpu().numpy()
         arrays[name] = np.ascontiguousarray(value)
-    atomic_write(path, save_numpy(arrays, metadata=dict(metadata) if metadata else None))
+    atomic_write(path, save_numpy(arrays))
 
 
 def read_safetensors(path: Path) -> dict[str, NDArray[Any]]:
     """Read all arrays of a safetensors file; InputError if it is missing, truncated or malformed."""
     return parse_safetensors(read_bytes(path), str(path))
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """``read_safetensors`` as torch tensors that may be written to."""
+    import torch
+
+    return {name: torch.from_numpy(array.copy()) for name, array in read_safetensors(path).items()}
 
 
 def parse_safetensors(content: bytes, where: str) -> dict[str, NDArray[Any]]:
@@ -265,12 +272,8 @@ def atomic_directory(path: Path) -> Iterator[Path]:
     path = Path(path)
     partial = path.with_name(path.name + ".part")
     shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with disk_errors("cannot create a folder", partial):
         partial.mkdir(parents=True)
-    except OSError as error:
-        raise ResourceError(
-            "cannot create a folder", where=str(partial), got=str(error), remedy="choose another --out"
-        ) from error
     try:
         yield partial
     except BaseException:
@@ -335,9 +338,8 @@ def verify_manifest(folder: Path) -> str:
         if not file.is_file():
             raise IntegrityError("a file is missing", where=str(file))
         if file.stat().st_size != size or sha256_file(file) != expected:
-            raise IntegrityError(
-                "a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}..."
-            )
+            raise IntegrityError("a file was altered after it was written", where=str(file),
+                expected=f"sha256 {expected[:16]}...")  # fmt: skip
     return sha256_file(path)
 
 

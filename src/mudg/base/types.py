@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Matrix = NDArray[np.float64]
-TrajectoryOrigin = Literal["recorded", "shifted", "planned"]
+TrajectoryOrigin = Literal["recorded", "shifted"]
 ObservationKind = Literal["recorded", "virtual"]
 
 
@@ -74,6 +74,11 @@ class Camera:
             raise InputError("readout time cannot be negative", where=owner, got=f"{self.readout_s} s")
         if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):
             raise InputError("principal point is far outside the image", where=owner, got=f"cx={self.cx}, cy={self.cy}")
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy, as ``geometry.pinhole`` takes them."""
+        return self.fx, self.fy, self.cx, self.cy
 
     @property
     def matrix(self) -> Matrix:
@@ -128,7 +133,7 @@ class Trajectory:
     Args:
         name: of the trajectory, e.g. ``left_2m``.
         views: in the order of their times.
-        origin: how it came about: recorded, a recorded one shifted, or planned anew.
+        origin: how it came about: recorded, or a recorded one shifted.
     """
 
     name: str

@@ -17,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from mudg.base import log, store
@@ -28,7 +27,7 @@ from mudg.bench import poses as bench_poses
 from mudg.bench import shift as bench_shift
 from mudg.core import flicker
 from mudg.data.clips import from_city
-from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 from mudg.data.clips.from_city import CityClipRules
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
@@ -47,12 +46,12 @@ def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -
     """Run one of `BENCHES`, or shift; returns the folder with `bench.json` and `bench.md`.
 
     Raises:
-        UsageError: there is no such measurement.
+        UsageError: there is no such benchmark.
     """
     if name == SHIFT:  # made of verbs that each keep their own folder
         return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
-        raise UsageError("no such measurement", expected=" or ".join((*BENCHES, SHIFT)), got=name)
+        raise UsageError("no such benchmark", expected=" or ".join((*BENCHES, SHIFT)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
     directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), to_dict(config), inputs, overwrite)
@@ -106,16 +105,17 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     rules = CityClipRules(window=model.config.window)
     record = from_city.make_log(rules, city, frames=SEAM_FRAMES)
     views = [from_city.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
-    truths = [record.world.render(v.resized(rules.width, rules.height)) for v in views]
+    small = [view.resized(rules.width, rules.height) for view in views]
+    truths = [record.world.render(view) for view in small]
     sizes = (rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
     sources: dict[int, WarpSource] = {}
     frames: list[torch.Tensor] = []
     tail: dict[Any, torch.Tensor] = {}
     spans = windows(len(views), model.config.window, usual.overlap)
     for number, span in enumerate(spans):
-        condition = build_condition(
+        condition = build_conditions(
             record.cloud, record.world.tracks(), [views[i] for i in span], record.recorded, ConditionRules(*sizes), sources
-        )
+        )[0]
         shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
         made = model.sample(condition, SampleRequest(usual.steps, config.seed, number, known=known, bf16=bf16))
@@ -124,10 +124,8 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
     depth = torch.stack([torch.from_numpy(t.depth.copy())[None] for t in truths]).clamp(max=1000.0)
     ids = torch.stack([torch.from_numpy(t.semantics.astype("int64")) for t in truths])
-    poses = torch.from_numpy(np.stack([v.world_from_cam for v in views]))
-    camera = views[0].resized(rules.width, rules.height).camera
-    lens = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]] * len(views), dtype=torch.float64)
-    pairs = flicker.changes(torch.stack(frames), rgb, depth, ids, poses, lens)
+    true_frames = [flicker.TrueFrame.of(*one) for one in zip(small, depth, ids, strict=True)]
+    pairs = flicker.changes(torch.stack(frames), rgb, true_frames)
     ratios = [m / t if t > 0 else math.nan for m, t in pairs]
     seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
     mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731

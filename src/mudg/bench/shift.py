@@ -10,9 +10,7 @@ are worked on at a time: each has one thread.
 
 from __future__ import annotations
 
-import concurrent.futures
 import math
-import multiprocessing
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -20,13 +18,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import torch
 import yaml
 
 from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, is_temporary, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
@@ -48,7 +46,6 @@ from mudg.stages.config import (
     ScoreConfig,
     SynthesizeConfig,
 )
-from mudg.stages.synthesize import quiet_openmp
 
 TEST_EVERY: Final = 4
 PERCEPTUAL_VIEWS: Final = 12
@@ -148,7 +145,7 @@ def _refuse_foreign(out: Path) -> None:
         except (InputError, KeyError, TypeError):
             foreign = [name for name in names if name in _PAGES]
     if foreign:
-        raise UsageError("the output folder holds files of something else", where=str(out), got=", ".join(sorted(foreign)[:8]),
+        raise UsageError("the output folder holds files that do not belong to this run", where=str(out), got=", ".join(sorted(foreign)[:8]),
                          remedy="choose an empty --out")  # fmt: skip
 
 
@@ -164,12 +161,11 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     known = (FILL, "gs3d", WITHOUT, DIFFUSION, WITH)
     wanted = set(config.methods) | ({WITHOUT, WITH} if config.ablation else set())
     if not wanted or wanted - set(known):
-        raise UsageError(
-            "unknown method", where="--methods", expected=", ".join(known), got=", ".join(sorted(wanted - set(known)))
-        )
+        raise UsageError("unknown method", where="--methods", expected=", ".join(known),
+            got=", ".join(sorted(wanted - set(known))))  # fmt: skip
     plain = FitConfig(method=WITH, iterations=config.iterations, seed=config.seed)
     rows = [
-        Row(name, title_of(name), None if name in GENERATED else _with_method(plain, name))
+        Row(name, title_of(name), None if name in GENERATED else configuration.load(FitConfig, plain, overrides={"method": name}))
         for name in known
         if name in wanted
     ]
@@ -182,10 +178,6 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     if len(set(names)) < len(names):
         raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
     return tuple(rows)
-
-
-def _with_method(plain: FitConfig, name: str) -> FitConfig:
-    return configuration.load(FitConfig, plain, overrides={"method": name})
 
 
 def variant_of(text: str, plain: FitConfig) -> Row:
@@ -225,47 +217,14 @@ def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
 
 
 def _run_jobs(jobs: Sequence[LogJob], processes: int) -> list[dict[str, Any]]:
-    """All logs, several at a time, in the order of the list."""
-    processes = min(processes, len(jobs))
-    with log.task("logs", len(jobs)) as bar:
-        if processes == 1:
-            found = []
-            for job in jobs:
-                bar.update(str(job.seed))
-                found.append(_with_one_thread(job))
-                bar.advance()
-            return found
-        context = multiprocessing.get_context("spawn")
-        with quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
-            futures = {pool.submit(_in_process, job): job.seed for job in jobs}
-            try:
-                for future in concurrent.futures.as_completed(futures):
-                    future.result()
-                    bar.update(str(futures[future]))
-                    bar.advance()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-            return [future.result() for future in futures]
-
-
-def _in_process(job: LogJob) -> dict[str, Any]:
-    log.set_quiet(True)
-    torch.set_num_threads(1)
-    native.set_threads(1)
-    return make_log(job)
-
-
-def _with_one_thread(job: LogJob) -> dict[str, Any]:
-    """As in a process of its own; afterwards this process has its threads again."""
-    before = torch.get_num_threads(), native.threads()
-    torch.set_num_threads(1)
-    native.set_threads(1)
-    try:
-        return make_log(job)
-    finally:
-        torch.set_num_threads(before[0])
-        native.set_threads(before[1])
+    """All logs, several at a time with one thread each, in the order of the list."""
+    found: dict[int, dict[str, Any]] = {}
+    with log.task("logs", len(jobs)) as bar, native.one_thread():
+        for index, facts in run_in_processes(make_log, [(job,) for job in jobs], min(processes, len(jobs))):
+            found[index] = facts
+            bar.update(str(jobs[index].seed))
+            bar.advance()
+    return [found[index] for index in range(len(jobs))]
 
 
 def make_log(job: LogJob) -> dict[str, Any]:
@@ -289,10 +248,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
         found[row.name] = _scores_of(job, row, views[row.name])
     films: list[str] = []
     if job.videos:
-        shown = {
-            "truth": truth,
-            **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN},
-        }
+        shown = {"truth": truth, **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN}}
         # With another method the old films are out of date, whatever was asked.
         _made(replace(job, overwrite=True), lambda o: shift_page.film(shown, paths, out / "film", overwrite=o))
         films = [path.name for path in paths]

@@ -54,7 +54,7 @@ def film(views: Mapping[str, Path], paths: Sequence[Trajectory], out: Path, *, o
     for path in paths:
         sets = {name: read_observations(listed[path.name]) for name, listed in found.items() if path.name in listed}
         if "truth" not in sets:
-            raise InputError("no truth to show", where=f"{views.get('truth')}: {path.name}")
+            raise InputError("no ground truth to show", where=f"{views.get('truth')}: {path.name}")
         pictures = list(_frames(sets, list(views), len(path)))
         if playable:
             store.atomic_write(folder.path / f"{path.name}.mp4", mp4_within(lambda made=pictures: made, ENCODING, VIDEO_BYTES))
@@ -97,14 +97,14 @@ def page(doc: Mapping[str, Any]) -> str:
 
 def _video_values(doc: Mapping[str, Any]) -> dict[str, Any]:
     """The videos, and what the reader can choose among them; the largest shift to the left comes first."""
-    shown = [(entry["log"], name) for entry in doc["logs"] for name in entry["films"]]
-    names = sorted({name for _, name in shown}, key=_shift_of)
+    videos = [(entry["log"], name) for entry in doc["logs"] for name in entry["films"]]
+    names = sorted({name for _, name in videos}, key=_shift_of)
     return {
-        "videos": [{"log": log, "name": name, "title": _place(name)} for log, name in shown],
+        "videos": [{"log": log, "name": name, "title": _shift_title(name)} for log, name in videos],
         "columns": ["truth", *(r["name"] for r in doc["methods"] if r["name"] in SHOWN)],
         "panel_rows": ROWS.values(),
         "log_choices": [entry["log"] for entry in doc["logs"] if entry["films"]],
-        "shift_choices": [{"name": name, "title": _place(name), "selected": name == names[-1]} for name in names],
+        "shift_choices": [{"name": name, "title": _shift_title(name), "selected": name == names[-1]} for name in names],
     }
 
 
@@ -113,5 +113,5 @@ def _shift_of(name: str) -> float:
     return float(shift) if shift else 0.0
 
 
-def _place(name: str) -> str:
+def _shift_title(name: str) -> str:
     return shift_title(_shift_of(name), name)

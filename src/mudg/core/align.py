@@ -50,7 +50,7 @@ def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) 
     """
     if depth.shape != measured.shape or depth.shape != valid.shape:
         raise InputError("depth, measured depth and its mask differ in shape",
-                         got=f"{tuple(depth.shape)}, {tuple(measured.shape)}, {tuple(valid.shape)}")  # fmt: skip
+            got=f"{tuple(depth.shape)}, {tuple(measured.shape)}, {tuple(valid.shape)}")  # fmt: skip
     known = valid & torch.isfinite(depth) & torch.isfinite(measured) & (measured > 0)
     x, y = depth[known].double(), measured[known].double()
     if len(x) == 0:
@@ -112,7 +112,7 @@ def fit_affine(values: Tensor, measured: Tensor, space: Space, rounds: int = 12)
     """
     if values.shape != measured.shape or values.ndim != 1:
         raise InputError("values and measured depth differ in shape", where="fit_affine", expected="[N] and [N]",
-                         got=f"{tuple(values.shape)}, {tuple(measured.shape)}")  # fmt: skip
+            got=f"{tuple(values.shape)}, {tuple(measured.shape)}")  # fmt: skip
     if space not in ("depth", "disparity"):
         raise InputError("there is no such space", where="fit_affine", expected="depth or disparity", got=str(space))
     known = torch.isfinite(values) & torch.isfinite(measured) & (measured > 0)

@@ -3,7 +3,7 @@
 The unknown is the logarithm of depth at every pixel, so that all errors count relative to the distance. A sparse linear system
 pulls it to the measurements and asks neighbouring pixels to differ as a plane would:
 
-1. ``visible_depth`` projects points into the view and drops those that a nearer surface hides.
+1. ``core.visible`` projects points into the view and drops those that a nearer surface hides.
 2. Every measurement gets a plane in inverse depth (planes of the world are planes there) from its neighbours of like depth.
 3. Every pixel takes over the plane of its nearest measurement. It gives the start, and the difference to expect between two pixels.
 4. Differences across image edges count little. After a first solve, differences that are far off what was expected count less still
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 
-from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import pixel_rays
 from mudg.base.types import View
 
 
@@ -86,54 +86,6 @@ _STRETCH = 3.0
 """Beams of a scanner lie farther apart than the points of one beam: neighbours shall come from several beams."""
 
 
-# --- what the view sees of the points ---------------------------------------------------------------------------------
-
-
-def visible_depth(
-    view: View, xyz_world: NDArray[np.floating], *, gap_deg: float = 0.6, near_m: float = 0.5, far_m: float = 200.0
-) -> NDArray[np.float32]:
-    """Points drawn into a view, without those seen through gaps of nearer surfaces; f32[H, W] metres, NaN = none.
-
-    A scanner stands elsewhere than the camera and sees past things that stand before it. A point is dropped if clearly nearer
-    ones (by 7 % and 0.3 m) lie within a beam's gap on two opposite sides of it, or right beside it.
-
-    Args:
-        view: camera and pose.
-        xyz_world: [N, 3] metres; points that are not finite are left out.
-        gap_deg: largest angle between neighbouring beams.
-
-    Raises:
-        InputError: points have the wrong shape.
-    """
-    if xyz_world.ndim != 2 or xyz_world.shape[1] != 3:
-        raise InputError(
-            "points have the wrong shape", where="visible_depth", expected="[N, 3]", got=str(xyz_world.shape)
-        )
-    camera = view.camera
-    uv, z = geometry.project(view, xyz_world)
-    with np.errstate(invalid="ignore"):
-        inside = (z > near_m) & (z < far_m) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    column, row, z = uv[inside, 0].astype(np.intp), uv[inside, 1].astype(np.intp), z[inside].astype(np.float32)
-    nearest = np.full((camera.height, camera.width), np.inf, np.float32)
-    np.minimum.at(nearest, (row, column), z)
-    hidden = _between_nearer(
-        nearest, max(2, round(float(np.deg2rad(gap_deg)) * camera.fy)), max(2, round(0.004 * camera.fx))
-    )
-    return np.where(np.isfinite(nearest) & ~hidden, nearest, np.float32(np.nan)).astype(np.float32)
-
-
-def _between_nearer(nearest: NDArray[np.float32], reach_v: int, reach_u: int) -> NDArray[np.bool_]:
-    """Pixels with clearly nearer measurements above and below, or left and right, bool[H, W]."""
-    limit = np.where(np.isfinite(nearest), 0.93 * nearest - 0.3, -np.inf)
-    hidden = np.zeros(nearest.shape, bool)
-    for axis, reach, across in ((0, reach_v, reach_u // 2), (1, reach_u, 1)):
-        wide = ndimage.minimum_filter1d(nearest, 2 * across + 1, axis=1 - axis, mode="nearest")
-        before = ndimage.minimum_filter1d(wide, reach, axis=axis, origin=(reach - 1) // 2, mode="nearest")
-        after = ndimage.minimum_filter1d(wide, reach, axis=axis, origin=-(reach // 2), mode="nearest")
-        hidden |= np.maximum(before, after) < limit
-    return hidden
-
-
 def beyond_reach(
     view: View, measured: NDArray[np.float32], highest_rad: float, *, gap_deg: float = 0.6
 ) -> NDArray[np.bool_]:
@@ -157,9 +109,7 @@ def beyond_reach(
 
 def ray_elevation(view: View) -> NDArray[np.float32]:
     """Elevation of each pixel's ray above the horizontal plane, radians, f32[H, W]."""
-    camera = view.camera
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    x, y = pixel_rays(view.camera)
     up = view.world_from_cam[2, :3]
     rise = up[0] * x[None] + up[1] * y[:, None] + up[2]
     return np.arcsin(rise / np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)).astype(np.float32)

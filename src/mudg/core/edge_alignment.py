@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base import geometry
 from mudg.base.geometry import transform_points
 from mudg.base.types import View
 
@@ -122,7 +123,7 @@ def _in_sight(xyz_cam: NDArray[np.floating], view: View) -> NDArray[np.bool_]:
     camera = view.camera
     slack = _SLACK * max(camera.width, camera.height)
     z = np.maximum(xyz_cam[:, 2], 1e-6)
-    u, v = camera.fx * xyz_cam[:, 0] / z + camera.cx, camera.fy * xyz_cam[:, 1] / z + camera.cy
+    u, v = geometry.pinhole(camera.intrinsics, xyz_cam[:, 0], xyz_cam[:, 1], z)
     beside = (u > -slack) & (u < camera.width + slack) & (v > -slack) & (v < camera.height + slack)
     return (xyz_cam[:, 2] > 1.0) & beside
 
@@ -136,8 +137,7 @@ def _turned_sums(edges: Floats, xyz_cam: Floats, view: View) -> tuple[Floats, in
         for about_x in TURNS_DEG:
             turned = xyz_cam @ _turn(about_y, about_x).T
             z = turned[:, 2].clip(1e-6)
-            u, v = camera.fx * turned[:, 0] / z + camera.cx, camera.fy * turned[:, 1] / z + camera.cy
-            places.append((u, v))
+            places.append(geometry.pinhole(camera.intrinsics, turned[:, 0], turned[:, 1], z))
     u, v = np.array([p[0] for p in places]), np.array([p[1] for p in places])
     inside = ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).all(0)
     u, v = u[:, inside].astype(int), v[:, inside].astype(int)

@@ -3,38 +3,34 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mudg.base import palette
+from mudg.base import geometry, palette
+from mudg.base.types import View
 
 MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"))
 
 
-def flicker(
-    made: Tensor, truth: Tensor, depth: Tensor, ids: Tensor, world_from_cam: Tensor, intrinsics: Tensor
-) -> float:
+def flicker(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> float:
     """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as steady as the truth).
 
     Arguments as for `changes`. NaN for one frame or without such pixels.
     """
-    pairs = changes(made, truth, depth, ids, world_from_cam, intrinsics)
+    pairs = changes(made, truth, frames)
     true_change = sum(t for _, t in pairs)
     return sum(m for m, _ in pairs) / true_change if true_change > 0 else math.nan
 
 
-def changes(
-    made: Tensor, truth: Tensor, depth: Tensor, ids: Tensor, world_from_cam: Tensor, intrinsics: Tensor
-) -> list[tuple[float, float]]:
-    """Summed absolute change of static surfaces between each frame and the next, in `made` and in `truth`.
+def changes(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> list[tuple[float, float]]:
+    """Summed absolute change of static surfaces between each frame and the next, in `made` and in `truth`, f32[T,3,H,W] each.
 
-    made, truth f32[T,3,H,W]; depth f32[T,1,H,W] metres and ids i64[T,H,W] are true; world_from_cam f64[T,4,4]; intrinsics f64[T,4].
     Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
     there (bilinear), if the same surface is seen there (depths within 3 %).
     """
-    frames = [TrueFrame(*one) for one in zip(depth, ids, world_from_cam, intrinsics, strict=True)]
     pairs = []
     for t in range(len(truth) - 1):
         where = pixel_motion(frames[t], frames[t + 1])
@@ -51,6 +47,13 @@ class TrueFrame:
     world_from_cam: Tensor
     intrinsics: Tensor
 
+    @classmethod
+    def of(cls, view: View, depth: Tensor, ids: Tensor) -> TrueFrame:
+        """The frame of a view of this size, with true depth and classes."""
+        camera = view.camera
+        lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+        return cls(depth, ids, torch.from_numpy(view.world_from_cam.copy()), lens)
+
 
 @dataclass(frozen=True)
 class PixelMotion:
@@ -66,13 +69,13 @@ def pixel_motion(frame: TrueFrame, following: TrueFrame) -> PixelMotion:
     height, width = frame.ids.shape
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     static = ~torch.isin(frame.ids, torch.tensor(MOVABLE)) & (frame.depth[0] < 90.0)
-    fx, fy, cx, cy = frame.intrinsics.float()
     z = frame.depth[0]
-    points = torch.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z, torch.ones_like(z)])
+    ray_x, ray_y = geometry.pinhole_ray(frame.intrinsics.float(), columns, rows)
+    points = torch.stack([ray_x * z, ray_y * z, z, torch.ones_like(z)])
     pose = (torch.linalg.inv(following.world_from_cam) @ frame.world_from_cam).float()
     x, y, ahead, _ = torch.einsum("ij,jhw->ihw", pose, points)
-    fx, fy, cx, cy = following.intrinsics.float()
-    there = torch.stack([(fx * x / ahead + cx) * (2 / width) - 1, (fy * y / ahead + cy) * (2 / height) - 1], -1)[None]
+    u, v = geometry.pinhole(following.intrinsics.float(), x, y, ahead)
+    there = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], -1)[None]
     within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)
     depth_there = _sample_at(following.depth, there, "nearest")[0]
     return PixelMotion(there, within & static & ((depth_there / ahead - 1).abs() < 0.03))

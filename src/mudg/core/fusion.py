@@ -31,11 +31,15 @@ from numpy.typing import NDArray
 
 from mudg.base import palette
 from mudg.base.errors import InputError
-from mudg.base.geometry import invert, yaw_of
+from mudg.base.geometry import invert, pinhole, yaw_of
 from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
+from mudg.core.visible import RULES, nearer_depth
+from mudg.core.zbuffer import DrawLimits, PointLayer, draw_points
 
 Matrix = NDArray[np.float64]
 STATIC: Final = -1
+GAP_SPREAD: Final = 1.4
+"""Largest usual angle between beams as a multiple of the median one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +49,7 @@ class FusionRules:
     Args:
         voxel_m: keep one point per voxel of this side, the one seen from nearest by; 0 keeps all.
         occlusion_test: leave out colours from behind nearer surfaces.
-        occlusion_relative, occlusion_m: a surface hides a point if nearer by more than relative * depth + this.
-        beam_gap_deg: vertical angle between LiDAR beams; a point covers 0.6 of it above and below (beams are not quite
-            evenly spread). 0 = measured per sweep.
-        beam_half_deg_horizontal: what a point covers to either side.
+        beam_gap_deg: vertical angle between LiDAR beams; 0 = measured per sweep.
         near_m, far_m: camera depth limits of colouring, metres.
         box_growth_m: moving boxes are grown by this on each side and on top.
         floor_margin_m: points this close above the box's floor stay static.
@@ -60,10 +61,7 @@ class FusionRules:
 
     voxel_m: float = 0.0
     occlusion_test: bool = True
-    occlusion_relative: float = 0.05
-    occlusion_m: float = 0.2
     beam_gap_deg: float = 0.0
-    beam_half_deg_horizontal: float = 0.1
     near_m: float = 0.5
     far_m: float = 200.0
     box_growth_m: float = 0.1
@@ -257,7 +255,7 @@ def color_points(
         ids, column, row, z = _pixels(xyz_cam, known, shot.view, rules)
         in_image[ids] = True
         if rules.occlusion_test and len(ids):
-            visible = ~hidden_points(xyz_cam[ids], stands[ids], shot.view, gap_deg, rules)
+            visible = ~hidden_points(xyz_cam[ids], stands[ids], shot.view, gap_deg)
             ids, column, row, z = ids[visible], column[visible], row[visible], z[visible]
         cosine = z / np.linalg.norm(xyz_cam[ids], axis=1)
         better = cosine > best[ids]
@@ -299,8 +297,7 @@ def _pixels(
     camera = view.camera
     ids = np.flatnonzero((xyz_cam[:, 2] > rules.near_m) & (xyz_cam[:, 2] < rules.far_m) & known)
     x, y, z = xyz_cam[ids].T
-    column = np.floor(camera.fx * x / z + camera.cx)
-    row = np.floor(camera.fy * y / z + camera.cy)
+    column, row = (np.floor(place) for place in pinhole(camera.intrinsics, x, y, z))
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     return ids[inside], column[inside].astype(np.intp), row[inside].astype(np.intp), z[inside]
 
@@ -320,27 +317,18 @@ def standing_points(xyz: NDArray[np.floating], cell_m: float = 2.0, margin_m: fl
 
 
 def hidden_points(
-    xyz_cam: NDArray[np.float32], stands: NDArray[np.bool_], view: View, gap_deg: float, rules: FusionRules
+    xyz_cam: NDArray[np.float32], stands: NDArray[np.bool_], view: View, gap_deg: float
 ) -> NDArray[np.bool_]:
     """Which points ``[N, 3]`` (camera frame, inside the image) lie behind a clearly nearer standing point; bool[N].
 
-    A z-buffer of the points that stand (``standing_points``), with cells of the horizontal half gap (at least a pixel),
-    each point covering its half gaps. The ground hides nothing: seen at a grazing angle its rings overlap each other.
+    What hides is what stands (``standing_points``). The ground hides nothing: seen at a grazing angle its rings overlap each other.
     """
-    camera = view.camera
-    gap_u = np.deg2rad(rules.beam_half_deg_horizontal) * camera.fx
-    gap_v = np.deg2rad(0.6 * gap_deg) * camera.fy
-    cell = max(1.0, float(gap_u))
-    reach_u, reach_v = round(gap_u / cell), round(gap_v / cell)
-    width, height = int(camera.width / cell) + 1, int(camera.height / cell) + 1
-    z = xyz_cam[:, 2]
-    column = ((camera.fx * xyz_cam[:, 0] / z + camera.cx) / cell).astype(np.intp).clip(0, width - 1)
-    row = ((camera.fy * xyz_cam[:, 1] / z + camera.cy) / cell).astype(np.intp).clip(0, height - 1)
-    index = row * width + column
-    nearest = np.full(height * width, np.inf, np.float32)
-    np.minimum.at(nearest, index[stands], z[stands])
-    covered = _spread_minimum(_spread_minimum(nearest.reshape(height, width), reach_v, 0), reach_u, 1)
-    return covered.reshape(-1)[index] < z * (1 - rules.occlusion_relative) - rules.occlusion_m
+    camera, rule = view.camera, RULES["colour"]
+    nearest, index = draw_points([PointLayer(np.ascontiguousarray(xyz_cam[stands]), np.eye(4))], View(camera, np.eye(4), 0.0), DrawLimits())
+    nearest[index < 0] = np.inf
+    nearer = nearer_depth(nearest, rule, rule.reach(camera, gap_deg))
+    column, row = (np.floor(place).astype(np.intp) for place in pinhole(camera.intrinsics, *xyz_cam.T))
+    return rule.hides(nearer[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)], xyz_cam[:, 2])
 
 
 def measure_beam_gap(xyz_lidar: NDArray[np.floating], default_deg: float = 0.4) -> float:
@@ -357,17 +345,6 @@ def measure_beam_gap(xyz_lidar: NDArray[np.floating], default_deg: float = 0.4) 
     steps = np.diff(elevation[order])[np.diff(sector[order]) == 0]
     steps = steps[steps > 0.08]
     return float(np.clip(np.median(steps), 0.1, 2.5)) if len(steps) >= 30 else default_deg
-
-
-def _spread_minimum(values: NDArray[np.float32], reach: int, axis: int) -> NDArray[np.float32]:
-    """Running minimum over ``2 * reach + 1`` cells along ``axis``."""
-    spread = values.copy()
-    for step in range(1, reach + 1):
-        low, high = [slice(None), slice(None)], [slice(None), slice(None)]
-        low[axis], high[axis] = slice(None, -step), slice(step, None)
-        np.minimum(spread[tuple(low)], values[tuple(high)], out=spread[tuple(low)])
-        np.minimum(spread[tuple(high)], values[tuple(low)], out=spread[tuple(high)])
-    return spread
 
 
 def _count_votes(
@@ -394,6 +371,11 @@ def _turn_only(a_from_b: Matrix) -> Matrix:
     turn = a_from_b.copy()
     turn[:3, 3] = 0
     return turn
+
+
+def largest_beam_gap(xyz_lidar: NDArray[np.floating]) -> float:
+    """Largest usual angle between neighbouring beams, degrees: beams are not evenly spread."""
+    return GAP_SPREAD * measure_beam_gap(xyz_lidar)
 
 
 def _apply(a_from_b: Matrix, xyz_b: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -7,8 +7,7 @@ the work. Published form: Street Gaussians (recorded views) and the supervision 
     recorded:  (1 - w) L1 + w (1 - SSIM)  +  trimmed LiDAR depth  +  sky  +  semantics
     virtual:   perceptual + robust dense depth + semantics, every pixel weighted by the observation's confidence
 
-``core.fused`` holds native twins of some, ``core.perceptual`` the distance in a network's features. The losses of the diffusion
-model stand beside that model.
+``core.native_ops`` holds native twins of some, ``core.perceptual`` the distance in a network's features.
 """
 
 from __future__ import annotations

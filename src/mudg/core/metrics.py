@@ -266,10 +266,7 @@ def _true_frame(pair: Pair) -> flicker.TrueFrame:
     view, depth, ids = pair.view, pair.truth_depth, pair.truth_semantics
     if view is None or depth is None or ids is None:
         raise InputError("flicker needs exact depth, classes and the view")
-    camera = view.camera
-    depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0)
-    lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-    return flicker.TrueFrame(depth, ids, torch.from_numpy(view.world_from_cam.copy()), lens)
+    return flicker.TrueFrame.of(view, torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0), ids)
 
 
 class Flicker:
@@ -324,16 +321,11 @@ def _confusion_of(pair: Pair) -> Tensor | None:
     return confusion(pair.semantics, pair.truth_semantics, pair.mask)
 
 
-def _psnr_of(pair: Pair) -> float | None:
-    if pair.rgb is None or pair.truth_rgb is None:
-        return None
-    return psnr(pair.rgb, pair.truth_rgb, pair.mask)
+def _of_colors(compare: Callable[[Tensor, Tensor, Tensor | None], float]) -> FrameMean:
+    def source(pair: Pair) -> float | None:
+        return None if pair.rgb is None or pair.truth_rgb is None else compare(pair.rgb, pair.truth_rgb, pair.mask)
 
-
-def _ssim_of(pair: Pair) -> float | None:
-    if pair.rgb is None or pair.truth_rgb is None:
-        return None
-    return ssim(pair.rgb, pair.truth_rgb, pair.mask)
+    return FrameMean(source)
 
 
 def _psnr_of_dynamic(pair: Pair) -> float | None:
@@ -355,8 +347,8 @@ class MetricRow:
 
 
 METRICS: Final[dict[str, MetricRow]] = {
-    "psnr": MetricRow("PSNR", "dB", ("rgb",), "higher", lambda: FrameMean(_psnr_of)),
-    "ssim": MetricRow("SSIM", "", ("rgb",), "higher", lambda: FrameMean(_ssim_of)),
+    "psnr": MetricRow("PSNR", "dB", ("rgb",), "higher", lambda: _of_colors(psnr)),
+    "ssim": MetricRow("SSIM", "", ("rgb",), "higher", lambda: _of_colors(ssim)),
     "psnr_movers": MetricRow(
         "PSNR of dynamic objects", "dB", ("dynamic objects", "rgb"), "higher", lambda: FrameMean(_psnr_of_dynamic)
     ),

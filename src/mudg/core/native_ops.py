@@ -37,7 +37,7 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     """
     if prediction.shape != target.shape or prediction.ndim != 3:
         raise InputError("photometric: images must be [C, H, W] of one shape", expected=str(tuple(prediction.shape)),
-                         got=str(tuple(target.shape)))  # fmt: skip
+            got=str(tuple(target.shape)))  # fmt: skip
     if not 0 <= ssim_weight <= 1:
         raise UsageError("the weight of SSIM must lie in [0, 1]", got=str(ssim_weight))
     if weight is not None and weight.shape != prediction.shape[1:]:
@@ -46,7 +46,16 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     library = _library_for((prediction, target))
     if library is None or prediction.numel() == 0:
         return losses.photometric(prediction, target, ssim_weight, weight)
-    return _Photometric.apply(prediction, target.detach(), weight, ssim_weight, library)
+    image, wanted = prediction.detach().contiguous(), target.detach().contiguous()
+    gradient, status = torch.empty_like(image), ctypes.c_int(0)
+    library.mudg_photometric.restype = ctypes.c_double
+    value = library.mudg_photometric(
+        *map(_address, (image, wanted, weight)), *map(ctypes.c_int, image.shape), ctypes.c_float(ssim_weight), _address(gradient),
+        ctypes.byref(status),
+    )  # fmt: skip
+    if status.value != 0:
+        raise ResourceError("not enough memory for the photometric loss", where=f"image {tuple(image.shape)}")
+    return _WithGradient.apply(prediction, value, gradient)
 
 
 def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
@@ -67,15 +76,24 @@ def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lif
     size = logits.shape[1:]
     if logits.ndim != 3 or not len(logits) or target.shape != size or weight.shape != size:
         raise InputError("class loss: logits must be [C, H, W], target and weight [H, W]", expected=str(tuple(size)),
-                         got=str([tuple(t.shape) for t in (logits, target, weight)]))  # fmt: skip
+            got=str([tuple(t.shape) for t in (logits, target, weight)]))  # fmt: skip
     if lift is not None and (lift[1].shape != size or not 0 <= lift[0] < len(logits)):
-        raise InputError("class loss: the lift must be of one channel and [H, W]", expected=f"0..{len(logits) - 1}, {tuple(size)}",
-                         got=f"{lift[0]}, {tuple(lift[1].shape)}")  # fmt: skip
+        raise InputError("class loss: the lift must be of one channel and [H, W]",
+            expected=f"0..{len(logits) - 1}, {tuple(size)}", got=f"{lift[0]}, {tuple(lift[1].shape)}")  # fmt: skip
     library = _library_for((logits, weight))
     if library is None or logits.numel() == 0 or target.dtype != torch.int64:
         return losses.class_loss(logits, target, weight, total, lift)
     channel, added = (-1, None) if lift is None else (lift[0], lift[1].detach().to(torch.float32).contiguous())
-    return _ClassLoss.apply(logits, target.contiguous(), weight.detach().contiguous(), 1.0 / total, channel, added, library)
+    values, ids, weight = logits.detach().contiguous(), target.contiguous(), weight.detach().contiguous()
+    gradient, status = torch.empty_like(values), ctypes.c_int(0)
+    library.mudg_class_loss.restype = ctypes.c_double
+    value = library.mudg_class_loss(
+        *map(_address, (values, ids, weight, added)), ctypes.c_int(channel), ctypes.c_int(len(values)),
+        ctypes.c_int64(ids.numel()), ctypes.c_float(1.0 / total), _address(gradient), ctypes.byref(status),
+    )  # fmt: skip
+    if status.value != 0:
+        raise ResourceError("not enough memory for the class loss", where=f"logits {tuple(values.shape)}")
+    return _WithGradient.apply(logits, value, gradient)
 
 
 def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
@@ -91,7 +109,7 @@ def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
     """
     if rgb.ndim != 3 or coarse.ndim != 3 or len(rgb) != len(coarse) or alpha.shape != (1, *rgb.shape[1:]):
         raise InputError("over: pictures must be [C, H, W] and [C, h, w], alpha [1, H, W]",
-                         got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]))  # fmt: skip
+            got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]))  # fmt: skip
     library = _library_for((rgb, alpha, coarse))
     if library is None or rgb.numel() == 0 or coarse.numel() == 0:
         return torch_over(rgb, alpha, coarse)
@@ -126,32 +144,16 @@ def torch_box_mean(values: Tensor, size: int) -> Tensor:
     return functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False).reshape(values.shape)
 
 
-def adam(
-    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int,
-    visible: Tensor | None = None,
-) -> None:  # fmt: skip
-    """One Adam step in place: betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
+def adam_columns(columns: Sequence[AdamColumn], step: int) -> None:
+    """One Adam step in place on several columns with the same rows (the kernel of ``Table.adam_step``).
 
-    Args:
-        parameter, gradient, moment1, moment2: one shape ``[N, ...]``; contiguous for the native path.
-        visible: bool[N]: only these rows move, parameters and moments; None = all.
-
-    Raises:
-        InputError: shapes differ, or ``visible`` is not bool[N].
-        UsageError: ``step`` below 1.
-    """
-    adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, visible)
-
-
-def adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | None = None) -> None:
-    """``adam`` on several columns with the same rows in one pass (the kernel of ``Table.adam_step``).
+    Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
 
     Args:
         columns: any number, N rows each; contiguous for the native path.
-        visible: bool[N]: only these rows move, parameters and moments; None = all.
 
     Raises:
-        InputError: shapes differ, or ``visible`` is not bool[N].
+        InputError: shapes differ.
         UsageError: ``step`` below 1.
     """
     if step < 1:
@@ -159,13 +161,13 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | Non
     if not columns:
         return
     for one in columns:
-        _check_column(one, columns[0].parameter, visible)
+        _check_column(one, columns[0].parameter)
     tensors = tuple(t for one in columns for t in (one.parameter, one.gradient, one.moment1, one.moment2))
     in_place = tuple(t for one in columns for t in (one.parameter, one.moment1, one.moment2))
     library = _library_for(tensors)
     if library is None or not all(t.is_contiguous() for t in in_place):
         with torch.no_grad():
-            torch_adam_columns(columns, step, visible)
+            torch_adam_columns(columns, step)
         return
     rows = columns[0].parameter.shape[0]
     gradients = [one.gradient.detach().contiguous() for one in columns]
@@ -174,10 +176,9 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | Non
                 one.parameter.numel() // rows if rows else 0, one.rate)
         for one, gradient in zip(columns, gradients, strict=True)
     ))  # fmt: skip
-    mask = None if visible is None else visible.contiguous()
     real, integer = ctypes.c_double, ctypes.c_int64
     library.mudg_adam(
-        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None if mask is None else mask.data_ptr()),
+        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None),
         real(BETA1), real(BETA2), real(EPSILON), integer(step),
     )  # fmt: skip
     # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
@@ -193,65 +194,28 @@ class _Column(ctypes.Structure):
     ]  # fmt: skip
 
 
-def _check_column(column: AdamColumn, first: Tensor, visible: Tensor | None) -> None:
+def _check_column(column: AdamColumn, first: Tensor) -> None:
     parameter = column.parameter
     tensors = (parameter, column.gradient, column.moment1, column.moment2)
     if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0 or parameter.shape[0] != first.shape[0]:
         raise InputError("adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
-                         got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
-    if visible is not None and (visible.shape != parameter.shape[:1] or visible.dtype != torch.bool):
-        raise InputError("adam: visible must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
-                         got=f"{visible.dtype}{list(visible.shape)}")  # fmt: skip
+            got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
 
 
-class _Photometric(torch.autograd.Function):
+class _WithGradient(torch.autograd.Function):
+    """A scalar whose gradient was worked out along with its value."""
+
     @staticmethod
-    def forward(
-        ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float, library: ctypes.CDLL
-    ) -> Tensor:
-        image, wanted = prediction.detach().contiguous(), target.contiguous()
-        gradient, status = torch.empty_like(image), ctypes.c_int(0)
-        library.mudg_photometric.restype = ctypes.c_double
-        value = library.mudg_photometric(
-            *map(_address, (image, wanted, weight)), *map(ctypes.c_int, image.shape), ctypes.c_float(ssim_weight), _address(gradient),
-            ctypes.byref(status),
-        )  # fmt: skip
-        if status.value != 0:
-            raise ResourceError("not enough memory for the photometric loss", where=f"image {tuple(image.shape)}")
+    def forward(ctx: Any, variable: Tensor, value: float, gradient: Tensor) -> Tensor:
         ctx.save_for_backward(gradient)
-        return prediction.new_tensor(value)
+        return variable.new_tensor(value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        # The usual case, a loss term of weight 1, needs no copy.
-        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None, None
-
-
-class _ClassLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, logits: Tensor, target: Tensor, weight: Tensor, scale: float, channel: int, added: Tensor | None, library: ctypes.CDLL
-    ) -> Tensor:
-        values = logits.detach().contiguous()
-        gradient, status = torch.empty_like(values), ctypes.c_int(0)
-        library.mudg_class_loss.restype = ctypes.c_double
-        value = library.mudg_class_loss(
-            *map(_address, (values, target, weight, added)), ctypes.c_int(channel), ctypes.c_int(len(values)),
-            ctypes.c_int64(target.numel()), ctypes.c_float(scale), _address(gradient), ctypes.byref(status),
-        )  # fmt: skip
-        if status.value != 0:
-            raise ResourceError("not enough memory for the class loss", where=f"logits {tuple(values.shape)}")
-        ctx.save_for_backward(gradient)
-        return logits.new_tensor(value)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = ctx.saved_tensors
-        # As above; callers put the weight of the term into ``total``.
-        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None, None, None, None, None
+        # The usual case, a loss term whose weight is in the value already, needs no copy.
+        return gradient if upstream.item() == 1.0 else gradient * upstream, None, None
 
 
 class _Over(torch.autograd.Function):

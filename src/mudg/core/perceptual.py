@@ -60,7 +60,7 @@ def lpips_distance(
     for stage, (features, target) in enumerate(zip(prediction, target_units, strict=True)):
         if features.shape != target.shape:
             raise InputError("features of two images differ in shape", where=f"stage {stage}",
-                             expected=str(tuple(target.shape)), got=str(tuple(features.shape)))  # fmt: skip
+                expected=str(tuple(target.shape)), got=str(tuple(features.shape)))  # fmt: skip
         squared = (_unit(features) - target) ** 2
         if channel_weights is not None:
             squared = squared * channel_weights[stage].view(-1, 1, 1)

@@ -12,6 +12,7 @@ Depth, labels and masks take the nearest pixel (``resize_nearest``). Networks re
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from torch import Tensor
 
 from mudg.base import palette
 from mudg.base.errors import InputError
+from mudg.base.types import Observation
 
 Map = TypeVar("Map", Tensor, NDArray[Any])
 
@@ -128,3 +130,28 @@ def error_image(rgb: Tensor, truth: Tensor) -> NDArray[np.uint8]:
     error = ((rgb.clamp(0, 1) - truth).abs().mean(0) / 0.35).clamp(0, 1).numpy()
     channels = (np.clip(error * 2.2, 0, 1), np.clip(error * 2.2 - 0.8, 0, 1), np.clip(error * 3.2 - 2.2, 0, 1))
     return (np.stack(channels, -1) * 255).round().astype(np.uint8)
+
+
+# ---- panels ----------------------------------------------------------------------------------------------------------
+
+
+def panels_of(observation: Observation) -> list[NDArray[np.uint8]]:
+    """Colour, depth and semantics of an observation as pictures of one size (those that exist)."""
+    panels = [to_bytes(observation.rgb)]
+    if observation.depth is not None:
+        panels.append(depth_colors(observation.depth[0].cpu().numpy()))
+    if observation.semantics is not None:
+        panels.append(class_colors(observation.semantics.cpu().numpy()))
+    return panels
+
+
+def side_by_side(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Panels u8[H, W, 3] of one height in a row, with white between them.
+
+    Raises:
+        InputError: no panels, or panels of different heights.
+    """
+    if len({len(panel) for panel in panels}) != 1:
+        raise InputError("panels must be of one size, at least one", got=str([panel.shape for panel in panels]))
+    white = np.full((len(panels[0]), 2, 3), 255, np.uint8)
+    return np.concatenate([part for panel in panels for part in (white, panel)][1:], 1)

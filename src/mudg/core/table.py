@@ -26,8 +26,8 @@ class AdamColumn:
     rate: float
 
 
-AdamKernel = Callable[[Sequence[AdamColumn], int, Tensor | None], None]
-"""(columns with the same rows, step from 1, visible rows or None): update in place."""
+AdamKernel = Callable[[Sequence[AdamColumn], int], None]
+"""(columns with the same rows, step from 1): update in place."""
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -75,11 +75,8 @@ class Table:
     def append(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor]) -> None:
         """Add rows with zero moments. Every column and label of the table must be given."""
         if set(columns) != set(self.columns) or set(labels) != set(self.labels):
-            raise InputError(
-                "appended rows must fill every column",
-                expected=str(sorted(set(self.columns) | set(self.labels))),
-                got=str(sorted(set(columns) | set(labels))),
-            )
+            raise InputError("appended rows must fill every column",
+                expected=str(sorted(set(self.columns) | set(self.labels))), got=str(sorted(set(columns) | set(labels))))  # fmt: skip
         fresh = {name: value.detach() for name, value in columns.items()}
         self.columns = {name: _leaf(torch.cat([value.detach(), fresh[name]])) for name, value in self.columns.items()}
         for moments in (self.moment1, self.moment2):
@@ -107,21 +104,18 @@ class Table:
         for value in self.columns.values():
             value.grad = None
 
-    def adam_step(
-        self, step: int, rates: Mapping[str, float], kernel: AdamKernel, visible: Tensor | None = None
-    ) -> None:
+    def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel) -> None:
         """One Adam step on every column that has a gradient and a rate above 0.
 
         Args:
             step: number of this step, from 1 (bias correction).
             rates: learning rate per column; a column that is not named stays as it is.
             kernel: ``torch_adam_columns`` or ``native_ops.adam_columns``.
-            visible: bool[N]: update these rows only, parameters and moments (others wait); None = all.
         """
         kernel(
             [AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
              for name, value in self.columns.items() if value.grad is not None and rates.get(name, 0.0) > 0],
-            step, visible,
+            step,
         )  # fmt: skip
 
     # -- state ------------------------------------------------------------------------------------------------------
@@ -140,8 +134,8 @@ class Table:
         for key, value in flat.items():
             group, _, name = key.partition(".")
             if group == "partial":
-                raise InputError("this scene's objects change colour over time, which is not supported any more", where=key,
-                                 remedy="fit it again, or render it with the version that fitted it")  # fmt: skip
+                raise InputError("this scene's objects change colour over time, which is not supported any more",
+                    where=key, remedy="fit it again, or render it with the version that fitted it")  # fmt: skip
             if group not in groups or not name:
                 raise InputError("not a tensor of a parameter table", where=key)
             groups[group][name] = value
@@ -154,26 +148,13 @@ class Table:
         return table
 
 
-def torch_adam_columns(columns: Sequence[AdamColumn], step: int, visible: Tensor | None = None) -> None:
-    """``torch_adam`` on each column; the plain-torch kernel of ``Table.adam_step``."""
+def torch_adam_columns(columns: Sequence[AdamColumn], step: int) -> None:
+    """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place: the plain-torch kernel of ``Table.adam_step``."""
     for one in columns:
-        torch_adam(one.parameter, one.gradient, one.moment1, one.moment2, one.rate, step, visible)
-
-
-def torch_adam(
-    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int, visible: Tensor | None
-) -> None:
-    """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place, on one column."""
-    if visible is not None:
-        rows = visible.nonzero()[:, 0]
-        p, m, v = parameter[rows], moment1[rows], moment2[rows]
-        torch_adam(p, gradient[rows], m, v, rate, step, None)
-        parameter[rows], moment1[rows], moment2[rows] = p, m, v
-        return
-    moment1.mul_(BETA1).add_(gradient, alpha=1 - BETA1)
-    moment2.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-    denominator = (moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
-    parameter.addcdiv_(moment1, denominator, value=-rate / (1 - BETA1**step))
+        one.moment1.mul_(BETA1).add_(one.gradient, alpha=1 - BETA1)
+        one.moment2.mul_(BETA2).addcmul_(one.gradient, one.gradient, value=1 - BETA2)
+        denominator = (one.moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
+        one.parameter.addcdiv_(one.moment1, denominator, value=-one.rate / (1 - BETA1**step))
 
 
 def _leaf(value: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Camera paths: the recorded one, the same drive on another line, another speed, or a spline through given poses.
+"""Camera paths: the recorded one, and the same drive shifted sideways, raised or turned.
 
 Which left is used
 ------------------
@@ -7,7 +7,7 @@ of ``world_from_ego(time)`` with its vertical part removed, normalised. That is 
 driving forwards. It is not the x axis of the camera (a side camera's x axis points along the road) and not a finite
 difference of positions (which has no direction while the car stands, and turns round when it reverses: here, left stays
 the vehicle's left). Where the vehicle's heading and the tangent of its path differ (sideslip, a pose origin far from the
-rear axle in a tight turn), the heading wins; ``heading_against_path_rad`` tells by how much they differ.
+rear axle in a tight turn), the heading wins.
 """
 
 from __future__ import annotations
@@ -37,11 +37,8 @@ def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
     left[2] = 0.0
     length = float(np.linalg.norm(left))
     if length < 1e-3:
-        raise InputError(
-            "the vehicle's left axis is vertical, so there is no lateral direction",
-            expected="ego poses with x forward, y left, z up",
-            got=f"left axis {world_from_ego[:3, 1].tolist()}",
-        )
+        raise InputError("the vehicle's left axis is vertical, so there is no lateral direction",
+            expected="ego poses with x forward, y left, z up", got=f"left axis {world_from_ego[:3, 1].tolist()}")  # fmt: skip
     return left / length
 
 
@@ -55,9 +52,7 @@ def recorded(scene: Scene, camera: str) -> Trajectory:
     return Trajectory(trajectory_name(camera), tuple(views), "recorded")
 
 
-def shifted(
-    scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0
-) -> Trajectory:
+def shifted(scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0) -> Trajectory:
     """The drive of one camera with the vehicle moved sideways; camera orientation kept (up to ``yaw_rad``).
 
     Args:
@@ -93,30 +88,19 @@ def shifted(
     return Trajectory(name, tuple(views), "shifted")
 
 
-def heading_against_path_rad(path: EgoPath) -> NDArray[np.float64]:
-    """Angle from the path's tangent to the vehicle's heading at each ego pose, ``f64[T]`` radians in (-pi, pi].
-
-    The tangent is a central difference of positions (one-sided at the ends); where the vehicle moves less than 1 cm
-    between the neighbours the angle is reported as 0, for want of a tangent. Near pi means reversing.
-    """
-    position = path.world_from_ego[:, :2, 3]
-    count = len(position)
-    angles = np.zeros(count)
-    for i in range(count):
-        step = position[min(i + 1, count - 1)] - position[max(i - 1, 0)]
-        if np.hypot(*step) >= 0.01:
-            difference = geometry.yaw_of(path.world_from_ego[i]) - np.arctan2(step[1], step[0])
-            angles[i] = np.pi - (np.pi - difference) % (2 * np.pi)
-    return angles
+def at_shift(
+    scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0
+) -> Trajectory:
+    """The recorded trajectory where nothing is shifted, else ``shifted``."""
+    if not shift_m and not height_m and not yaw_rad:
+        return recorded(scene, camera)
+    return shifted(scene, camera, shift_m, height_m=height_m, yaw_rad=yaw_rad)
 
 
 def _frames(scene: Scene, camera: str) -> tuple:
     if camera not in scene.cameras:
-        raise UsageError(
-            f"the scene has no camera named {camera!r}",
-            where=f"scene {scene.id}",
-            expected=f"one of {', '.join(scene.cameras)}",
-        )
+        raise UsageError(f"the scene has no camera named {camera!r}", where=f"scene {scene.id}",
+            expected=f"one of {', '.join(scene.cameras)}")  # fmt: skip
     frames = tuple(scene.frames_of(camera))
     if not frames:
         raise UsageError(f"camera {camera!r} has no frames", where=f"scene {scene.id}")
@@ -131,9 +115,6 @@ def _ego_pose(path: EgoPath, view: View) -> NDArray[np.float64]:
     nearest = 0 if view.time_s < path.times_s[0] else -1
     if abs(path.times_s[nearest] - view.time_s) <= 0.2:
         return path.world_from_ego[nearest]
-    raise InputError(
-        "no ego pose at the time of a camera frame, so there is no left direction",
-        where=f"camera {view.camera.name}",
-        expected=f"a time within [{path.times_s[0]}, {path.times_s[-1]}] s",
-        got=f"{view.time_s} s",
-    )
+    raise InputError("no ego pose at the time of a camera frame, so there is no left direction",
+        where=f"camera {view.camera.name}", expected=f"a time within [{path.times_s[0]}, {path.times_s[-1]}] s",
+        got=f"{view.time_s} s")  # fmt: skip

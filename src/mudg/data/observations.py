@@ -58,9 +58,7 @@ class ObservationWriter:
         if not bool(torch.isfinite(observation.rgb).all()):
             count = int((~torch.isfinite(observation.rgb)).sum())
             raise InputError("colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values")
-        rgb = to_bytes(observation.rgb)
-        with store.atomic_path(self._out / "rgb" / f"{name}.png") as temporary:
-            Image.fromarray(rgb).save(temporary, compress_level=1)
+        store.write_image(self._out / "rgb" / f"{name}.png", to_bytes(observation.rgb), compress_level=1)
         arrays = {"confidence": _numpy(observation.confidence[0], np.float16), "mask": _numpy(observation.mask[0], np.uint8)}
         if observation.depth is not None:
             arrays["depth"] = _numpy(observation.depth[0], np.float32)

@@ -3,7 +3,7 @@
 The only place where a pickle is opened, and only with torch's restricted unpickler: tensors and plain containers. Of the objects
 that training frameworks leave in their files a short list is replaced by an inert stand-in; anything else is refused.
 
-`RULES` is the complete map, as text: each row says how a published name is called here, both ways. `{i}` stands for a number.
+`RULES` is the complete map, as text: each row says how a published tensor is called here. `{i}` stands for a number.
 """
 
 from __future__ import annotations
@@ -66,6 +66,12 @@ def _at(published: str, clean: str, leaves: Iterable[tuple[str, str]]) -> list[t
     return [(published + a, clean + b) for a, b in leaves]
 
 
+def _block(published: str, clean: str) -> list[tuple[str, str]]:
+    """A residual block and its transformers."""
+    parts = (("0.", "res.", _RES), ("1.", "spatial.", _TRANSFORMER), ("2.", "temporal.", _TRANSFORMER))
+    return [row for a, b, leaves in parts for row in _at(published + a, clean + b, leaves)]
+
+
 def _parameters(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     """Each row for its weight and for its bias."""
     return [(f"{a}.{kind}", f"{b}.{kind}") for a, b in rows for kind in ("weight", "bias")]
@@ -78,17 +84,13 @@ RULES: tuple[tuple[str, str], ...] = (
           for n in (0, 2)),
         (f"{_UNET}input_blocks.0.0", "net.down.0.conv"),
         *_at(f"{_UNET}init_attn.0.", "net.first.", _TRANSFORMER),
-        *_at(f"{_UNET}input_blocks.{{i}}.0.", "net.down.{i}.res.", _RES),
-        *_at(f"{_UNET}input_blocks.{{i}}.1.", "net.down.{i}.spatial.", _TRANSFORMER),
-        *_at(f"{_UNET}input_blocks.{{i}}.2.", "net.down.{i}.temporal.", _TRANSFORMER),
+        *_block(f"{_UNET}input_blocks.{{i}}.", "net.down.{i}."),
         (f"{_UNET}input_blocks.{{i}}.0.op", "net.down.{i}.conv"),
         *_at(f"{_UNET}middle_block.0.", "net.middle.res1.", _RES),
         *_at(f"{_UNET}middle_block.1.", "net.middle.spatial.", _TRANSFORMER),
         *_at(f"{_UNET}middle_block.2.", "net.middle.temporal.", _TRANSFORMER),
         *_at(f"{_UNET}middle_block.3.", "net.middle.res2.", _RES),
-        *_at(f"{_UNET}output_blocks.{{i}}.0.", "net.up.{i}.res.", _RES),
-        *_at(f"{_UNET}output_blocks.{{i}}.1.", "net.up.{i}.spatial.", _TRANSFORMER),
-        *_at(f"{_UNET}output_blocks.{{i}}.2.", "net.up.{i}.temporal.", _TRANSFORMER),
+        *_block(f"{_UNET}output_blocks.{{i}}.", "net.up.{i}."),
         (f"{_UNET}output_blocks.{{i}}.3.conv", "net.up.{i}.grow"),
         (f"{_UNET}output_blocks.{{i}}.1.conv", "net.up.{i}.grow"),
         (f"{_UNET}out.0", "net.norm"), (f"{_UNET}out.2", "net.leave"),
@@ -169,16 +171,7 @@ def _index(rows: Iterable[tuple[str, str]]) -> _Index:
     return found
 
 
-_TO_CLEAN = _index(RULES)
 _TO_PUBLISHED = _index((clean, published) for published, clean in RULES)
-
-
-def clean_name(published: str) -> str | None:
-    """Our name of a published tensor; None if it has none (unused or unknown)."""
-    for pattern, clean in _TO_CLEAN.get(_place(published), ()):
-        if found := pattern.fullmatch(published):
-            return clean.format(**found.groupdict())
-    return None
 
 
 def published_names(clean: Iterable[str]) -> dict[str, str]:
@@ -265,10 +258,9 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     content = _unpickle(path)
     found = _named_tensors(content)
     if not found:
-        raise InputError(
-            "the file holds no named tensors", where=str(path), expected="state_dict, module, or names with tensors",
-            got=", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__,
-        )  # fmt: skip
+        raise InputError("the file holds no named tensors", where=str(path),
+            expected="state_dict, module, or names with tensors",
+            got=", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__)  # fmt: skip
     return _without_prefix(found)
 
 
@@ -280,31 +272,20 @@ def _unpickle(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except MemoryError:
         raise
-    except (
-        EOFError,
-        RuntimeError,
-        ValueError,
-        KeyError,
-        IndexError,
-        TypeError,
-        AttributeError,
-        OSError,
-        *_UNPICKLING,
-    ) as error:
+    except _UNREADABLE as error:
         text = str(error)
         refused = re.search(r"GLOBAL (\S+)", text)
         if refused is not None:
             raise InputError(
                 "the checkpoint holds an object that is neither a tensor nor known to be harmless; it was not loaded",
                 where=str(path), expected="tensors, numbers, text and plain containers", got=refused.group(1),
-                remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors",
-            ) from error  # fmt: skip
+                remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors") from error  # fmt: skip
         if out_of_memory(error):
             raise MemoryError(text) from error
-        raise InputError(
-            "not a readable checkpoint", where=str(path), expected="a complete file written by torch.save, or safetensors",
-            got=text.splitlines()[0][:200] if text else type(error).__name__, remedy="fetch the file again and compare its size",
-        ) from error  # fmt: skip
+        raise InputError("not a readable checkpoint", where=str(path),
+            expected="a complete file written by torch.save, or safetensors",
+            got=text.splitlines()[0][:200] if text else type(error).__name__,
+            remedy="fetch the file again and compare its size") from error  # fmt: skip
 
 
 def out_of_memory(error: Exception) -> bool:
@@ -312,8 +293,10 @@ def out_of_memory(error: Exception) -> bool:
     return any(sign in str(error) for sign in ("DefaultCPUAllocator", "not enough memory", "Cannot allocate memory"))
 
 
-# torch raises the pickle module's error; named through torch, since this package imports no pickle
-_UNPICKLING: tuple[type[Exception], ...] = (torch.serialization.pickle.UnpicklingError,)  # type: ignore[attr-defined]
+_UNREADABLE: tuple[type[Exception], ...] = (
+    EOFError, RuntimeError, ValueError, KeyError, IndexError, TypeError, AttributeError, OSError,
+    torch.serialization.pickle.UnpicklingError,  # type: ignore[attr-defined]  # through torch: this package imports no pickle
+)  # fmt: skip
 
 
 def _named_tensors(content: Any) -> dict[str, Tensor]:
@@ -349,8 +332,9 @@ def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> di
 def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str) -> dict[str, Tensor]:
     """The tensors of a checkpoint under our names, strictly.
 
-    found   published name -> tensor
-    wanted  our name -> shape, all that the model needs and nothing else
+    Args:
+        found: published name -> tensor.
+        wanted: our name -> shape, all that the model needs and nothing else.
 
     Raises:
         InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the counts.
@@ -360,6 +344,15 @@ def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], wher
     read = {name: value for name, value in found.items() if name in known or name not in UNUSED}
     match_exactly(read, {published[ours]: shape for ours, shape in wanted.items()}, where, "the published model")
     return {ours: found[theirs] for ours, theirs in published.items()}
+
+
+def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
+    """InputError for the first tensor that does not hold finite floating-point numbers; ``where``: its file."""
+    for name, value in tensors.items():
+        if not value.is_floating_point():
+            raise InputError("a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype))
+        if not bool(torch.isfinite(value).all()):
+            raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
 
 
 def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str, network: str) -> None:
@@ -381,8 +374,6 @@ def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int
             for kind, names in (("missing", missing), ("unexpected", unexpected), ("of another shape", misshaped))
             if names
         ]
-        raise InputError(
-            "the checkpoint is not the network it should be", where=where,
+        raise InputError("the checkpoint is not the network it should be", where=where,
             expected=f"{len(wanted)} tensors of {network}", got="; ".join(lines),
-            remedy="check that the file is complete and of the right kind",
-        )  # fmt: skip
+            remedy="check that the file is complete and of the right kind")  # fmt: skip

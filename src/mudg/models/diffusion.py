@@ -1,7 +1,7 @@
-"""What the two diffusion models share: what is asked of them, what they return, and how far it can be trusted.
+"""The interface that the two diffusion models share: requests, generated clips, and their confidence.
 
-`MDM` (`models/mdm/model.py`) and `PublishedMDM` (`models/published/model.py`) have the same methods for it: `check_request`,
-`check_clip`, `image_size`, and `sample`, into which a condition and a `SampleRequest` go and out of which comes a `GeneratedClip`.
+`MDM` (`models/mdm/model.py`) and `PublishedMDM` (`models/published/model.py`) have the same methods: `check_request`, `check_clip`,
+`image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ from mudg.models.mdm.codec import Modality
 class SampleRequest:
     """How one clip is to be generated.
 
-    steps       denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for each
-                modality, two networks' worth each with guidance
-    seed, index all noise is drawn from (seed, index): same in, same out
-    sampler     a row of `noise.SAMPLERS`
-    eta         ddim: noise added between steps, 0 to 1 (None = the sampler's default)
-    guidance    published kind: weight of the guided over the unguided prediction; 1 = none (None = the model's own)
-    guidance_rescale  published kind: share of the guided prediction whose spread is pulled back (None = the model's own)
-    n_samples   > 1: the first sample is returned, the spread of all lowers the confidence
-    known       modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window
-    align       bring each frame's depth to the measured scale (`core.align`)
-    bf16        run the networks in bfloat16
+    Args:
+        steps: denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for each
+            modality, and twice as many with guidance.
+        seed, index: all noise is drawn from (seed, index): same in, same out.
+        sampler: a row of `noise.SAMPLERS`.
+        eta: ddim: noise added between steps, 0 to 1 (None = the sampler's default).
+        guidance: published kind: weight of the guided over the unguided prediction; 1 = none (None = the model's own).
+        guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's own).
+        n_samples: if > 1, the first sample is returned, and the spread of all lowers the confidence.
+        known: modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window.
+        align: bring each frame's depth to the measured scale (`core.align`).
+        bf16: run the networks in bfloat16.
     """
 
     steps: int
@@ -54,8 +55,7 @@ class SampleRequest:
 
     def sampler_settings(self) -> dict[str, Any]:
         """Settings of the sampler that were given; UsageError where there is no such sampler or it does not take them."""
-        given = {"eta": self.eta}
-        settings = {name: value for name, value in given.items() if value is not None}
+        settings = {} if self.eta is None else {"eta": self.eta}
         noise.check_sampler(self.sampler, settings)
         return settings
 
@@ -66,7 +66,7 @@ class GeneratedClip:
 
     rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1]. `latents`:
     modality -> [T,C,h,w], to be handed to the next window as `known`. `depth_fits`: one per frame, how depth was brought to
-    the measured scale; empty if that was not asked for.
+    the measured scale; empty without `SampleRequest.align`.
     """
 
     rgb: Tensor
@@ -81,7 +81,7 @@ def check_image_size(height: int, width: int, multiple: int) -> None:
     """UsageError unless both sides are positive multiples of `multiple` pixels, as the network's strides need."""
     if height % multiple or width % multiple or min(height, width) < multiple:
         raise UsageError("image size does not fit the diffusion model", expected=f"multiples of {multiple} pixels",
-                         got=f"{width}x{height}")  # fmt: skip
+            got=f"{width}x{height}")  # fmt: skip
 
 
 def sized_to_width(width_px: int, aspect: float, multiple: int) -> tuple[int, int]:
@@ -145,9 +145,10 @@ def mean_change(estimates: list[Tensor], last: Tensor) -> Tensor:
 def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     """How far a generated pixel can be trusted, f32[T,1,H,W] in [0,1].
 
-    seen    [T,1,h,w] share of the latent cell that was measured or warped from a recorded image
-    change  [T,1,h,w] how much the colour latent still moved in the later half of sampling (or its spread over samples)
-    factor  pixels per cell
+    Args:
+        seen: [T,1,h,w] share of the latent cell that was measured or warped from a recorded image.
+        change: [T,1,h,w] how much the colour latent still changed in the later half of sampling (or its spread over samples).
+        factor: pixels per cell.
 
     The product of a coverage term (1 where seen, 0.35 far from anything seen, smoothed over 5 cells) and exp(-2 change).
     """
@@ -157,18 +158,17 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
 
 
-def depth_agreement(depth: Tensor, condition: Condition, reach_px: int = 2) -> Tensor:
+def depth_agreement(depth: Tensor, condition: Condition) -> Tensor:
     """How far generated depth f32[T,1,H,W] agrees with what was measured nearby, f32[T,1,H,W] in [0.2, 1].
 
-    exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within `reach_px` as the mean of
+    exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within 2 pixels as the mean of
     those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not to
     be trusted either.
     """
     seen = condition.valid.float()
     ratio = (depth.clamp(min=0.1) / condition.depth.clamp(min=0.1)).log().abs()
     agrees = torch.exp(-5.0 * ratio).clamp(min=0.2)
-    window = 2 * reach_px + 1
-    pool = lambda x: functional.avg_pool2d(x, window, stride=1, padding=reach_px, count_include_pad=True)  # noqa: E731
+    pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)  # noqa: E731
     near = pool(seen)
     return torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
 

@@ -44,10 +44,11 @@ class FilterBank(nn.Module):
         blurred opponent colours (3); C = 9.
     """
 
-    def __init__(self, scales: int = 3, contrast_floor: float = 0.02) -> None:
+    CONTRAST_FLOOR: Final = 0.02
+
+    def __init__(self, scales: int = 3) -> None:
         super().__init__()
         self.scales = scales
-        self.contrast_floor = contrast_floor
         smooth, slope = torch.tensor([1.0, 2.0, 1.0]) / 4, torch.tensor([-1.0, 0.0, 1.0]) / 2
         along_x, along_y = torch.outer(smooth, slope), torch.outer(slope, smooth)
         self.register_buffer("opponent", torch.tensor(OPPONENT).view(3, 3, 1, 1))
@@ -67,7 +68,7 @@ class FilterBank(nn.Module):
         padded = F.pad(colors[:, :1], (1, 1, 1, 1), mode="replicate")
         slope = F.conv2d(padded, self.derivative.to(colors.dtype))
         power = (slope**2).sum(1, keepdim=True)
-        contrast = torch.sqrt(box_mean(power, 7) + self.contrast_floor**2)
+        contrast = torch.sqrt(box_mean(power, 7) + self.CONTRAST_FLOOR**2)
         dx, dy = slope[:, :1] / contrast, slope[:, 1:] / contrast
         diagonal, antidiagonal = (dx + dy) * 0.5**0.5, (dx - dy) * 0.5**0.5
         energy = box_mean(torch.cat([dx, dy, diagonal, antidiagonal], 1) ** 2, 5)

@@ -1,7 +1,7 @@
-"""Pretrained networks in folders, as the packages transformers and diffusers write them, or in the Hugging Face cache: read from disk
-alone, whole or not at all.
+"""Pretrained networks in folders, as the packages transformers and diffusers write them, or in the Hugging Face cache; nothing is
+downloaded, and a folder is read completely or not at all.
 
-The packages are extras and imported when a network is asked for. Which class reads a folder is decided by our tables: no name in a
+The packages are extras, imported at first use. Which class reads a folder is decided by our tables: no name in a
 file becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the network
 has and the folder lacks is an error, where the packages would leave it random and say so in a log.
 """
@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Literal
 
+import numpy as np
 import torch
-from torch import nn
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from mudg.base import store
 from mudg.base.errors import InputError, ResourceError
@@ -26,7 +29,7 @@ _REMEDY: Final = "pip install 'mudg[models]'"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a network computes, and whether its convolutions and matrix products are made in bfloat16."""
+    """Device of a network, and whether its convolutions and matrix products are computed in bfloat16."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     bf16: bool = False
@@ -43,6 +46,16 @@ class Place:
 
 
 CPU: Final = Place()
+MEAN: Final = (0.485, 0.456, 0.406)
+DEVIATION: Final = (0.229, 0.224, 0.225)
+"""Statistics of colours in 0..1 (ImageNet) where a folder names none."""
+
+
+def normalized(rgb: NDArray[np.uint8], mean: Sequence[float], deviation: Sequence[float]) -> Tensor:
+    """Image u8[H, W, 3] as f32[1, 3, H, W] with the mean and deviation of its colours in 0..1 taken out."""
+    image = torch.from_numpy(rgb).permute(2, 0, 1)[None].float() / 255
+    offset, scale = (torch.tensor(numbers)[None, :, None, None] for numbers in (mean, deviation))
+    return (image - offset) / scale
 
 
 _IN_HUB: Final = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?")
@@ -63,19 +76,18 @@ def find(name: str | Path) -> Path:
         hub = package("huggingface_hub")
     except ResourceError as error:
         raise ResourceError("no such folder, nor the package that knows the Hugging Face cache", where=text,
-                            remedy=f"name a folder that exists; for names of repositories: {_REMEDY}") from error  # fmt: skip
+            remedy=f"name a folder that exists; for names of repositories: {_REMEDY}") from error  # fmt: skip
     try:
         found = hub.snapshot_download(parts["repository"], revision=parts["revision"], local_files_only=True)
     except (OSError, ValueError) as error:
-        raise ResourceError(
-            "no such folder, and no copy of such a repository in the Hugging Face cache", where=text, got=str(error).splitlines()[0],
-            expected=f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}", remedy=f"hf download {parts['repository']}",
-        ) from error  # fmt: skip
+        raise ResourceError("no such folder, and no copy of such a repository in the Hugging Face cache", where=text,
+            got=str(error).splitlines()[0], expected=f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}",
+            remedy=f"hf download {parts['repository']}") from error  # fmt: skip
     return Path(found)
 
 
 def title(folder: str | Path) -> str:
-    """What a folder is called in notes: "owner/name@revision" of one in the Hugging Face cache, else its own name."""
+    """Name of a folder in notes: "owner/name@revision" of one in the Hugging Face cache, else its own name."""
     path = Path(folder)
     parent = path.parent.parent.name
     if path.parent.name == "snapshots" and parent.startswith("models--"):
@@ -84,7 +96,7 @@ def title(folder: str | Path) -> str:
 
 
 def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> ModuleType:
-    """A package that reads folders, its progress bars off; ResourceError naming the extra where it is missing."""
+    """A package that reads folders, with its progress bars off; ResourceError names the extra if it is missing."""
     try:
         match name:
             case "transformers":
@@ -94,9 +106,8 @@ def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> Mo
             case "huggingface_hub":
                 found = importlib.import_module("huggingface_hub")
     except ImportError as error:
-        raise ResourceError(
-            f"the {name} package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
-        ) from error
+        raise ResourceError(f"the {name} package is missing", where="pretrained network", got=str(error),
+            remedy=_REMEDY) from error  # fmt: skip
     return _quiet(found)
 
 
@@ -112,10 +123,9 @@ def member(owner: ModuleType, class_name: str) -> Any:
     """A class of a package; ResourceError where the installed version is too old to have it."""
     found = getattr(owner, class_name, None)
     if found is None:
-        raise ResourceError(
-            f"the installed {owner.__name__} package has no {class_name}", where="pretrained network", expected="a newer version",
-            got=str(getattr(owner, "__version__", "")), remedy=f"pip install --upgrade {owner.__name__}",
-        )  # fmt: skip
+        raise ResourceError(f"the installed {owner.__name__} package has no {class_name}", where="pretrained network",
+            expected="a newer version", got=str(getattr(owner, "__version__", "")),
+            remedy=f"pip install --upgrade {owner.__name__}")  # fmt: skip
     return found
 
 
@@ -128,7 +138,7 @@ def read_settings(file: Path) -> dict[str, Any]:
 
 
 def load_network(network_class: Any, folder: Path, place: Place = CPU, subfolder: str = "") -> nn.Module:
-    """A network with all its weights, in float32 on its device, ready to be asked; its parameters want no gradient.
+    """A network with all its weights, in float32 on its device, ready for use; its parameters have no gradient.
 
     Args:
         network_class: class of transformers or diffusers. folder: as ``save_pretrained`` writes it.
@@ -148,17 +158,13 @@ def load_network(network_class: Any, folder: Path, place: Place = CPU, subfolder
         network, report = network_class.from_pretrained(str(folder), **options)
     except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(
-            f"the folder cannot be read as {network_class.__name__}", where=where, got=lines[0][:300],
-            expected="the configuration and the safetensors file that save_pretrained writes",
-        ) from error  # fmt: skip
+        raise InputError(f"the folder cannot be read as {network_class.__name__}", where=where, got=lines[0][:300],
+            expected="the configuration and the safetensors file that save_pretrained writes") from error  # fmt: skip
     lacking = sorted(str(name) for key in ("missing_keys", "mismatched_keys") for name in report.get(key) or ())
     if lacking:
-        raise InputError(
-            f"weights of the {network_class.__name__} are missing, or have another shape", where=where,
+        raise InputError(f"weights of the {network_class.__name__} are missing, or have another shape", where=where,
             expected="a value for every parameter", got=", ".join(lacking[:4]) + (" ..." if len(lacking) > 4 else ""),
-            remedy="take the folder of the whole network, with its task's head",
-        )  # fmt: skip
+            remedy="take the folder of the whole network, with its task's head")  # fmt: skip
     if any(value.dtype != torch.float32 for value in network.parameters()):
         network = network.float()
     return network.to(device).eval().requires_grad_(False)

@@ -10,10 +10,12 @@ instruction set instead of the best one.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -86,6 +88,19 @@ def threads() -> int:
     return 1 if found is None else int(found.mudg_threads())
 
 
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread of the native loops in this block: threads inside threads only wait for each other."""
+    found, before = library(), threads()
+    if found is not None:
+        found.mudg_set_threads(1)
+    try:
+        yield
+    finally:
+        if found is not None:
+            found.mudg_set_threads(before)
+
+
 def default_threads() -> int:
     """MUDG_THREADS, else the number of processors this process may run on. UsageError if MUDG_THREADS is no number."""
     text = os.environ.get("MUDG_THREADS", "").strip()
@@ -119,7 +134,7 @@ def _load() -> tuple[ctypes.CDLL | None, str]:
     wanted = os.environ.get("MUDG_ISA", "").strip()
     if wanted and found.mudg_set_isa(wanted.encode()) != 0:
         raise UsageError("MUDG_ISA names an instruction set that cannot run here", got=wanted,
-                         expected="avx512, avx2, portable")  # fmt: skip
+            expected="avx512, avx2, portable")  # fmt: skip
     return found, ""
 
 

@@ -34,8 +34,7 @@ def write_page(scene: Scene, made: set[str], out: Path) -> Path:
         labelled = [frame for frame in scene.frames_of(camera) if frame.id in made]
         for frame in spread(labelled or scene.frames_of(camera), _FRAMES):
             name = f"pictures/{frame.id.replace('/', '_')}.jpg"
-            with store.atomic_path(out / name) as temporary:
-                picture(scene, frame).save(temporary, "JPEG", quality=88)
+            store.write_image(out / name, picture(scene, frame), quality=88)
             pictures.append({"file": name, "caption": _caption(scene, frame)})
     text = html.render(
         "labels.html.j2", title=f"Labels of {scene.id}", kicker="mudg annotate", notes=scene.source.notes, pictures=pictures,

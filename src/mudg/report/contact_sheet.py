@@ -47,9 +47,7 @@ Floats = NDArray[np.float64]
 
 def write_contact_sheet(scene: Scene, path: Path) -> Path:
     """Draw the scene's contact sheet as a JPEG at ``path``."""
-    sheet = contact_sheet(scene)
-    with store.atomic_path(path) as temporary:
-        sheet.save(temporary, "JPEG", quality=88)
+    store.write_image(path, contact_sheet(scene), quality=88)
     return path
 
 
@@ -115,7 +113,6 @@ def frame_tile(scene: Scene, frame: Frame, width: int = TILE_WIDTH_PX) -> Image.
     split = " held out" if scene.split.get(frame.id) == "test" else ""
     drawing.draw_caption(draw, f"{frame.id}  {frame.view.time_s:.2f} s{gap}{split}")
     return tile
-
 
 
 def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> None:

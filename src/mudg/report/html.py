@@ -1,4 +1,4 @@
-"""Pages from the Jinja templates of ``report/templates``. Every value is escaped; CSS and scripts lie inside the page."""
+"""Pages and model cards from the Jinja templates of ``report/templates``. On pages every value is escaped; CSS and scripts lie inside."""
 
 from __future__ import annotations
 
@@ -20,6 +20,11 @@ def render(template: str, **values: Any) -> str:
         template: file name in ``report/templates``. values: what the template names; one that is missing is an error.
     """
     return _environment().get_template(template).render(**values)
+
+
+def render_text(template: str, **values: Any) -> str:
+    """The text of a Markdown file, where nothing is escaped; arguments as for ``render``."""
+    return _environment().overlay(autoescape=False).get_template(template).render(**values) + "\n"
 
 
 def class_legend() -> list[tuple[str, str]]:

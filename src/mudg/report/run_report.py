@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from mudg import native
 from mudg.base import log, store
+from mudg.base.processes import computed_ahead
 from mudg.data.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.report.page import FPS, PANEL_ROWS, TrajectoryVideo, page
@@ -44,17 +44,12 @@ class Columns:
     has_truth: bool
 
 
-def write_report(out: Path) -> Path:
-    """Write ``OUT/report.html`` from what the chain left in ``out`` (see ``stages.run``).
+def film(out: Path) -> list[TrajectoryVideo]:
+    """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see ``stages.run``).
 
     Raises:
         InputError: the run is not scored yet, or a folder of views is damaged.
     """
-    return write_page(out, film(out))
-
-
-def film(out: Path) -> list[TrajectoryVideo]:
-    """The costly half of a report: one video per trajectory. Raises as ``write_report``."""
     out = Path(out)
     scores = store.read_json(out / "score" / "metrics.json")
     folders = _folders(out, scores)
@@ -63,14 +58,8 @@ def film(out: Path) -> list[TrajectoryVideo]:
         log.warn("PyAV has no H.264 encoder here: the report shows one picture per trajectory instead of a video")
     trajectories = [t for t in scores["trajectories"] if any(t["name"] in found for found in folders.values())]
     budget = BUDGET_BYTES // max(1, len(trajectories)) if playable else 0
-    with log.task("report", len(trajectories)) as bar, ThreadPoolExecutor(native.default_threads()) as pool:
-
-        def make(trajectory: Mapping[str, Any]) -> TrajectoryVideo:
-            video = _video(trajectory, folders, budget)
-            bar.advance()
-            return video
-
-        return list(pool.map(make, trajectories))
+    videos = computed_ahead(lambda n: _video(trajectories[n], folders, budget), len(trajectories), native.default_threads())
+    return list(log.progress(videos, len(trajectories), "report"))
 
 
 def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:

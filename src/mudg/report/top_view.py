@@ -114,7 +114,6 @@ def draw_caption(draw: ImageDraw.ImageDraw, text: str) -> None:
     draw.text((4, 3), text, fill=TEXT_COLOR)
 
 
-
 def box_color(label: str) -> tuple[int, int, int]:
     """Colour of a class of boxes."""
     return VEHICLE_COLOR if label in VEHICLES else PEOPLE_COLOR if label in PEOPLE else OTHER_COLOR

@@ -1,10 +1,10 @@
-"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and movers, each pixel with a confidence.
+"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and dynamic objects, each pixel with a confidence.
 
 The result is a complete new scene; the given one is not touched. A label that a frame has already is kept, one that it lacks
 is made; a scene whose frames lack nothing is copied as it is. What made the labels is written into the scene's notes, so that
 nobody takes them for truth.
 
-Frames are labelled in processes of their own, and each is put aside when it is done: the same command goes on where it was
+Frames are labelled in separate processes, and each is staged when it is done: repeat the command to resume where it was
 stopped.
 """
 
@@ -37,8 +37,8 @@ from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import find_ego
 from mudg.stages.labelling.points import NearbyReturns
 
-_ASIDE = "labelled"
-_OUTPUT = VerbOutput("annotate", 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", f"{_ASIDE}/"))
+_STAGING = "labelled"
+_OUTPUT = VerbOutput("annotate", 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", f"{_STAGING}/"))
 _FRAMES_PER_PROCESS = 8
 """Fewer frames than this are not worth the start of a process."""
 
@@ -65,20 +65,20 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     wanted = wanted_labels(config)
     missing = [frame for frame in loaded.frames if not wanted <= set(frame.labels)]
     if not missing:
-        log.info("annotate: labels present, nothing to do; the scene is passed through")
+        log.info("annotate: the scene already has all labels; nothing to add")
     if not (folder.path / "scene.json").is_file():
-        aside = folder.path / _ASIDE
-        _label_frames(config, Path(scene), loaded, missing, aside)
+        staging = folder.path / _STAGING
+        _label_frames(config, Path(scene), loaded, missing, staging)
         source = dataclasses.replace(
-            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, inputs, aside))
+            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, inputs, staging))
         )
         with SceneWriter(folder.path, loaded.id, source) as writer:
             writer.copy_all_but_frames(loaded)
-            _add_frames(config, loaded, missing, aside, writer)
+            _add_frames(config, loaded, missing, staging, writer)
             writer.finish()
     made = read_scene(folder.path)
     write_page(made, {frame.id for frame in missing}, folder.path)
-    shutil.rmtree(folder.path / _ASIDE, ignore_errors=True)
+    shutil.rmtree(folder.path / _STAGING, ignore_errors=True)
     folder.finish({"labelled": len(missing), "labeller": config.labeller if missing else "labels present"})
     return folder.path
 
@@ -110,12 +110,12 @@ def wanted_labels(config: AnnotateConfig) -> set[str]:
     )  # fmt: skip
 
 
-def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str, str], aside: Path) -> Iterator[str]:
+def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str, str], staging: Path) -> Iterator[str]:
     """A sentence for each label that was made: for how many frames, and from what."""
     made_by = f"labeller '{config.labeller}'"
     if "weights" in inputs:
-        made_by += annotate_depth.folder_words(config.weights, inputs["weights"])
-    depth = annotate_depth.origin(config, inputs, [frame.id for frame in missing if "depth" not in frame.labels], aside)
+        made_by += annotate_depth.describe_folder(config.weights, inputs["weights"])
+    depth = annotate_depth.origin(config, inputs, [frame.id for frame in missing if "depth" not in frame.labels], staging)
     origins = {"semantics": made_by, "sky": made_by, "depth": depth, "dynamic": "tracked boxes that move and dense depth",
                "ego": "pixels that stay the same while the vehicle moves"}  # fmt: skip
     for name, origin in origins.items():
@@ -127,20 +127,20 @@ def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str
 # --- one frame after the other ----------------------------------------------------------------------------------------
 
 
-def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Sequence[Frame], aside: Path) -> None:
-    """Put the labels of every frame that has none yet into ``aside``."""
-    todo = [frame.id for frame in missing if not aside_file(aside, frame.id).is_file()]
+def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Sequence[Frame], staging: Path) -> None:
+    """Put the labels of every frame that has none yet into ``staging``."""
+    todo = [frame.id for frame in missing if not staged_labels(staging, frame.id).is_file()]
     if len(todo) < len(missing):
-        log.info(f"annotate: {len(missing) - len(todo)} frames were labelled before")
+        log.info(f"annotate: {len(missing) - len(todo)} frames are labelled already")
     most = config.processes or (1 if config.device == "cuda" else os.cpu_count()) or 1
     processes = min(most, len(todo) // _FRAMES_PER_PROCESS)
     with log.task("labelling frames", len(missing), len(missing) - len(todo)) as bar:
         if processes <= 1:
-            for _ in label_and_put_aside(config, scene, todo, aside):
+            for _ in label_into_staging(config, scene, todo, staging):
                 bar.advance()
             return
         work = [
-            (config, path, list(part), aside)
+            (config, path, list(part), staging)
             for part in np.array_split(np.array(todo, dtype=object), 4 * processes)
             if len(part)
         ]
@@ -148,12 +148,12 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
             bar.advance(labelled)
 
 
-def _label_in_process(config: AnnotateConfig, path: Path, ids: list[str], aside: Path) -> int:
-    return sum(1 for _ in label_and_put_aside(config, read_scene(path), ids, aside))
+def _label_in_process(config: AnnotateConfig, path: Path, ids: list[str], staging: Path) -> int:
+    return sum(1 for _ in label_into_staging(config, read_scene(path), ids, staging))
 
 
-def label_and_put_aside(config: AnnotateConfig, scene: Scene, ids: Sequence[str], aside: Path) -> Iterator[str]:
-    """Label these frames one after the other, write each to ``aside``, and name it when it is there."""
+def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str], staging: Path) -> Iterator[str]:
+    """Label these frames one after the other, write each to ``staging``, and name it when it is there."""
     if not ids:
         return
     label = labeller(config.labeller, config.weights, annotate_depth.place(config))
@@ -169,14 +169,14 @@ def label_and_put_aside(config: AnnotateConfig, scene: Scene, ids: Sequence[str]
         with one_torch_thread():
             labels = label(given)
             if network is not None and "depth" not in frame.labels:
-                labels = annotate_depth.with_network(network, given, labels, frame_id, aside)
-        store.write_safetensors(aside_file(aside, frame_id), label_arrays(config, labels))
+                labels = annotate_depth.with_network(network, given, labels, frame_id, staging)
+        store.write_safetensors(staged_labels(staging, frame_id), label_arrays(config, labels))
         yield frame_id
 
 
-def aside_file(aside: Path, frame_id: str) -> Path:
+def staged_labels(staging: Path, frame_id: str) -> Path:
     """Where the labels of a frame lie until the scene is written."""
-    return aside / f"{frame_id}.safetensors"
+    return staging / f"{frame_id}.safetensors"
 
 
 def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[Any]]:
@@ -192,7 +192,7 @@ def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[An
 
 
 def _add_frames(
-    config: AnnotateConfig, scene: Scene, missing: Sequence[Frame], aside: Path, writer: SceneWriter
+    config: AnnotateConfig, scene: Scene, missing: Sequence[Frame], staging: Path, writer: SceneWriter
 ) -> None:
     ego = {name: find_ego(scene, name) for name in scene.cameras} if config.ego else {}
     lacking = {frame.id for frame in missing}
@@ -200,7 +200,7 @@ def _add_frames(
         if frame.id not in lacking:
             writer.copy_frame(scene, frame)
             continue
-        arrays = store.read_safetensors(aside_file(aside, frame.id))
+        arrays = store.read_safetensors(staged_labels(staging, frame.id))
         for name in ("semantics", "depth"):  # a confidence tells that a label was made: none beside one that was given
             if name in frame.labels:
                 arrays.pop(f"{name}_confidence", None)

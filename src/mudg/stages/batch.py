@@ -85,13 +85,13 @@ def read_list(path: Path, settings: Sequence[str] = ()) -> list[Entry]:
         folder = path.parent
     entries = [entry for where, line in lines if (entry := _entry(line, where, folder, settings)) is not None]
     if not entries:
-        raise InputError("the list names no scenes", where=str(path), expected="one source a line")
+        raise InputError("the list is empty", where=str(path), expected="one source per line")
     sources: dict[str, str] = {}
     for entry in entries:
         if entry.name in sources:
             raise InputError(
-                "two entries would write one folder", where=str(path), got=f"{sources[entry.name]} and {entry.source}",
-                remedy=f"give one another name: SOURCE name={entry.name}-2",
+                "two entries would write the same folder", where=str(path), got=f"{sources[entry.name]} and {entry.source}",
+                remedy=f"give one of them another name: SOURCE name={entry.name}-2",
             )  # fmt: skip
         sources[entry.name] = entry.source
     return entries
@@ -101,7 +101,7 @@ def _entry(line: str, where: str, folder: Path, settings: Sequence[str]) -> Entr
     try:
         words = shlex.split(line, comments=True)
     except ValueError as error:
-        raise InputError("line cannot be split into words", where=where, got=line[:80]) from error
+        raise InputError("cannot parse the line", where=where, got=line[:80]) from error
     if not words:
         return None
     given: dict[str, str] = {}
@@ -109,10 +109,9 @@ def _entry(line: str, where: str, folder: Path, settings: Sequence[str]) -> Entr
         key, separator, value = word.partition("=")
         if not separator or key not in ("name", *settings):
             raise InputError(
-                "line holds what is no setting", where=where, got=word[:80],
+                "unknown setting in the line", where=where, got=word[:80],
                 expected=", ".join(f"{key}=..." for key in ("name", *settings)),
-                remedy="put quotes around a path with spaces",
-            )  # fmt: skip
+                remedy="put quotes around a path with spaces")  # fmt: skip
         given[key] = value
     source = words[0] if words[0] == "city" else str(folder / Path(words[0]).expanduser())
     name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
@@ -132,7 +131,7 @@ def shard(entries: list[Entry], text: str) -> list[Entry]:
     first, separator, count = text.partition("/")
     if not separator or not first.isdigit() or not count.isdigit() or not int(first) < int(count):
         raise UsageError(
-            "shard makes no sense", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4", got=text
+            "invalid shard", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4", got=text
         )
     return entries[int(first) :: int(count)]
 
@@ -207,7 +206,7 @@ def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: 
             known = False
         if not known:
             raise UsageError(
-                "the status would replace a file of something else", where=str(status), remedy="choose another --out"
+                "the status file would replace a file that does not belong to this list", where=str(status), remedy="choose another --out"
             )
 
 

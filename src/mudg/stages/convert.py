@@ -41,12 +41,7 @@ LICENCE = (
 
 
 def run(
-    config: ConvertConfig,
-    checkpoint: Path,
-    to: Path,
-    *,
-    overwrite: bool = False,
-    network: PublishedConfig | None = None,
+    config: ConvertConfig, checkpoint: Path, to: Path, *, overwrite: bool = False, network: PublishedConfig | None = None
 ) -> Path:
     """Convert one checkpoint; returns `to`, which is complete or not there.
 
@@ -67,13 +62,12 @@ def run(
     if replaces and not overwrite:
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
     if replaces and not _holds_model(to):
-        raise UsageError("the folder holds something else than a model", where=str(to), remedy="choose another --to")
+        raise UsageError("the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to")
     place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
-    work, limit = (
-        _from_folder(config, checkpoint, place)
-        if checkpoint.is_dir()
-        else _from_file(config, checkpoint, place, network)
-    )
+    if checkpoint.is_dir():
+        work, limit = _from_folder(config, checkpoint, place)
+    else:
+        work, limit = _from_file(config, checkpoint, place, network)
     if replaces:
         replacement.begin()
     try:
@@ -107,9 +101,10 @@ def own_names(folder: Path) -> list[str]:
     return [name for name in (*files, "MODEL_CARD.md", "model.json") if name in there] if files else []
 
 
-def _from_file(
-    config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None
-) -> tuple[Callable[[], None], int]:
+Work = Callable[[], None]
+
+
+def _from_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None) -> tuple[Work, int]:
     """The conversion of a checkpoint, and the address space it may take."""
     if not checkpoint.is_file():
         raise InputError("no such checkpoint", where=str(checkpoint))
@@ -119,16 +114,14 @@ def _from_file(
     return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint, *towers)
 
 
-def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Callable[[], None], int]:
+def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, int]:
     """The conversion of DepthLab's files, and the address space it may take."""
     if config.resolution != "auto" or config.towers:
-        raise UsageError("a folder is read as DepthLab, which has neither resolution nor towers", where=str(folder),
-                         remedy="leave out --resolution and --towers, or name a checkpoint file")  # fmt: skip
+        raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(folder),
+                         remedy="leave them out, or give a checkpoint file")  # fmt: skip
     files = convert_depthlab.find(folder).files()
-    work = functools.partial(
-        convert_depthlab.convert_folder, folder, to, DTYPES[config.dtype], config.shard_mb << 20
-    )  # fmt: skip
-    return work, memory_limit(config, *files)
+    dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
+    return functools.partial(convert_depthlab.convert_folder, folder, to, dtype, shard_bytes), memory_limit(config, *files)
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
@@ -141,7 +134,7 @@ def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
             if mark in part:
                 return size
     raise UsageError(
-        "the file's name does not tell which resolution the model was trained at", where=str(checkpoint), expected="512 or 1024 in it",
+        "the training resolution is not in the file's name", where=str(checkpoint), expected="512 or 1024 in the name",
         remedy="add --resolution 320x512 or --resolution 576x1024",
     )  # fmt: skip
 
@@ -175,25 +168,18 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
         "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
     }  # fmt: skip
-    published_files.save(
-        to,
-        network,
-        tensors,
-        facts,
-        _card(network, facts),
-        dtype=DTYPES[config.dtype],
-        shard_bytes=config.shard_mb << 20,
-    )
+    dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
+    published_files.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=shard_bytes)
 
 
 def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
     """InputError for DynamiCrafter-256, which looks alike and is another model."""
     marks = [name for name in found if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
     if marks:
-        raise InputError(
-            "this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where), got=", ".join(marks[:3]),
+        raise InputError("this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where),
+            got=", ".join(marks[:3]),
             expected="MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule that never "
-            "reaches pure noise and no dynamic rescale, and weighs its image attention by learnt factors",
+            "reaches pure noise and no dynamic rescale, and weights its image attention with learned factors",
             remedy="take the 512 or 1024 checkpoint",
         )  # fmt: skip
 
@@ -228,23 +214,17 @@ def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
 
 def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: Path) -> None:
     """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0, 1]."""
-    for name, value in tensors.items():
-        if not value.is_floating_point():
-            raise InputError(
-                "a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype)
-            )
-        if not bool(torch.isfinite(value).all()):
-            raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
+    weights.refuse_bad_values(tensors, str(where))
     scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
     if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
         raise InputError(
-            "the table of the dynamic rescale is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
+            "the dynamic rescale table is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
             got=f"{float(scale.min())} .. {float(scale.max())}",
         )  # fmt: skip
     if alpha_bar is not None and abs(float(alpha_bar.flatten()[-1])) > 1e-6:
         raise InputError(
             "the checkpoint's noise schedule keeps signal at its last step", where=f"{where}: alphas_cumprod[-1]", expected="0",
-            got=str(float(alpha_bar.flatten()[-1])), remedy="this is another model, though its tensors have the same names",
+            got=str(float(alpha_bar.flatten()[-1])), remedy="take a MuDG or DynamiCrafter checkpoint; this is another model",
         )  # fmt: skip
 
 
@@ -254,7 +234,7 @@ def embed_captions(network: PublishedConfig, tower_weights: Mapping[str, Tensor]
     with torch.device("meta"):
         tower = TextTower(network.text, network.vocabulary)
     tower.load_state_dict({n: t if n == "tokens.weight" else t.float() for n, t in tower_weights.items()}, assign=True)
-    ids = torch.stack([clip.caption_tokens(clip.CAPTION), clip.caption_tokens("")])
+    ids = torch.stack([clip.padded_tokens(clip.CAPTION_IDS), clip.padded_tokens(clip.EMPTY_IDS)])
     tower.tokens = torch.nn.Embedding.from_pretrained(tower.tokens.weight[ids.flatten()].float())
     return tower.eval()(torch.arange(ids.numel()).view_as(ids)).float()
 

@@ -27,11 +27,8 @@ from mudg.models import folders
 from mudg.models.depth import depthlab, marigold
 from mudg.models.depth.depthlab import PARTS, UNETS
 
-PICKLES = {
-    "denoising_unet": "denoising_unet.pth",
-    "reference_unet": "reference_unet.pth",
-    "mapping_layer": "mapping_layer.pth",
-}
+PICKLES = {part: f"{part}.pth" for part in (*UNETS, "mapping_layer")}
+"""Part -> the published file that holds it."""
 LICENCE = (
     "Weights keep the terms of those who published them: DepthLab, Marigold (made from Stable Diffusion) and the CLIP image encoder. "
     "Read the pages they came from before any use."
@@ -61,9 +58,8 @@ class Sources:
         for name in _ENCODER_FILES:
             if (self.encoder / name).is_file():
                 return self.encoder / name
-        raise InputError(
-            "the image encoder has no weight file", where=str(self.encoder), expected=" or ".join(_ENCODER_FILES)
-        )
+        raise InputError("the image encoder has no weight file", where=str(self.encoder),
+            expected=" or ".join(_ENCODER_FILES))  # fmt: skip
 
 
 def find(folder: Path) -> Sources:
@@ -82,11 +78,11 @@ def find(folder: Path) -> Sources:
             raise InputError("a published file is missing", where=str(pickles), expected=name)
     marigolds = ("MarigoldPipeline", "MarigoldDepthPipeline")
     base = _only(
-        folder, [place for place in places if _told(place / "model_index.json", "_class_name") in marigolds],
+        folder, [place for place in places if _json_value(place / "model_index.json", "_class_name") in marigolds],
         "marigold-depth-v1-0, a folder of diffusers",
     )  # fmt: skip
     encoder = _only(
-        folder, [place for place in places if _told(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
+        folder, [place for place in places if _json_value(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
         "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers",
     )  # fmt: skip
     return Sources(pickles, base, encoder)
@@ -95,14 +91,14 @@ def find(folder: Path) -> Sources:
 def _only(folder: Path, found: list[Path], what: str) -> Path:
     if len(found) != 1:
         raise InputError(
-            "a part of DepthLab is missing" if not found else "a part of DepthLab is there more than once", where=str(folder),
+            "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once", where=str(folder),
             expected=f"one folder with {what}", got=", ".join(place.name for place in found) or "none",
-            remedy="lay the three folders side by side, as DepthLab's page says, and give the folder around them",
+            remedy="put the three folders into one, as DepthLab's page says, and give that folder",
         )  # fmt: skip
     return found[0]
 
 
-def _told(file: Path, key: str) -> object:
+def _json_value(file: Path, key: str) -> object:
     return folders.read_settings(file).get(key) if file.is_file() else None
 
 
@@ -123,15 +119,15 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
     try:
         vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError("the image encoder is not described", where=str(sources.encoder / "config.json"),
+        raise InputError("the image encoder has no description", where=str(sources.encoder / "config.json"),
                          got=str(error)[:300]) from error  # fmt: skip
     file = sources.base / marigold.SCHEDULE_FILE
     schedule = folders.read_settings(file)
-    marigold.ddim_scheduler(folders.member(folders.package("diffusers"), "DDIMScheduler"), schedule, str(file))
+    marigold.ddim_scheduler(schedule, str(file))
     if schedule.get("rescale_betas_zero_snr"):
-        raise InputError("this is the noise schedule of a later Marigold", where=str(file), got="rescale_betas_zero_snr: true",
-                         expected="that of marigold-depth-v1-0, which DepthLab was made from",
-                         remedy="take marigold-depth-v1-0")  # fmt: skip
+        raise InputError("this is the noise schedule of a later Marigold", where=str(file),
+            got="rescale_betas_zero_snr: true", expected="that of marigold-depth-v1-0, which DepthLab was made from",
+            remedy="take marigold-depth-v1-0")  # fmt: skip
     return depthlab.part_configs(unet, vae, vision_config), schedule
 
 
@@ -154,12 +150,7 @@ def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str
              "image_encoder": sources.encoder_file()}  # fmt: skip
     for part, network in depthlab.blank_parts(configs).items():
         weights.match_exactly(found[part], depthlab.shapes_of(network), str(files[part]), f"DepthLab's {part}")
-        for name, value in found[part].items():
-            where = f"{files[part]}: {name}"
-            if not value.is_floating_point():
-                raise InputError("a tensor does not hold floating-point numbers", where=where, got=str(value.dtype))
-            if not bool(torch.isfinite(value).all()):
-                raise InputError("a tensor holds values that are not finite", where=where)
+        weights.refuse_bad_values(found[part], str(files[part]))
     return found
 
 
@@ -190,7 +181,7 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
         store.write_text(partial / "MODEL_CARD.md", _card(facts))
         description = {
             "schema": depthlab.SCHEMA, "kind": depthlab.KIND, "parts": parts, "scheduler": schedule,
-            "sampling": asdict(depthlab.DepthLabSampling()), "facts": facts,
+            "sampling": asdict(depthlab.PUBLISHED_SAMPLING), "facts": facts,
         }  # fmt: skip
         store.write_json(partial / depthlab.DESCRIPTION, description)
         store.sync_tree(partial)

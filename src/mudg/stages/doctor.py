@@ -175,7 +175,6 @@ def _optional() -> dict[str, str]:
     }
 
 
-
 def _video(problems: list[str]) -> dict[str, str]:
     if find_spec("av") is None:
         return {"encoders": "unknown (av is missing)"}

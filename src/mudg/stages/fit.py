@@ -12,29 +12,26 @@ loss), ``models.scene.densify``. Nothing else touches the parameters.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shutil
-import signal
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
 from mudg.core import losses, metrics, native_ops
-from mudg.core.pictures import class_colors, depth_colors, to_bytes
+from mudg.core.pictures import panels_of
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet
@@ -111,7 +108,7 @@ def run(
     folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    with _one_torch_thread():
+    with one_torch_thread():
         state = _prepare(config, Path(scene), Path(fused), virtual, folder.path)
         optimise(state, config, folder)
     save_model(state.model, folder.path)
@@ -149,7 +146,7 @@ def _prepare(config: FitConfig, scene_path: Path, fused_path: Path, virtual: Map
     found = checkpoint.latest(out / "steps")
     if found is None:
         return start_state(config, scene, fused, views, classes)
-    log.info(f"continuing at step {found.step} of {config.iterations}")
+    log.info(f"resuming at step {found.step} of {config.iterations}")
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
     stats, appearance = found.tensors("stats"), Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
     return FitState(
@@ -187,11 +184,11 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``VirtualConfig.beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
-    that changes. Ctrl-C is taken at the end of a step: checkpoint, then KeyboardInterrupt.
+    that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
     raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
-    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, _interrupt_at_end_of_step() as interrupted:
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
@@ -217,12 +214,12 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
                 write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
-            if step % config.checkpoint_every == 0 or interrupted.is_set():
+            if step % config.checkpoint_every == 0 or interruption.requested:
                 save_checkpoint(state, folder.path / "steps")
             bar.advance()
-            if interrupted.is_set():
+            if interruption.requested:
                 folder.pause(state.summary())
-                raise KeyboardInterrupt
+                interruption.stop_now()
 
 
 def _learn_from(
@@ -371,10 +368,9 @@ def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
     """NumericsError naming term, view and step if a loss term is not finite; nothing has been changed by then."""
     for name, value in terms.items():
         if not math.isfinite(value.item()):
-            raise NumericsError(
-                f"the loss term {name!r} is not finite", where=f"view {view}, step {step}", got=str(value.item()),
-                remedy="check this view's image and labels; the parameters are those of the step before",
-            )  # fmt: skip
+            raise NumericsError(f"the loss term {name!r} is not finite", where=f"view {view}, step {step}",
+                got=str(value.item()),
+                remedy="check this view's image and labels; the parameters are those of the step before")  # fmt: skip
 
 
 def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
@@ -384,11 +380,9 @@ def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
             # A sum is the cheapest pass over memory there is; it may overflow, so what it finds is counted.
             if not math.isfinite(gradient.sum().item()) and (count := int((~torch.isfinite(gradient)).sum())):
                 table.clear_gradients()
-                raise NumericsError(
-                    "a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
+                raise NumericsError("a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
                     got=f"{count} values",
-                    remedy="the parameters are those of the step before; report the scene, or leave this view out",
-                )  # fmt: skip
+                    remedy="the parameters are those of the step before; report the scene, or leave this view out")  # fmt: skip
 
 
 # ---- schedules -----------------------------------------------------------------------------------------------------
@@ -503,16 +497,13 @@ def load_model(folder: Path) -> SceneModel:
     """
     folder = Path(folder)
     if not (folder / "model.json").is_file():
-        raise InputError("no fitted scene here", where=str(folder), expected="a folder made by `mudg fit`")
+        raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
     values = store.read_json(folder / "model.json")
     if values.get("schema") != 1:
         raise InputError("unknown schema of a fitted scene", where=str(folder / "model.json"), expected="1", got=str(values.get("schema")))
-    groups = {}
-    for name in ("gaussians", "nodes"):
-        arrays = store.read_safetensors(folder / f"{name}.safetensors")
-        groups[name] = {key: torch.from_numpy(value.copy()) for key, value in arrays.items()}
+    groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
     return SceneModel.from_state(values, groups)
 
 
@@ -553,41 +544,4 @@ def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
     """A picture: truth, render, depth, semantics of the middle recorded view."""
     stored = state.views.recorded[len(state.views.recorded) // 2]
     seen = render_view(state.model, stored.view, raster)
-    panels = [stored.rgb, to_bytes(seen.rgb), depth_colors(seen.depth[0].numpy())]  # type: ignore[index]
-    if seen.semantics is not None:
-        panels.append(class_colors(seen.semantics.numpy()))
-    with store.atomic_path(path) as temporary:
-        Image.fromarray(np.concatenate(panels, 1)).save(temporary)
-
-
-@contextlib.contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Results must not depend on how many cores are free; the native library's do not, torch's do. Its short loops gain nothing
-    from a second thread."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def _interrupt_at_end_of_step() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into a flag, so that a step is never cut in half; a second one interrupts at once."""
-    flag = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def note(number: int, frame: Any) -> None:
-        if flag.is_set() and callable(before):
-            before(number, frame)
-        flag.set()
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, before)
+    store.write_image(path, np.concatenate([stored.rgb, *panels_of(seen)], 1))

@@ -50,13 +50,12 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
     cloud, report = fuse_sweeps(scene_sweeps(loaded, config), loaded.tracks, rules)
     if report.sweeps and not len(cloud.static):
         log.warn(
-            "fuse: no point of the static world falls into an image; check calibration and clocks with `mudg doctor`"
+            "fuse: no static point projects into any image; check calibration and clocks with `mudg doctor`"
         )
     for words in describe(report):
         log.info(f"fuse: {words}")
     write_fused(folder.path, cloud, report_record(report, rules))
-    with store.atomic_path(folder.path / "top.png") as temporary:
-        top_view(loaded, cloud, report).save(temporary)
+    store.write_image(folder.path / "top.png", top_view(loaded, cloud, report))
     folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
     return folder.path
 
@@ -104,11 +103,7 @@ def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
     """The report as JSON values for ``fuse.json``."""
     values = dataclasses.asdict(report)
     tracks = {
-        track_id: {
-            **verdict,
-            "points": report.object_points.get(track_id),
-            "left_out": report.left_out.get(track_id),
-        }
+        track_id: {**verdict, "points": report.object_points.get(track_id), "left_out": report.left_out.get(track_id)}
         for track_id, verdict in values.pop("verdicts").items()
     }
     values.pop("object_points")
@@ -118,14 +113,14 @@ def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
 
 def describe(report: FusionReport) -> list[str]:
     """What happened, in sentences."""
-    movers = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
+    dynamic = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
     total = max(report.points_in, 1)
     lines = [
         f"{report.sweeps} sweeps, {report.points_in} points: {report.points_colored / total:.0%} coloured, "
-        f"{report.points_hidden / total:.1%} hidden behind nearer surfaces, {report.points_unseen / total:.0%} in no image",
-        f"{len(movers)} of {len(report.verdicts)} tracked boxes move; {report.points_static} points in the static cloud",
+        f"{report.points_hidden / total:.1%} occluded, {report.points_unseen / total:.0%} in no image",
+        f"{len(dynamic)} of {len(report.verdicts)} tracked boxes are dynamic; {report.points_static} points in the static cloud",
     ]
-    lines += [f"mover {track_id} left out: {words}" for track_id, words in report.left_out.items()]
+    lines += [f"dynamic object {track_id} left out: {words}" for track_id, words in report.left_out.items()]
     return lines
 
 

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,7 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path
     }
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
-        log.info(f"ingest: look at {folder.out / sheet.name}")
+        log.info(f"ingest: check {folder.out / sheet.name}")
     folder.finish({**summary, **({} if kind == CITY else _alignment(scene))})
     return folder.path
 
@@ -103,17 +103,13 @@ def _alignment(scene: Scene) -> dict[str, Any]:
     return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What a command line asks for: settings, the log (empty with a list), and the folder to write."""
-
-    config: IngestConfig
-    log: str
-    out: Path
-
-
-def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False) -> Asked:
+def parse_arguments(
+    words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False
+) -> tuple[IngestConfig, str, Path]:
     """Understand ``[FORMAT] LOG [OUT]`` beside ``--out``; with a list, ``[FORMAT] [OUT]``.
+
+    Returns:
+        Settings, the log (empty with a list), and the folder to write.
 
     Raises:
         UsageError: words are missing or too many, or a format is given twice.
@@ -124,7 +120,7 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
     named = len(left) > 0 and left[0] in formats and (len(left) > logs + (out is None) or not Path(left[0]).exists())
     if named:
         if config.format not in ("auto", left[0]):
-            raise UsageError("two formats are given", got=f"{left[0]} and --format {config.format}")
+            raise UsageError("two formats were given", got=f"{left[0]} and --format {config.format}")
         config = replace(config, format=left.pop(0))
     usage = "mudg ingest [FORMAT] LOG OUT, or mudg ingest [FORMAT] --list FILE --out ROOT"
     source = "" if many or not left else left.pop(0)
@@ -134,11 +130,11 @@ def asked(words: Sequence[str], out: Path | None, config: IngestConfig, *, many:
         out = Path(left.pop(0))
     if left:
         if not many and not Path(source).exists() and source != CITY:
-            raise UsageError("there is neither such a format nor such a log", expected=", ".join(formats), got=source)
-        raise UsageError("there are too many words", expected=usage, got=" ".join([source, *left]))
+            raise UsageError("no such format and no such log", expected=", ".join(formats), got=source)
+        raise UsageError("too many arguments", expected=usage, got=" ".join([source, *left]))
     if out is None:
         raise UsageError("no folder to write was given", expected=usage)
-    return Asked(config, source, out)
+    return config, source, out
 
 
 _OF_A_LINE = ("format", "frames", "cameras", "sequence", "poses", "boxes")
@@ -169,31 +165,25 @@ _SCENE = "scene"
 def _kind(config: IngestConfig, source: Path) -> str:
     """Which format ``source`` has, or ``scene``."""
     if config.format not in ("auto", *IMPORTERS):
-        raise UsageError(
-            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format
-        )
+        raise UsageError("there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)),
+            got=config.format)  # fmt: skip
     if not source.exists():
-        raise InputError(
-            "driving log does not exist", where=str(source), expected=f"a folder, a scene zip, or the word {CITY}"
-        )
+        raise InputError("driving log does not exist", where=str(source),
+            expected=f"a folder, a scene zip, or the word {CITY}")  # fmt: skip
     if config.format != "auto":
         return config.format
     if is_scene(source):
         return _SCENE
     for name, looks_like in RECOGNISERS.items():
         if looks_like(source):
-            log.info(f"ingest: {source} looks like {name}")
+            log.info(f"ingest: {source} recognised as {name}")
             return name
     inside = "a file"
     if source.is_dir():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-    raise InputError(
-        "the log's format was not recognised",
-        where=str(source),
-        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
-        got=inside,
-        remedy="give the folder of one drive or sequence, or name the format with --format",
-    )
+    raise InputError("the log's format was not recognised", where=str(source),
+        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}", got=inside,
+        remedy="give the folder of one drive or sequence, or name the format with --format")  # fmt: skip
 
 
 def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:
@@ -286,7 +276,7 @@ def _refuse(config: IngestConfig, names: Sequence[str], what: str, remedy: str) 
 
 def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
     """Copy a scene, every file checked; held-out frames are kept as the scene has them."""
-    _refuse(config, _OF_A_LOG, "a scene is taken as it is", "leave it out")
+    _refuse(config, _OF_A_LOG, "this setting does not apply to a scene, which is copied unchanged", "leave it out")
     scene = read_scene(source)
     with SceneWriter(out, scene.id, scene.source) as writer:
         writer.copy_all_but_frames(scene)

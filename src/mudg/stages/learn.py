@@ -64,7 +64,7 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     """
     if config.compute.tensorboard and importlib.util.find_spec("tensorboard") is None:
         raise ResourceError("TensorBoard is not installed", where="--compute.tensorboard",
-                            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
+            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
@@ -85,7 +85,7 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunD
     opened: list[RunDir] = []
     settings = {name: value for name, value in to_dict(config).items() if name != "compute"}
 
-    def open_it() -> str:
+    def open_run() -> str:
         sources = [from_log.log_source(text) for text in config.data.scenes]
         _refuse_overlap(config, out, sources, overwrite)
         inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
@@ -96,7 +96,7 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunD
             opened[0].reused()
         return "" if opened[0].complete else str(opened[0].path)
 
-    path = ranks.leader_does(open_it)
+    path = ranks.leader_does(open_run)
     if not path:
         return None
     return opened[0] if ranks.leads else RunDir(out, Path(path), _OUTPUT, "", {})
@@ -198,7 +198,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
         average = {name: value.detach().clone() for name, value in trained.state_dict().items()}
     state = TrainingState(trained, optimizer, average)
     if state.resume(out, ranks):
-        log.info(f"learn: continues at step {state.step}")
+        log.info(f"learn: resuming at step {state.step}")
     if ranks.size > 1:
         log.info(f"learn: {ranks.size} processes, {config.compute.parallel}")
     return state, spread
@@ -279,13 +279,7 @@ def _tensorboard(folder: Path) -> Any:
 
 
 def _score_watched(
-    model: Model,
-    weights: dict[str, Tensor],
-    config: LearnConfig,
-    run_dir: RunDir,
-    folder: Path,
-    step: int,
-    bf16: bool,
+    model: Model, weights: dict[str, Tensor], config: LearnConfig, run_dir: RunDir, folder: Path, step: int, bf16: bool
 ) -> None:
     """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
     made = kind_of(model).rebuilt(model, weights)

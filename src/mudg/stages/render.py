@@ -15,8 +15,9 @@ from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
+from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.exporters.video import panels_of, side_by_side, write_mp4
+from mudg.data.exporters.video import write_mp4
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
@@ -69,16 +70,13 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     """
     cameras = config.cameras or tuple(scene.cameras)[:1]
     if not config.shifts_m:
-        raise UsageError("nothing to render: no shifts given", remedy="0 is the recorded drive")
+        raise UsageError("nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path")
     paths = []
     for camera in cameras:
         for shift_m in config.shifts_m:
-            if shift_m == 0 and not config.height_m and not config.yaw_deg:
-                path = trajectory.recorded(scene, camera)
-            else:
-                path = trajectory.shifted(
-                    scene, camera, shift_m, height_m=config.height_m, yaw_rad=math.radians(config.yaw_deg)
-                )
+            path = trajectory.at_shift(
+                scene, camera, shift_m, height_m=config.height_m, yaw_rad=math.radians(config.yaw_deg)
+            )
             paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
     return tuple(paths)
 

@@ -54,6 +54,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         InputError: no such log. UsageError: ``out`` holds a run of other settings or files of something else, or touches what is
             read. Whatever a verb raises.
     """
+    import torch
+
     from mudg import native
     from mudg.report import run_report
 
@@ -61,7 +63,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     if str(source) != CITY and not Path(source).exists():
         raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
     _refuse_overlap(config, source, out)
-    _use_all_threads(native.default_threads())
+    torch.set_num_threads(native.default_threads())
     ledger = _Ledger.open(out, config, str(source), overwrite)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
@@ -83,7 +85,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     page = out / "report.html"
     return {
         "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
-        "text": _closing_words(out, page, ledger),
+        "text": _closing_text(out, page, ledger),
     }  # fmt: skip
 
 
@@ -143,23 +145,18 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
     models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     renders = {name: out / "render" / name for name in models}
 
-    def fitted(name: str) -> Path:
-        settings, observations = (guided, virtual) if name == WITH_DIFFUSION else (plain, None)
-        return fit.run(settings, scene, fused, models[name], observations=observations, overwrite=overwrite)
-
     def fitted_both() -> None:
         """Side by side where there are two cores: they need nothing of each other, and much of a fit uses one core only."""
         threads = native.default_threads()
-        if threads < 2 or not all(overwrite or _unfinished(folder) for folder in models.values()):
-            for name in models:
-                fitted(name)
+        tasks = [
+            Task(name, fit.run, (settings, scene, fused, models[name]), {"observations": views, "overwrite": overwrite})
+            for name, settings, views in ((WITHOUT_DIFFUSION, plain, None), (WITH_DIFFUSION, guided, virtual))
+        ]
+        if threads >= 2 and all(overwrite or _unfinished(folder) for folder in models.values()):
+            run_side_by_side(tasks, threads // 2)
             return
-        inputs = {WITHOUT_DIFFUSION: (plain, None), WITH_DIFFUSION: (guided, virtual)}
-        run_side_by_side(
-            [Task(name, fit.run, (settings, scene, fused, models[name]), {"observations": views, "overwrite": overwrite})
-             for name, (settings, views) in inputs.items()],
-            threads // 2,
-        )  # fmt: skip
+        for task in tasks:
+            task.function(*task.arguments, **task.named)
 
     def rendered(name: str) -> Path:
         return render.run(config.render, scene, models[name], renders[name], overwrite=overwrite)
@@ -200,13 +197,7 @@ def _digests(out: Path) -> dict[str, str]:
     return {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
 
 
-def _use_all_threads(count: int) -> None:
-    import torch
-
-    torch.set_num_threads(count)
-
-
-def _closing_words(out: Path, report: Path, ledger: _Ledger) -> str:
+def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     from mudg.stages import score
 
     rows = "\n".join(f"  {name:<26}{seconds:8.1f} s" for name, seconds in ledger.seconds().items())
@@ -241,10 +232,9 @@ class _Ledger:
                 before = {}
             else:
                 raise UsageError(
-                    "the output folder holds a run of other settings", where=str(out),
+                    "the output folder holds a run with other settings", where=str(out),
                     got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
-                    remedy="choose another --out, or add --overwrite to replace it",
-                )  # fmt: skip
+                    remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
         elif out.exists():
             own = {"scene"} if _is_own_scene(source, out) else set()
             if not out.is_dir() or any(entry.name not in own and not is_temporary(entry.name) for entry in out.iterdir()):
@@ -267,7 +257,7 @@ class _Ledger:
 
     @staticmethod
     def _foreign(out: Path) -> UsageError:
-        return UsageError("the output folder holds files of something else", where=str(out), remedy="choose an empty --out")
+        return UsageError("the output folder holds files that do not belong to this run", where=str(out), remedy="choose an empty --out")
 
     def has_report(self, key: str) -> bool:
         """Whether report.html was made of just this and is unchanged."""

@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -27,6 +24,7 @@ from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, palette, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.processes import computed_ahead
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project
@@ -40,10 +38,11 @@ from mudg.data.observations import (
     read_observations,
 )
 from mudg.data.scene import read_scene
-from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
+from mudg.models.featnets import CodecFeatures, PerceptualDistance
 from mudg.models.mdm import files as mdm_files
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
+from mudg.stages.fitting.perception import lpips_network
 from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, Truth, ViewTruth, apart_m, stored_truth, truth_of
 
 BASELINE: Final = "nearest_fill"
@@ -55,7 +54,6 @@ _OUTPUT: Final = VerbOutput(
 )  # fmt: skip
 _NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
 
-Result = TypeVar("Result")
 Baseline = Callable[[View], Observation]
 PairDistance = Callable[[metrics.Pair], float | None]
 
@@ -167,8 +165,7 @@ def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     if config.perceptual_views:
         found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec))
     if config.lpips_weights:
-        state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
-        network = LpipsFeatures(state, config.lpips_weights)
+        network = lpips_network(config.lpips_weights)
         found["lpips"] = PerceptualDistance(network, network.channel_weights)
     return found
 
@@ -188,10 +185,8 @@ def _trajectories(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]
     }
     names = sorted({name for found in sets.values() for name in found}, key=_order)
     if not names:
-        raise InputError(
-            "none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
-            expected="output of mudg render or mudg synthesize",
-        )  # fmt: skip
+        raise InputError("none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
+            expected="output of mudg render or mudg synthesize")  # fmt: skip
     return [_matched(config, scene, name, {m: found[name] for m, found in sets.items() if name in found}) for name in names]
 
 
@@ -212,7 +207,7 @@ def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Ob
         for method, index in nearest.items():
             distance_m = apart_m(sets[method].views[index], view)
             if distance_m > SAME_PLACE_M:
-                raise InputError("two methods rendered one trajectory from different places",
+                raise InputError("two methods rendered the same trajectory from different positions",
                                  where=f"{name}: {method}, view {index}", got=f"{distance_m:.3f} m apart")  # fmt: skip
             indices[method].append(index)
         camera = scene.cameras.get(view.camera.name, view.camera)
@@ -299,7 +294,8 @@ def _score(
     def measure(number: int) -> MeasuredView:
         return _measured(trajectory, reference, number, {m: {k: sums[m][k] for k in wanted[number]} for m in names})
 
-    with contextlib.ExitStack() as stack:
+    threads = native.threads()
+    with native.one_thread(), contextlib.ExitStack() as stack:
         truths = fills = None
         exact = reference.truth.exact
         if not reference.truth.stored and (exact or all(frame is not None for frame in trajectory.frames)):
@@ -308,7 +304,7 @@ def _score(
             )
         if reference.baseline is not None:
             fills = stack.enter_context(ObservationWriter(out / BASELINE / trajectory.name, trajectory.name, BASELINE))
-        for number, made in enumerate(_computed_ahead(measure, len(trajectory.views))):
+        for number, made in enumerate(computed_ahead(measure, len(trajectory.views), threads)):
             if fills is not None:
                 fills.add(made.seen[BASELINE])
             if made.truth is not None:
@@ -371,34 +367,6 @@ def _contents(truth: ViewTruth, exact: bool) -> set[str]:
     return has
 
 
-def _computed_ahead(compute: Callable[[int], Result], count: int) -> Iterator[Result]:
-    """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads."""
-    threads = native.threads()
-    with _one_thread_each(), ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[Result]] = deque()
-        for number in range(count):
-            waiting.append(pool.submit(compute, number))
-            if len(waiting) > 2 * threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-
-
-@contextlib.contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """While several threads work on a view each, each of them counts as one: threads inside threads only wait for each other."""
-    before = torch.get_num_threads(), native.threads()
-    torch.set_num_threads(1)
-    if native.library() is not None:
-        native.set_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        if native.library() is not None:
-            native.set_threads(before[1])
-
-
 def _values(sums: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str, float | str]:
     """A number per metric, or why there is none: no truth, not produced by the method, not computed by this build."""
     values = metrics.results(sums)
@@ -443,5 +411,4 @@ def _write_error_picture(path: Path, seen: Mapping[str, Observation], true: Obse
     images = [true.rgb, *(resize_rgb(observation.rgb, height, width) for observation in seen.values())]
     errors = [np.zeros((height, width, 3), np.uint8), *(error_image(rgb, true.rgb) for rgb in images[1:])]
     picture = np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])
-    with store.atomic_path(path) as temporary:
-        Image.fromarray(picture).save(temporary, optimize=False, compress_level=1)
+    store.write_image(path, picture, optimize=False, compress_level=1)

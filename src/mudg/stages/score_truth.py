@@ -20,7 +20,10 @@ from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Frame, Observation, Scene, Trajectory, View
+from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_nearest, resize_rgb
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, list_observation_sets, read_observations
@@ -28,6 +31,7 @@ from mudg.data.scene import read_image, read_label, read_points, read_scene
 
 MOVING_FILE: Final = "moving.safetensors"
 SAME_SWEEP_S: Final = 0.05
+MAX_LIDAR_M: Final = 100.0
 SAME_TIME_S: Final = 1e-4
 SAME_PLACE_M: Final = 1e-3
 _OUTPUT: Final = VerbOutput("truth", 1, below("*", (*OBSERVATION_FILES, MOVING_FILE)))
@@ -89,7 +93,7 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
         return folder.reused()
     truth = truth_of(read_scene(scene))
     if not truth.exact:
-        raise InputError("only a generated city has truth at any view", where=str(scene))
+        raise InputError("only a generated city has ground truth at every view", where=str(scene))
     with log.task("truth", sum(map(len, trajectories))) as bar:
         for path in trajectories:
             masks = []
@@ -97,7 +101,7 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
                     if true is None or true.moving is None:
-                        raise InputError("the city has no truth here", where=f"{path.name}, {view.time_s:g} s")
+                        raise InputError("the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s")
                     masks.append(true.moving[0].numpy().astype(np.uint8))
                     if len(masks) <= writer.done:
                         writer.skip(view)  # an interrupted run wrote it
@@ -118,7 +122,7 @@ def stored_truth(folder: Path) -> Truth:
         stored = sets.get(name)
         if stored is None:
             raise InputError(
-                "the folder of truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
+                "the folder of ground truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
             )
         index = min(range(len(stored)), key=lambda i: abs(stored.views[i].time_s - view.time_s))
         there = stored.views[index]
@@ -126,7 +130,7 @@ def stored_truth(folder: Path) -> Truth:
         same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
         if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
             raise InputError(
-                "the stored truth shows another view", where=f"{folder / name}, view {index}",
+                "the stored ground truth shows another view", where=f"{folder / name}, view {index}",
                 expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
                 got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
             )  # fmt: skip
@@ -160,13 +164,10 @@ def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
 
 def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
     """Depth f32[1, H, W] of the sweep taken with this frame (NaN where no point fell), or None without such a sweep."""
-    from mudg.stages.fitting.views import visible_lidar
-
     sweeps = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= SAME_SWEEP_S]
     if not sweeps:
         return None
-    points = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in sweeps]
-    seen = visible_lidar(view, np.concatenate(points).astype(np.float32))
-    depth = torch.full((view.camera.height * view.camera.width,), torch.nan)
-    depth[seen.pixel] = seen.depth_m
-    return depth.reshape(1, view.camera.height, view.camera.width)
+    clouds = [(sweep, read_points(scene, sweep).xyz) for sweep in sweeps]
+    world = np.concatenate([geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]).astype(np.float32)
+    gap_deg = max(largest_beam_gap(xyz) for _, xyz in clouds)
+    return torch.from_numpy(visible_depth(view, world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M))[None]

@@ -10,25 +10,25 @@ OUT/<trajectory>/state/  what an interrupted run needs to continue after the las
 
 from __future__ import annotations
 
-import concurrent.futures
+import functools
 import math
-import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
 from mudg.base import log, palette, store
 from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
+from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
@@ -41,6 +41,7 @@ from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip
 from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of
+from mudg.models.scene.model import SceneModel
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.learning import loading
@@ -51,19 +52,6 @@ SKY = palette.ID["sky"]
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
 _OUTPUT = VerbOutput("synthesize", 1, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
-
-
-@dataclass(frozen=True)
-class Job:
-    """One trajectory to make, in terms that another process understands."""
-
-    config: SynthesizeConfig
-    scene: Path
-    fused: Path
-    out: Path
-    camera: str
-    shift_m: float
-    fitted: Path | None = None
 
 
 def run(
@@ -93,12 +81,13 @@ def run(
     cameras = config.cameras or tuple(loaded.cameras)[:1]
     if not cameras or not config.shifts_m:
         raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
-    jobs = [Job(config, Path(scene), Path(fused), directory.path, c, s, fitted) for c in cameras for s in config.shifts_m]
-    names = [trajectory_of(loaded, job).name for job in jobs]
+    paths = [trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m]
+    names = [path.name for path in paths]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
     choose_bf16(config.precision)
     started = time.monotonic()
+    jobs = [(config, Path(scene), Path(fused), directory.path, path, fitted) for path in paths]
     frames = _run_jobs(jobs, names, config.processes or os.cpu_count() or 1)
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
@@ -106,71 +95,21 @@ def run(
     return directory.path
 
 
-def _run_jobs(jobs: Sequence[Job], names: Sequence[str], processes: int) -> int:
+def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:
     """Make the trajectories, each in one thread, several processes at a time; returns the number of views."""
     processes = min(processes, len(jobs))
+    if processes > 1:
+        log.info_once(f"synthesize: {processes} processes with one thread each")
     made = 0
     with log.task("synthesize", len(jobs)) as bar:
-        if processes == 1:
-            threads = torch.get_num_threads()
-            torch.set_num_threads(1)
-            try:
-                for job, name in zip(jobs, names):
-                    bar.update(name)
-                    made += make_trajectory(job)
-                    bar.advance()
-            finally:
-                torch.set_num_threads(threads)
-            return made
-        log.info_once(f"synthesize: {processes} processes with one thread each")
-        context = multiprocessing.get_context("spawn")
-        with quiet_openmp(), concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
-            futures = {pool.submit(_make_in_process, job): name for job, name in zip(jobs, names)}
-            try:
-                for future in concurrent.futures.as_completed(futures):
-                    made += future.result()
-                    bar.update(futures[future])
-                    bar.advance()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+        for index, views in run_in_processes(make_trajectory, jobs, processes):
+            made += views
+            bar.update(names[index])
+            bar.advance()
     return made
 
 
-class quiet_openmp:
-    """Environment for child processes: one thread, and waiting without spinning."""
-
-    _wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": "1"}
-
-    def __enter__(self) -> None:
-        self._before = {name: os.environ.get(name) for name in self._wanted}
-        os.environ.update(self._wanted)
-
-    def __exit__(self, *_: object) -> None:
-        for name, value in self._before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _make_in_process(job: Job) -> int:
-    from mudg import native
-
-    log.set_quiet(True)
-    torch.set_num_threads(1)
-    native.set_threads(1)
-    return make_trajectory(job)
-
-
 # one trajectory -------------------------------------------------------------------------------------------------------
-
-
-def trajectory_of(scene: Scene, job: Job) -> Trajectory:
-    """The trajectory of a job; a shift of 0 is the recorded path."""
-    if job.shift_m == 0:
-        return trajectory.recorded(scene, job.camera)
-    return trajectory.shifted(scene, job.camera, job.shift_m)
 
 
 def windows(frames: int, window: int, overlap: int) -> list[range]:
@@ -181,7 +120,7 @@ def windows(frames: int, window: int, overlap: int) -> list[range]:
         UsageError: the overlap leaves no new frame per window.
     """
     if overlap >= window:
-        raise UsageError("windows overlap wholly", expected=f"overlap < {window}", got=str(overlap))
+        raise UsageError("the overlap is as long as a window", expected=f"overlap < {window}", got=str(overlap))
     if frames <= window:
         return [range(frames)]
     starts = list(range(0, frames - window, window - overlap)) + [frames - window]
@@ -201,15 +140,15 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
     return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()})
 
 
-def make_trajectory(job: Job) -> int:
+def make_trajectory(
+    config: SynthesizeConfig, scene_path: Path, fused: Path, out: Path, path: Trajectory, fitted: Path | None
+) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one."""
-    config = job.config
-    scene, cloud = read_scene(job.scene), read_fused(job.fused)
-    cloud = cloud if config.given_classes else without_classes(cloud)
-    path = trajectory_of(scene, job)
-    folder = job.out / path.name
+    folder = out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
+    scene, cloud = read_scene(scene_path), read_fused(fused)
+    cloud = cloud if config.given_classes else without_classes(cloud)
     model = loading.load_any(config)
     camera = path.views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
@@ -217,8 +156,8 @@ def make_trajectory(job: Job) -> int:
     fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     recorded = recorded_images(scene, config)
-    renders = None if job.fitted is None else Renders(job.fitted)
-    maker = ViewMaker(model, scene, cloud, recorded, rules, config, renders)
+    beyond = None if fitted is None else functools.partial(rendered_points, load_model(fitted))
+    maker = ViewMaker(model, scene, cloud, recorded, rules, config, beyond)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -249,8 +188,7 @@ def make_trajectory(job: Job) -> int:
             store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
             (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
         if sheet:
-            with store.atomic_path(folder / "overview.png") as temporary:
-                Image.fromarray(np.concatenate(sheet)).save(temporary)
+            store.write_image(folder / "overview.png", np.concatenate(sheet))
         if fits:
             store.write_json(folder / FITS, fits)
         shutil.rmtree(state, ignore_errors=True)
@@ -262,28 +200,16 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     files = sorted(state.glob("[0-9]*.safetensors"))
     if not files:
         return 0, {}
-    arrays = store.read_safetensors(files[-1])
-    return int(files[-1].stem), {m: torch.from_numpy(a.copy()) for m, a in arrays.items()}  # type: ignore[misc]
+    return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
 
 
-class Renders:
-    """What a fitted scene shows at a view, in the form that conditions are made of."""
-
-    def __init__(self, folder: Path) -> None:
-        self._model = load_model(folder)
-        self._raster = RasterConfig(near_m=NEAR_M)
-
-    def observation(self, view: View) -> Observation:
-        """Colour, depth (NaN in the sky and where nothing is) and classes."""
-        return render_view(self._model, view, self._raster)
-
-    def sparse(self, view: View) -> ProjectedPoints:
-        """Everything that is covered and not sky."""
-        seen = self.observation(view)
-        depth = torch.full(seen.rgb.shape[-2:], torch.nan) if seen.depth is None else seen.depth[0]
-        ids = torch.full(depth.shape, palette.UNLABELLED) if seen.semantics is None else seen.semantics
-        valid = torch.isfinite(depth)
-        return ProjectedPoints(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
+def rendered_points(model: SceneModel, view: View) -> ProjectedPoints:
+    """What a fitted scene shows at a view, in the form that conditions are made of: everything that is covered and not sky."""
+    seen = render_view(model, view, RasterConfig(near_m=NEAR_M))
+    depth = torch.full(seen.rgb.shape[-2:], torch.nan) if seen.depth is None else seen.depth[0]
+    ids = torch.full(depth.shape, palette.UNLABELLED) if seen.semantics is None else seen.semantics
+    valid = torch.isfinite(depth)
+    return ProjectedPoints(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
 
 
 class ViewMaker:
@@ -291,13 +217,13 @@ class ViewMaker:
 
     def __init__(
         self, model: loading.DiffusionModel, scene: Scene, cloud: FusedCloud, recorded: Sequence[Photo], rules: ConditionRules,
-        config: SynthesizeConfig, renders: Renders | None = None,
+        config: SynthesizeConfig, beyond: Callable[[View], ProjectedPoints] | None,
     ) -> None:  # fmt: skip
         if not recorded:
-            log.warn("synthesize: no recorded image may be used; holes take the nearest point's colour")
+            log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
         self._rules, self._full_size = rules, config.full_size
-        self._renders = renders
+        self._beyond = beyond
         self._sources: dict[int, WarpSource] = {}
         self._request = loading.request_of(config, choose_bf16(config.precision))
 
@@ -310,9 +236,8 @@ class ViewMaker:
     ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
         condition, fine = build_conditions(
-            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources,
-            None if self._renders is None else self._renders.sparse,
-        )  # fmt: skip
+            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources, self._beyond
+        )
         sample = self._model.sample(condition, replace(self._request, index=number, known=known))
         sky = (sample.semantics == SKY).unsqueeze(1) & ~condition.valid
         made, made_views = replace(sample, depth=torch.where(sky, torch.nan, sample.depth)), condition.views
@@ -321,7 +246,7 @@ class ViewMaker:
             made = enlarge(made, size, None if self._model.points_alone else (condition, fine))
             made_views = tuple(views)
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
-        if self._model.points_alone and not taken_there(views[0], self._recorded):
+        if self._model.points_alone and not recorded_at_pose(views[0], self._recorded):
             usable[0] = False
         trust = made.confidence * usable
         observations = [
@@ -331,7 +256,7 @@ class ViewMaker:
         return sample, condition, observations
 
 
-def taken_there(view: View, recorded: Sequence[Photo]) -> bool:
+def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:
     """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
 
     The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a

@@ -18,7 +18,7 @@ class CityConfig:
     """A driving log through a generated city. The same configuration gives the same world, bit for bit."""
 
     seed: int = 0
-    """Everything is drawn from it."""
+    """Seed of the city; every seed gives another one."""
     n_frames: Annotated[int, Field(ge=1, le=2000)] = 40
     """Frames per camera."""
     rate_hz: Annotated[float, Field(ge=1, le=50)] = 10.0
@@ -28,36 +28,36 @@ class CityConfig:
     height: Annotated[int, Field(ge=16, le=4096)] = 320
     """Height of the images, pixels."""
     cameras: Annotated[tuple[CameraName, ...], Field(min_length=1)] = ("front", "front_left", "front_right")
-    """Which of the three cameras to record."""
+    """Cameras to record, out of these three."""
     hfov_deg: Annotated[float, Field(ge=20, le=120)] = 60.0
-    """Horizontal field of view of every camera."""
+    """Horizontal field of view of every camera, degrees."""
     rig_variation: Annotated[float, Field(ge=0, le=1)] = 0.0
     """0 = the standard rig; 1 = field of view, mounting height and pitch vary from seed to seed."""
     lidar_beams: Annotated[int, Field(ge=1, le=256)] = 64
-    """Rows of the spinning LiDAR."""
+    """Number of beams (rows) of the spinning LiDAR."""
     lidar_azimuth_step_deg: Annotated[float, Field(ge=0.02, le=10)] = 0.2
-    """Angle between two columns."""
+    """Angle between two LiDAR columns, degrees."""
     lidar_lower_deg: Annotated[float, Field(ge=-60, le=0)] = -25.0
-    """Elevation of the lowest beam."""
+    """Elevation of the lowest beam, degrees."""
     lidar_upper_deg: Annotated[float, Field(ge=-10, le=60)] = 15.0
-    """Elevation of the highest beam."""
+    """Elevation of the highest beam, degrees."""
     lidar_range_m: Annotated[float, Field(ge=5, le=400)] = 120.0
-    """Largest range."""
+    """Largest range of the LiDAR, metres."""
     lidar_noise_m: Annotated[float, Field(ge=0, le=1)] = 0.02
-    """Standard deviation of the range."""
+    """Standard deviation of the range, metres."""
     lidar_dropout: Annotated[float, Field(ge=0, le=0.9)] = 0.03
-    """Share of returns that are lost at random; glass and weak returns lose more."""
+    """Share of LiDAR returns lost at random, 0 to 0.9; glass and weak returns lose more."""
     light: LightName = "auto"
-    """Time of day and weather; auto draws one."""
+    """Time of day and weather; auto picks one by seed."""
     style: Literal["auto", "urban", "suburban"] = "auto"
-    """Kind of quarter; auto draws one."""
+    """Kind of neighbourhood; auto picks one by seed."""
     crossing: Literal["auto", "yes", "no"] = "auto"
-    """Whether a street crosses ahead; auto draws it."""
+    """Whether a street crosses ahead; auto picks by seed."""
     traffic: Annotated[float, Field(ge=0, le=2)] = 1.0
     """Density of moving and parked vehicles and of people, 0 = none, 1 = standard, 2 = busy."""
     shift_margin_m: Annotated[float, Field(ge=0, le=5)] = 4.0
-    """Cameras moved sideways by up to this distance, to either side, meet no object at any frame."""
+    """Free space beside the recorded path, metres: a camera shifted laterally by up to this distance never enters an object."""
     supersample: Annotated[int, Field(ge=1, le=4)] = 2
-    """Rays per pixel and axis of the recorded images."""
+    """Rays per pixel along each axis of the recorded images; more gives smoother edges and takes longer."""
     sensor_noise: bool = True
     """Add camera noise to the recorded images."""

@@ -1,4 +1,4 @@
-"""What lines the streets: buildings, gardens, walls, fences, the crossing street and the background. All static."""
+"""Static surroundings of the streets: buildings, gardens, walls, fences, the crossing street and the background."""
 
 from __future__ import annotations
 
@@ -164,15 +164,15 @@ def _crossing_surroundings(f: Furnisher) -> None:
             while a < 120:
                 length = f.uniform(9, 22) if plan.urban else f.uniform(8, 13)
                 b = side * (edge + (f.uniform(0.2, 0.8) if plan.urban else f.uniform(3.5, 6)))
-                x0, y0 = crossing.at(arm * a, b)
-                x1, y1 = crossing.at(arm * (a + length), b)
+                x0, y0 = crossing.to_world(arm * a, b)
+                x1, y1 = crossing.to_world(arm * (a + length), b)
                 _building(f, x0, y0, x1, y1, side * arm, f.uniform(9, 12), plan.urban)
                 if f.chance(0.5):
-                    x, y = crossing.at(arm * (a + 2), side * (crossing.half_width + 0.9))
+                    x, y = crossing.to_world(arm * (a + 2), side * (crossing.half_width + 0.9))
                     f.rows.append(record(rec.TREE, (x, y, KERB_M), 0.0, (1, 1, f.uniform(6, 9)), f.seed(), f.pick(LEAF_COLORS),
                                          (0.13, 0.10, 0.075), (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15)))  # fmt: skip
                 a += length + (0.05 if plan.urban else f.uniform(3, 8))
-        x, y = crossing.at(arm * 125.0, 0.0)  # something closes the view
+        x, y = crossing.to_world(arm * 125.0, 0.0)  # something closes the view
         _block(f, (x, y), crossing.yaw + arm * -math.pi / 2, (40, 12, f.uniform(9, 16)))
     if plan.urban or f.chance(0.3):
         _signals(f)
@@ -220,7 +220,7 @@ def _signals(f: Furnisher) -> None:
         if not crossing.has_arm(arm_side):
             continue
         a = arm_side * (abs(plan.kerb(arm_side)) + crossing.corner * 0.6 + 1.0)
-        x, y = crossing.at(a, arm_side * (crossing.half_width + 0.7))
+        x, y = crossing.to_world(a, arm_side * (crossing.half_width + 0.7))
         if f.blocked(crossing.s, a, 1.0, crossing.half_width + 1.5):
             continue
         facing = crossing.yaw + (0.0 if arm_side > 0 else math.pi)

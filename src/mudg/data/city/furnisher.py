@@ -1,4 +1,4 @@
-"""Collects what stands along the streets and keeps the corridor of the shifted cameras free."""
+"""Collects the static objects along the streets and keeps the corridor of the shifted cameras free."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CLEARANCE_M = 1.0
 
 
 class Furnisher(Draws):
-    """Collects the records of static things; keeps the corridor of the shifted cameras free."""
+    """Collects the records of static objects; keeps the corridor of the shifted cameras free."""
 
     def __init__(self, config: CityConfig, plan: StreetPlan) -> None:
         super().__init__(config.seed, "city furniture")
@@ -55,7 +55,7 @@ class Furnisher(Draws):
         self, kind: int, place: tuple[float, float], turn: float, size: tuple[float, float, float], rgb: Color,
         rgb2: Color = (0.5, 0.5, 0.5), parameters: tuple[float, ...] = (), z: float = KERB_M,
     ) -> None:  # fmt: skip
-        """Add a thing at street coordinates (s, u); ``turn`` is its heading relative to the street."""
+        """Add an object at street coordinates (s, u); ``turn`` is its heading relative to the street."""
         x, y, heading = self.plan.line.point(*place)
         self.rows.append(record(kind, (x, y, z), heading + turn, size, self.seed(), rgb, rgb2, parameters))
 

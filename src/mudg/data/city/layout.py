@@ -27,7 +27,7 @@ class Centreline:
     y: Array
     heading: Array
 
-    def at(self, s: Array | float, u: Array | float) -> tuple[Array, Array, Array]:
+    def to_world(self, s: Array | float, u: Array | float) -> tuple[Array, Array, Array]:
         """World x, y and heading of street coordinates (``u`` metres to the left of the centreline)."""
         x, y = np.interp(s, self.s, self.x), np.interp(s, self.s, self.y)
         heading = np.interp(s, self.s, self.heading)
@@ -62,7 +62,7 @@ class Crossing:
         """Whether the street goes on to the left (+1) or right (-1) of the main street."""
         return self.end > 0 if side > 0 else self.start < 0
 
-    def at(self, a: float, b: float) -> tuple[float, float]:
+    def to_world(self, a: float, b: float) -> tuple[float, float]:
         """World x, y of crossing coordinates."""
         c, n = np.cos(self.yaw), np.sin(self.yaw)
         return self.x + c * a - n * b, self.y + n * a + c * b

@@ -17,11 +17,8 @@ from mudg.data.scene import SceneWriter
 SENSOR = "lidar"
 
 
-def write_city(
-    config: CityConfig, out_dir: Path | str, *, scene_id: str | None = None, test_every: int = 4,
-    jpeg_quality: int | None = None,
-) -> Scene:  # fmt: skip
-    """Generate the log of ``config`` and write it with its exact labels (depth, semantics, sky, dynamic, instance).
+def write_city(config: CityConfig, out_dir: Path | str, *, test_every: int = 4) -> Scene:
+    """Generate the log of ``config`` and write it, as lossless PNG, with its exact labels (depth, semantics, sky, dynamic, instance).
 
     All cores work: the rays of a frame on the native threads, encoding and writing on the writer's. The scene is moved
     into place when it is complete; an interrupted call leaves nothing, and the same call makes the same bytes again.
@@ -29,9 +26,7 @@ def write_city(
     Args:
         config: the city and its log.
         out_dir: destination; must not hold a scene yet.
-        scene_id: name of the scene; None = ``city-<seed>``.
         test_every: hold out every n-th frame of all cameras (n, 2n, ...; never the first); 0 = none.
-        jpeg_quality: None = lossless PNG.
 
     Returns:
         The scene, read back.
@@ -46,7 +41,7 @@ def write_city(
     log.info(f"city {config.seed}: {world.describe()}")
     moving = np.array([0, *(int(posed.moving) for posed in world.objects)], bool)
     split: dict[str, str] = {}
-    with SceneWriter(out_dir, scene_id or f"city-{config.seed}", world.source(), jpeg_quality) as writer:
+    with SceneWriter(out_dir, f"city-{config.seed}", world.source()) as writer:
         for camera in world.cameras().values():
             writer.add_camera(camera)
         writer.set_ego(world.ego_path())

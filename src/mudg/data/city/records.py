@@ -1,17 +1,14 @@
-"""Records: one row of numbers per thing in the city. The native library turns them into shapes and looks."""
+"""Records: one row of numbers per object of the city. The native library makes shapes and materials from them."""
 
 from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mudg.base import seeds
 
 COLUMNS: Final = 28
 
-# kinds of things; the same numbers stand in native/city_world.h
+# kinds of objects; the same numbers stand in native/city_world.h
 BUILDING, TREE, HEDGE, LAMP, SIGN, SIGNAL, WALL, FENCE, POLE, BIN, BENCH = range(1, 12)
 SHELTER, HILL, BUSH, GANTRY, BOLLARD, MOTORBIKE, PLANTER = range(12, 19)
 CAR, VAN, TRUCK, BUS, PEDESTRIAN, CYCLIST = range(50, 56)
@@ -44,7 +41,7 @@ class Draws:
         self.rng = seeds.numpy_rng(seed, 0, purpose)
 
     def seed(self) -> int:
-        """A fresh seed for one thing."""
+        """A new seed for one object."""
         return int(self.rng.integers(1, 1 << 24))
 
     def uniform(self, low: float, high: float) -> float:
@@ -54,8 +51,3 @@ class Draws:
     def chance(self, probability: float) -> bool:
         """True with this probability."""
         return float(self.rng.random()) < probability
-
-
-def to_array(rows: list[list[float]]) -> NDArray[np.float64]:
-    """Rows to f64[N, 28]."""
-    return np.ascontiguousarray(np.array(rows, np.float64).reshape(-1, COLUMNS))

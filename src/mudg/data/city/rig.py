@@ -32,14 +32,18 @@ def ego_from_camera(config: CityConfig) -> dict[str, NDArray[np.float64]]:
     places = {"front": (0.0, 0.0), "front_left": (SIDE_YAW_DEG, 0.35), "front_right": (-SIDE_YAW_DEG, -0.35)}
     # camera axes in a body frame that looks along x: right = -y, down = -z, forward = x
     body_from_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    c, s = math.cos(pitch), math.sin(pitch)
-    nod = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])  # positive pitch looks down
     poses = {}
     for name, (yaw_deg, y) in places.items():
         pose = geometry.yaw_matrix(math.radians(yaw_deg), (x - (0.15 if y else 0.0), y, height))
-        pose[:3, :3] = pose[:3, :3] @ nod @ body_from_camera
+        pose[:3, :3] = pose[:3, :3] @ pitch_rotation(pitch) @ body_from_camera
         poses[name] = pose
     return poses
+
+
+def pitch_rotation(angle_rad: float) -> NDArray[np.float64]:
+    """Rotation f64[3, 3] about y; a positive angle looks down."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 def ego_from_lidar() -> NDArray[np.float64]:

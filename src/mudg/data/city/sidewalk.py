@@ -1,4 +1,4 @@
-"""What stands on the sidewalks: trees, lamps, poles, signs, bins, benches, bollards."""
+"""Objects on the sidewalks: trees, lamps, poles, signs, bins, benches, bollards."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Sidewalk:
         self, kind: int, place: tuple[float, float], across: float, turn: float, size: Size, rgb: Color,
         rgb2: Color = (0.5, 0.5, 0.5), parameters: tuple[float, ...] = (),
     ) -> None:  # fmt: skip
-        """Place a thing of half width ``across`` unless it stands in a crossing or there is no room beside the corridor.
+        """Place an object of half width ``across`` unless it stands in a crossing or there is no room beside the corridor.
 
         ``place``: metres along the street and from the kerb.
         """

@@ -1,4 +1,4 @@
-"""Everything with a pose: moving, waiting and parked vehicles, pedestrians, cyclists; and the recording vehicle."""
+"""Objects with poses: moving, waiting and parked vehicles, pedestrians, cyclists; and the recording vehicle."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from mudg.data.city.config import CityConfig
 from mudg.data.city.furnisher import KERB_M
 from mudg.data.city.layout import StreetPlan
 from mudg.data.city.records import Color, Draws, record
+from mudg.data.city.rig import pitch_rotation
 
 Array = NDArray[np.float64]
 
@@ -60,7 +61,7 @@ def ego_keys(config: CityConfig, plan: StreetPlan) -> tuple[Array, Array]:
     times = np.arange(-margin, (config.n_frames - 1) * per_frame + margin + 1) / (config.rate_hz * per_frame)
     s = plan.ego_s(times)
     wander = rng.uniform(0.05, 0.25) * np.sin(s / rng.uniform(12, 25))
-    x, y, heading = plan.line.at(s, plan.ego_u + wander)
+    x, y, heading = plan.line.to_world(s, plan.ego_u + wander)
     heading = heading + np.gradient(wander, s)
     heading -= np.interp(0.0, times, heading)
     bump = rng.uniform(0.5, 1.0, 3) * np.array([0.012, 0.006, 0.006])
@@ -68,7 +69,7 @@ def ego_keys(config: CityConfig, plan: StreetPlan) -> tuple[Array, Array]:
     poses = np.empty((len(times), 4, 4))
     for i, t in enumerate(times):
         z, pitch, roll = bump * np.sin(rate * t) * np.clip(abs(t) * 2, 0, 1)
-        attitude = _rotation_y(pitch) @ _rotation_x(roll)
+        attitude = pitch_rotation(pitch) @ _rotation_x(roll)
         poses[i] = geometry.yaw_matrix(float(heading[i]), (x[i], y[i], z))
         poses[i, :3, :3] = poses[i, :3, :3] @ attitude
     poses[margin] = np.eye(4)
@@ -78,11 +79,6 @@ def ego_keys(config: CityConfig, plan: StreetPlan) -> tuple[Array, Array]:
 def _rotation_x(a: float) -> Array:
     c, s = math.cos(a), math.sin(a)
     return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-
-
-def _rotation_y(a: float) -> Array:
-    c, s = math.cos(a), math.sin(a)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 class TrafficPlanner(Draws):
@@ -189,8 +185,8 @@ class TrafficPlanner(Draws):
                       tuple(0.4 * c for c in clothes[1]), (swing, float(self.chance(0.3))))  # type: ignore[arg-type]  # fmt: skip
 
     def along_street(self, s: Array, u: Array | float, direction: int, z: float = 0.0) -> Array:
-        """Keys of something that follows the main street; direction -1 = against it."""
-        x, y, heading = self.plan.line.at(s, u)
+        """Keys of an object that follows the main street; direction -1 = against it."""
+        x, y, heading = self.plan.line.to_world(s, u)
         return np.stack([x, y, np.full(len(s), z), heading + (0.0 if direction > 0 else math.pi)], 1)
 
 
@@ -246,7 +242,7 @@ def _lanes(t: TrafficPlanner) -> None:
 
 
 def _follow(points: Array, start: float, speed: float, times: Array) -> Array:
-    """Keys of something that runs along a polyline [n, 2], at ``start`` metres at time 0."""
+    """Keys of an object that follows a polyline [n, 2], at ``start`` metres at time 0."""
     step = np.hypot(*np.diff(points, axis=0).T)
     length = np.concatenate([[0.0], np.cumsum(step)])
     at = np.clip(start + speed * times, 0.0, length[-1] - 1e-3)
@@ -257,9 +253,9 @@ def _follow(points: Array, start: float, speed: float, times: Array) -> Array:
     return np.column_stack([xy, np.zeros(len(times)), np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))])
 
 
-def _bend(p0: Array, p1: Array, p2: Array, count: int = 24) -> Array:
-    """Quadratic curve from p0 to p2 with both tangents through p1."""
-    f = np.linspace(0, 1, count)[:, None]
+def _bend(p0: Array, p1: Array, p2: Array) -> Array:
+    """Quadratic curve from p0 to p2, 24 points, with both tangents through p1."""
+    f = np.linspace(0, 1, 24)[:, None]
     return (1 - f) ** 2 * p0 + 2 * f * (1 - f) * p1 + f**2 * p2
 
 
@@ -274,12 +270,12 @@ def _turning(t: TrafficPlanner) -> None:
         towards_ego = t.chance(0.55) and bool(plan.backward_lanes)
         u = plan.backward_lanes[-1] if towards_ego else plan.forward_lanes[-1]
         b = arm * crossing.half_width * 0.5  # inbound traffic keeps right
-        start = np.array([crossing.at(arm * 60.0, b)])
-        corner = np.array(crossing.at(u, b))
-        inbound = np.array(crossing.at(u + arm * 7.0, b))
+        start = np.array([crossing.to_world(arm * 60.0, b)])
+        corner = np.array(crossing.to_world(u, b))
+        inbound = np.array(crossing.to_world(u + arm * 7.0, b))
         sign = -1 if towards_ego else 1
         s_out = crossing.s + sign * np.arange(7.0, 90.0, 1.0)
-        x, y, _ = plan.line.at(s_out, u)
+        x, y, _ = plan.line.to_world(s_out, u)
         out = np.stack([x, y], 1)
         path = np.concatenate([start, _bend(inbound, corner, out[0]), out[1:]])
         to_bend = float(np.hypot(*(inbound - start[0])))
@@ -300,14 +296,14 @@ def _crossing_traffic(t: TrafficPlanner) -> None:
         for _ in range(2):
             if t.chance(0.6):  # waiting at the line
                 row = t.vehicle(allow_big=False)
-                x, y = crossing.at(arm * (a + row[5] / 2), arm * crossing.half_width * 0.5)
+                x, y = crossing.to_world(arm * (a + row[5] / 2), arm * crossing.half_width * 0.5)
                 yaw = crossing.yaw + (math.pi if arm > 0 else 0.0)
                 t.add(row, np.tile([x, y, 0.0, yaw], (len(t.times), 1)), moving=False)
             a += t.uniform(6, 8)
         speed = t.uniform(4, 8)
         offset = t.uniform(10, 40)
         a_out = arm * (offset + speed * t.times)
-        xy = np.array([crossing.at(float(v), -arm * crossing.half_width * 0.5) for v in a_out])
+        xy = np.array([crossing.to_world(float(v), -arm * crossing.half_width * 0.5) for v in a_out])
         yaw = crossing.yaw + (0.0 if arm > 0 else math.pi)
         if offset + speed * t.times[0] > abs(plan.kerb(arm)):
             t.add(t.vehicle(), np.column_stack([xy, np.zeros(len(xy)), np.full(len(xy), yaw)]))
@@ -386,7 +382,7 @@ def _pedestrians(t: TrafficPlanner) -> None:
             speed, side = t.uniform(1.1, 1.5), 1 if t.chance(0.5) else -1
             u = t.uniform(-1, 1) * 4.0 + side * speed * (t.times - duration / 2)
             s = np.full(len(t.times), start + t.uniform(0.3, length - 0.3))
-            x, y, heading = plan.line.at(s, u)
+            x, y, heading = plan.line.to_world(s, u)
             on_walk = (u > plan.left) | (u < plan.right)
             keys = np.stack([x, y, np.where(on_walk, KERB_M, 0.0), heading + side * math.pi / 2], 1)
             t.add(t.pedestrian(speed), keys, gait=2 * math.pi * speed / 1.45)

@@ -90,9 +90,8 @@ class CityWorld:
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
-        self._handle = CityHandle(
-            rec.to_array(rows), self.plan, _road_numbers(config, self.plan), light, _seed31(config, "city surfaces")
-        )
+        records = np.array(rows, np.float64).reshape(-1, rec.COLUMNS)
+        self._handle = CityHandle(records, self.plan, _road_numbers(config, self.plan), light, _seed31(config, "city surfaces"))
         self._cameras = rig.cameras(config)
         self._mounts = rig.ego_from_camera(config)
         self._ego_path = EgoPath(self._ego_times, self._ego_poses)

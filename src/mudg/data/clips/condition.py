@@ -1,9 +1,9 @@
 """Conditions and training clips for the diffusion model.
 
-`build_condition` turns a fused cloud and recorded images into what the model is given for a path of views:
+`build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
 
 1. the cloud is projected into every view (z-buffer);
-2. far points that shine through gaps between near ones are removed (`remove_shine_through`);
+2. far points that shine through gaps between near ones are removed (`core.visible`, rule `condition`);
 3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
    falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
@@ -28,11 +28,13 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import palette
+from mudg.base import geometry, palette
 from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import seen_pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,31 +114,6 @@ def fill_beyond(measured: ProjectedPoints, other: ProjectedPoints, reach_px: int
     )  # fmt: skip
 
 
-def remove_shine_through(depth: NDArray[np.float32], valid: NDArray[np.bool_], reach_px: int = 3) -> NDArray[np.bool_]:
-    """Valid pixels that are not seen through a gap in a nearer surface, bool[H,W].
-
-    A pixel is dropped when clearly nearer (by 15 % and 0.5 m) measured pixels lie within `reach_px` on two opposite
-    sides of it, left and right or above and below. One-sided neighbours are an ordinary edge and stay.
-    """
-    nearest = np.where(valid, depth, np.inf).astype(np.float32)
-    sides = []
-    for axis in (0, 1):
-        for direction in (1, -1):
-            lowest = np.full_like(nearest, np.inf)
-            for step in range(1, reach_px + 1):
-                moved = np.full_like(nearest, np.inf)
-                source = [slice(None), slice(None)]
-                target = [slice(None), slice(None)]
-                source[axis] = slice(None, -step) if direction > 0 else slice(step, None)
-                target[axis] = slice(step, None) if direction > 0 else slice(None, -step)
-                moved[tuple(target)] = nearest[tuple(source)]
-                lowest = np.minimum(lowest, moved)
-            sides.append(lowest)
-    limit = 0.85 * depth - 0.5
-    through = (np.maximum(sides[0], sides[1]) < limit) | (np.maximum(sides[2], sides[3]) < limit)
-    return valid & ~through
-
-
 def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Row and column of the nearest valid pixel for every pixel; the pixel itself where nothing at all is valid."""
     if not valid.any():
@@ -152,13 +129,13 @@ def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tenso
     Returns x, y f32[K,H,W] in pixels of the other view and z f32[K,H,W] metres (not positive = behind it).
     """
     camera, target = view.camera, other.camera
-    u = (torch.arange(camera.width, dtype=torch.float32) + 0.5 - camera.cx) / camera.fx
-    v = (torch.arange(camera.height, dtype=torch.float32) + 0.5 - camera.cy) / camera.fy
+    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
+    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
     m = torch.from_numpy((other.cam_from_world @ view.world_from_cam).astype(np.float32))
     turned = [m[i, 0] * u[None, :] + m[i, 1] * v[:, None] + m[i, 2] for i in range(3)]
     px, py, pz = (turned[i] * depth + m[i, 3] for i in range(3))
     safe = pz.clamp(min=0.1)
-    return target.fx * px / safe + target.cx, target.fy * py / safe + target.cy, pz
+    return *geometry.pinhole(target.intrinsics, px, py, safe), pz
 
 
 def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> Tensor:
@@ -206,30 +183,6 @@ class WarpSource:
     semantics: Tensor
 
 
-def build_condition(
-    cloud: FusedCloud,
-    tracks: Sequence[Track],
-    views: Sequence[View],
-    recorded: Sequence[Photo],
-    rules: ConditionRules,
-    sources: dict[int, WarpSource] | None = None,
-    beyond: Beyond | None = None,
-) -> Condition:
-    """The model's condition for `views` (any path, any size; resized to the rules' size).
-
-    cloud      fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time
-    recorded   images of any cameras; the ones nearest in time to a view are warped into it; may be empty
-    sources    cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views
-    beyond     what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
-               within `rules.measured_reach_px` as if it were points (not with `published`)
-    Returns colour and depth filled everywhere (zeros with `published`), `valid` where a point was seen and kept,
-    `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as reference the recorded image of the first view's
-    camera that is nearest in time (black if there is none).
-    Raises InputError for an empty list of views.
-    """
-    return build_conditions(cloud, tracks, views, recorded, rules, sources, beyond)[0]
-
-
 def build_conditions(
     cloud: FusedCloud,
     tracks: Sequence[Track],
@@ -239,9 +192,25 @@ def build_conditions(
     sources: dict[int, WarpSource] | None = None,
     beyond: Beyond | None = None,
 ) -> tuple[Condition, Condition]:
-    """As `build_condition`, and the same condition on the fine grid (the same object if there is no finer one)."""
+    """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
+
+    Args:
+        cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
+        recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
+        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views.
+        beyond: what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
+            within `rules.measured_reach_px` as if it were points (not with `published`).
+
+    Returns:
+        Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
+        where a point was seen and kept, `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as
+        reference the recorded image of the first view's camera that is nearest in time (black if there is none).
+
+    Raises:
+        InputError: no views.
+    """
     if not views:
-        raise InputError("a condition needs at least one view", where="clips.build_condition")
+        raise InputError("a condition needs at least one view", where="clips.build_conditions")
     small = [view.resized(rules.width, rules.height) for view in views]
     reference = _reference(small[0], recorded, rules)
     if rules.published:
@@ -272,11 +241,7 @@ def build_conditions(
 
 
 def _condition_of_view(
-    points: DrawnCloud,
-    view: View,
-    recorded: Sequence[Photo],
-    rules: ConditionRules,
-    sources: dict[int, WarpSource],
+    points: DrawnCloud, view: View, recorded: Sequence[Photo], rules: ConditionRules, sources: dict[int, WarpSource]
 ) -> tuple[Tensor, ...]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
     the backdrop u8[1,H,W] of one view, at its size."""
@@ -312,9 +277,8 @@ def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Ten
     if not bool(sparse.valid.any()):
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
     rows, columns = (torch.from_numpy(i.astype(np.int64)) for i in nearest_valid(sparse.valid.numpy()))
-    found = (x[..., rows, columns] for x in (sparse.rgb, sparse.depth, sparse.moving, sparse.semantics))
-    rgb, depth, moving, ids = found
-    return rgb, depth, moving, ids
+    here = (..., rows, columns)
+    return sparse.rgb[here], sparse.depth[here], sparse.moving[here], sparse.semantics[here]
 
 
 def _published_condition(
@@ -341,11 +305,12 @@ def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> 
     nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
     if rules.published and rules.fine_width:
         size = (rules.height, rules.width)
-        return functional.interpolate(_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
-    return _tensor(resize_area(nearest.rgb, rules.width, rules.height))
+        return functional.interpolate(image_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
+    return image_tensor(resize_area(nearest.rgb, rules.width, rules.height))
 
 
-def _tensor(rgb: NDArray[np.uint8]) -> Tensor:
+def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
+    """Image u8[H,W,3] as f32[3,H,W] in [0,1]."""
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
 
 
@@ -354,12 +319,8 @@ def _order_of_images(view: View, recorded: Sequence[Photo], rules: ConditionRule
 
     def rank(number: int) -> tuple[float, bool, float]:
         other = recorded[number].view
-        gap = round(abs(other.time_s - view.time_s) / 0.02)
-        return (
-            gap,
-            other.camera.name != view.camera.name,
-            float(np.linalg.norm(other.center_world - view.center_world)),
-        )
+        distance_m = float(np.linalg.norm(other.center_world - view.center_world))
+        return round(abs(other.time_s - view.time_s) / 0.02), other.camera.name != view.camera.name, distance_m
 
     return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
 
@@ -371,9 +332,8 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
     _, depth, moving, _ = _filled(points.project(view), rules)
-    return WarpSource(
-        view, _tensor(resize_area(recorded.rgb, width, height)), depth, moving, _ids_at(recorded, width, height)
-    )
+    rgb = image_tensor(resize_area(recorded.rgb, width, height))
+    return WarpSource(view, rgb, depth, moving, _ids_at(recorded, width, height))
 
 
 def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
@@ -388,21 +348,17 @@ def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules
     """Project a fused cloud into a view of the condition's resolution (see `ProjectedPoints`)."""
     poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
     config = ProjectConfig(
-        static_splat_px=rules.point_px,
-        object_splat_px=rules.point_px,
-        near_m=rules.near_m,
-        far_m=rules.far_m,
+        static_splat_px=rules.point_px, object_splat_px=rules.point_px, near_m=rules.near_m, far_m=rules.far_m,
         occluder_m=0.0 if rules.published else rules.occluder_m,
-    )
+    )  # fmt: skip
     placed = {name: pose for name, pose in poses.items() if pose is not None}
     seen = project_cloud(cloud, placed, view, config)
     valid = seen.valid[0]
     if not rules.published:
-        valid = torch.from_numpy(remove_shine_through(seen.depth[0].numpy(), valid.numpy()))
+        valid = torch.from_numpy(seen_pixels(seen.depth[0].numpy(), valid.numpy(), HIDING_RULES["condition"]))
     clouds = [cloud.static, *(points for _, points in drawn_objects(cloud, placed))]
     unknown = np.uint8(palette.UNLABELLED)
     ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
     table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
-    return ProjectedPoints(
-        seen.color, seen.depth[0], valid, (seen.index >= len(cloud.static)) & valid, table[seen.index.long()]
-    )
+    moving = (seen.index >= len(cloud.static)) & valid
+    return ProjectedPoints(seen.color, seen.depth[0], valid, moving, table[seen.index.long()])

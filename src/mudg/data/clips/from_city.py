@@ -1,8 +1,8 @@
 """Training clips from generated cities: pure functions of (seed, city number).
 
-One city is a short log (12 frames) seen by the front camera and, sometimes, the two beside it. Its sweeps are fused as
+One city is a short log (12 frames) recorded by the front camera and, sometimes, the two beside it. Its sweeps are fused as
 the `fuse` verb does, the condition is built as `synthesize` does, and the truth comes from the generator at exactly the
-views asked for. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded images
+views of the clip. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded images
 given, as for frames that a log lacks.
 
 What varies from city to city besides the city itself: field of view, mounting height and pitch, number and elevation range
@@ -25,7 +25,7 @@ from mudg.base.types import Clip, Condition, FusedCloud, Photo, View
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
-from mudg.data.clips.condition import ConditionRules, WarpSource, build_condition
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 
 HELD_OUT = 1_000_000
@@ -79,16 +79,14 @@ class CityLog:
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
     """The city's configuration."""
     seed = seeds.key(0 if city >= HELD_OUT else rules.seed, city, "city") & 0x7FFFFFFF
+    plain = CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
     if city >= HELD_OUT:
-        return CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
+        return plain
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < 0.4
-    return CityConfig(
-        seed=seed,
-        n_frames=FRAMES,
+    return replace(
+        plain,
         rate_hz=float(rng.choice([10.0, 10.0, 6.0])),
-        width=rules.width * rules.fine,
-        height=rules.height * rules.fine,
         cameras=("front", "front_left", "front_right") if side_cameras else ("front",),
         hfov_deg=float(rng.uniform(46, 76)),
         rig_variation=1.0,
@@ -118,9 +116,10 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     config = replace(city_config(rules, city), n_frames=frames)
     rng = seeds.numpy_rng(rules.seed, city, "log")
     world = CityWorld(config)
-    truths: dict[str, list[CityTruth]] = {
-        name: [world.render(view, sensor_noise=True) for view in world.frame_views(name)] for name in config.cameras
-    }
+    photos: dict[str, list[Photo]] = {}
+    for name in config.cameras:
+        truths = [(view, world.render(view, sensor_noise=True)) for view in world.frame_views(name)]
+        photos[name] = [Photo(view, truth.rgb_u8, truth.semantics) for view, truth in truths]
     used: Sequence[int] = range(frames)
     jitter_m, jitter_rad = 0.0, 0.0
     if city < HELD_OUT:
@@ -132,18 +131,10 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     for index in used:
         sweep = world.lidar_sweep(index)
         error = geometry.yaw_matrix(float(rng.normal(0, jitter_rad)), rng.normal(0, jitter_m, 3))
-        shots = [
-            Photo(world.frame_views(n)[index], truths[n][index].rgb_u8, truths[n][index].semantics)
-            for n in config.cameras
-        ]
+        shots = [photos[name][index] for name in config.cameras]
         sweeps.append(SweepShots(sweep.time_s, sweep.world_from_lidar @ error, sweep.points, shots))
     cloud, _ = fuse_sweeps(sweeps, world.tracks(), FusionRules(min_object_points=40))
-    recorded = tuple(
-        Photo(view, truth.rgb_u8, truth.semantics)
-        for name in config.cameras
-        for view, truth in zip(world.frame_views(name), truths[name])
-    )
-    return CityLog(world, cloud, recorded)
+    return CityLog(world, cloud, tuple(photo for name in config.cameras for photo in photos[name]))
 
 
 def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> list[Clip]:
@@ -157,22 +148,29 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> l
     tracks = log.world.tracks()
     clips = []
     sources: dict[int, WarpSource] = {}
-    known = _without_every_fourth(log.recorded, rng) if city < HELD_OUT and rng.random() < 0.5 else log.recorded
+    known = log.recorded
+    if city < HELD_OUT and rng.random() < 0.5:  # as in a log whose every fourth moment is held out
+        known = _split_moments(log.recorded, 4, rng)[1]
     for shift_m in shifts_of(rules, city):
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
-        given, cache = (_thinned(log.recorded, rng), {}) if shift_m == 0.0 else (known, sources)
+        given, cache = known, sources
+        if shift_m == 0.0:
+            given, cache = _split_moments(log.recorded, int(rng.integers(2, 5)), rng)[0], {}
         given = log.recorded if rules.published else given  # for the reference only
-        condition = build_condition(log.cloud, tracks, views, given, conditions, cache)
+        condition = build_conditions(log.cloud, tracks, views, given, conditions, cache)[0]
         truths = [log.world.render(view.resized(*size)) for view in views]
         clips.append(replace(clip_from_truth(condition, truths), shift_m=shift_m))
     return clips
 
 
-def _without_every_fourth(recorded: Sequence[Photo], rng: np.random.Generator) -> tuple[Photo, ...]:
-    """As in a log whose every fourth moment is held out."""
-    times = sorted({r.view.time_s for r in recorded})
-    held_out = set(times[int(rng.integers(4)) :: 4])
-    return tuple(r for r in recorded if r.view.time_s not in held_out)
+def _split_moments(
+    recorded: Sequence[Photo], gap: int, rng: np.random.Generator
+) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+    """The images of every ``gap``-th moment, from a random one on, and all others."""
+    times = sorted({photo.view.time_s for photo in recorded})
+    chosen = set(times[int(rng.integers(gap)) :: gap])
+    kept = tuple(photo for photo in recorded if photo.view.time_s in chosen)
+    return kept, tuple(photo for photo in recorded if photo.view.time_s not in chosen)
 
 
 def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
@@ -182,14 +180,6 @@ def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
     if pose is not None:
         moved[:3, 3] += shift_m * ego_left_world(pose)
     return View(view.camera, moved, view.time_s)
-
-
-def _thinned(recorded: Sequence[Photo], rng: np.random.Generator) -> tuple[Photo, ...]:
-    """Every second to fourth moment's images only."""
-    gap = int(rng.integers(2, 5))
-    times = sorted({r.view.time_s for r in recorded})
-    kept = set(times[int(rng.integers(gap)) :: gap])
-    return tuple(r for r in recorded if r.view.time_s in kept)
 
 
 def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
@@ -216,7 +206,7 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     if city >= HELD_OUT or rules.point_colors:
         plain = ConditionRules(rules.width, rules.height, warp=False)
         tracks = log.world.tracks()
-        points = [build_condition(log.cloud, tracks, c.condition.views, (), plain).color for c in clips]
+        points = [build_conditions(log.cloud, tracks, c.condition.views, (), plain)[0].color for c in clips]
         clips = [replace(clip, point_color=color) for clip, color in zip(clips, points)]
     write_shard(folder, city, pack_clips(clips))
     return len(clips)

@@ -5,8 +5,8 @@ A clip is a window of consecutive frames of one camera, seen from where they wer
 * **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured (and the depth labels of
   the scene, where there are such); classes where labels exist and are trusted;
 * **condition**: what `synthesize` would build for these views without their own images. Every view gets only images that
-  are at least some moments away, so that something is left to be done: between one and `farthest` moments, drawn per
-  window. Of the cloud a random share of the points is left out, so that depth is more than copying.
+  are at least some moments away, so that the model has to complete something: between one and `farthest` moments, drawn per
+  window. A random share of the cloud's points is left out, so that depth is more than copying.
 
 The points of the cloud keep the colours that fusing gave them, also where those came from the very image that is the truth;
 so it is in the published system.
@@ -30,14 +30,16 @@ from mudg.base import geometry, palette, seeds, store
 from mudg.base.config import differences
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointCloud, Scene, Sweep, View
-from mudg.core.pictures import resize_area
+from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import project_points
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import seen_pixels
 from mudg.data.clips.condition import (
     ConditionRules,
     WarpSource,
-    build_condition,
+    build_conditions,
+    image_tensor,
     nearest_valid,
-    remove_shine_through,
 )
 from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
@@ -107,8 +109,8 @@ def log_source(text: str) -> LogSource:
         labelled = run / "annotate"
         found = LogSource(labelled if (labelled / "scene.json").is_file() else run / "scene", run / "fuse")
     if not (found.fused / "fuse.json").is_file() or not found.scene.exists():
-        raise InputError("no scene with a fused cloud here", where=text, expected="SCENE=FUSED, or an output folder of mudg run",
-                         remedy="make the cloud with `mudg fuse`")  # fmt: skip
+        raise InputError("no scene with a fused cloud here", where=text,
+            expected="SCENE=FUSED, or an output folder of mudg run", remedy="make the cloud with `mudg fuse`")  # fmt: skip
     return found
 
 
@@ -194,7 +196,7 @@ def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int)
         far = [n for n in images if abs(log.moment[n] - log.moment[place]) >= gap]
         given = {index: sources[n] for index, n in enumerate(far) if n in sources}
         view = images[place].view
-        parts.append(build_condition(cloud, log.scene.tracks, [view], [images[n] for n in far], conditions, given))
+        parts.append(build_conditions(cloud, log.scene.tracks, [view], [images[n] for n in far], conditions, given)[0])
         sources |= {far[index]: source for index, source in given.items()}
     return _stacked(parts), images
 
@@ -202,14 +204,14 @@ def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int)
 def _published_condition(
     log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int
 ) -> tuple[Condition, dict[int, Photo]]:
-    """What the published model is given; no image but the reference, the first frame's own, has a part in it."""
+    """The published model's condition; of the images only the reference is used, the first frame's own."""
     del gap
     rules = log.rules
     images = log.images(log.moment[places[0]], log.moment[places[-1]])
     views = [images[place].view for place in places]
     camera = views[0].camera
     conditions = ConditionRules(rules.width, rules.height, camera.width, camera.height, published=True)
-    return build_condition(cloud, log.scene.tracks, views, [images[places[0]]], conditions), images
+    return build_conditions(cloud, log.scene.tracks, views, [images[places[0]]], conditions)[0], images
 
 
 def _nearest_depth(depth: Tensor, far_m: float = ConditionRules(1, 1).far_m) -> Tensor:
@@ -248,15 +250,13 @@ def _stacked(parts: Sequence[Condition]) -> Condition:
 def _truth(scene: Scene, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """rgb f32[3,H,W], depth f32[1,H,W] metres, where it is known bool[1,H,W], classes i64[H,W], all at the size of `view`."""
     width, height = view.camera.width, view.camera.height
-    rgb = torch.from_numpy(resize_area(recorded.rgb, width, height).copy()).permute(2, 0, 1).float() / 255
-    rows = ((np.arange(height) + 0.5) * recorded.rgb.shape[0] / height).astype(int)[:, None]
-    columns = ((np.arange(width) + 0.5) * recorded.rgb.shape[1] / width).astype(int)[None]
+    rgb = image_tensor(resize_area(recorded.rgb, width, height))
     ids = np.full((height, width), palette.UNLABELLED, np.uint8)
     if recorded.semantics is not None:
-        ids = recorded.semantics[rows, columns]
+        ids = resize_nearest(recorded.semantics, height, width)
     depth, known = _measured(scene, view)
     if "depth" in frame.labels and "depth_confidence" not in frame.labels:  # else a labeller guessed it
-        labelled = read_label(scene, frame, "depth")[rows, columns]
+        labelled = resize_nearest(read_label(scene, frame, "depth"), height, width)
         depth = np.where(~known & np.isfinite(labelled), labelled, depth)
         known = known | np.isfinite(labelled)
     sky = (ids == SKY) & ~known
@@ -280,7 +280,7 @@ def _measured(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np
     places = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in nearest.values()]
     seen = project_points(np.concatenate(places).astype(np.float32), None, view, near_m=1.0, far_m=100.0)
     depth = seen.depth[0].numpy()
-    return depth, remove_shine_through(depth, seen.valid[0].numpy())
+    return depth, seen_pixels(depth, seen.valid[0].numpy(), HIDING_RULES["condition"])
 
 
 # files ----------------------------------------------------------------------------------------------------------------
@@ -330,7 +330,7 @@ def claim_folder(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]
         found = store.read_json(path)
         if found != wanted:
             raise UsageError("the folder holds training clips of other logs or settings", where=str(folder),
-                             got="; ".join(differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
+                got="; ".join(differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
         return
     if folder.is_dir() and any(folder.glob("*.safetensors")):
         raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --data.clips")

@@ -58,36 +58,29 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
         marks = c.valid * FLAG_VALID + warped * FLAG_WARPED + unknown * FLAG_DEPTH_UNKNOWN
         return marks[:, 0].to(torch.uint8).numpy()
 
-    def ids(clip: Clip, far: bool) -> NDArray[np.uint8]:
-        c = clip.condition
-        known = c.backdrop_semantics if far else c.semantics
+    def ids(c: Condition, known: Tensor | None) -> NDArray[np.uint8]:
         return (torch.full_like(c.valid, 255, dtype=torch.uint8) if known is None else known)[:, 0].numpy()
 
-    def lens(clip: Clip) -> NDArray[np.float64]:
-        cameras = [view.camera for view in clip.condition.views]
-        return np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], np.float64)
+    def intrinsics(c: Condition) -> NDArray[np.float64]:
+        return np.array([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in c.views], np.float64)
 
+    conditions = [clip.condition for clip in clips]
     points = [u8(c.point_color) for c in clips if c.point_color is not None]
     return ({"point_color": np.stack(points)} if points else {}) | {
         "rgb": np.stack([u8(c.rgb) for c in clips]),
         "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
         "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
-        "color": np.stack([u8(c.condition.color) for c in clips]),
-        "sparse_depth": np.stack([f16(c.condition.depth) * (c.condition.depth[:, 0] != 0).numpy() for c in clips]),
+        "color": np.stack([u8(c.color) for c in conditions]),
+        "sparse_depth": np.stack([f16(c.depth) * (c.depth[:, 0] != 0).numpy() for c in conditions]),
         "flags": np.stack([flags(c) for c in clips]),
-        "backdrop": np.stack([u8(_backdrop(c)) for c in clips]),
-        "reference": np.stack([u8(c.condition.reference) for c in clips]),
-        "ids": np.stack([ids(c, False) for c in clips]),
-        "backdrop_ids": np.stack([ids(c, True) for c in clips]),
-        "world_from_cam": np.stack([np.stack([v.world_from_cam for v in c.condition.views]) for c in clips]),
-        "intrinsics": np.stack([lens(c) for c in clips]),
+        "backdrop": np.stack([u8(c.color if c.backdrop is None else c.backdrop) for c in conditions]),
+        "reference": np.stack([u8(c.reference) for c in conditions]),
+        "ids": np.stack([ids(c, c.semantics) for c in conditions]),
+        "backdrop_ids": np.stack([ids(c, c.backdrop_semantics) for c in conditions]),
+        "world_from_cam": np.stack([np.stack([v.world_from_cam for v in c.views]) for c in conditions]),
+        "intrinsics": np.stack([intrinsics(c) for c in conditions]),
         "shift_m": np.asarray([c.shift_m for c in clips], np.float32),
     }
-
-
-def _backdrop(clip: Clip) -> Tensor:
-    c = clip.condition
-    return c.color if c.backdrop is None else c.backdrop
 
 
 def write_shard(folder: Path, city: int, arrays: Mapping[str, NDArray[np.generic]]) -> None:
@@ -106,7 +99,7 @@ def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
         return safe_open(str(path), "numpy")
     except (SafetensorError, OSError) as error:
         raise InputError("a shard of training clips is missing or damaged", where=str(path), got=str(error),
-                         remedy="delete it; it is made again") from error  # fmt: skip
+            remedy="delete it; it is made again") from error  # fmt: skip
 
 
 _PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "backdrop", "ids", "backdrop_ids", "world_from_cam",
@@ -161,9 +154,7 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
         return (middle + contrast * (x - middle)).clamp(0, 1)
 
     rgb = curve(clip.rgb, 1.0)
-    varied: dict[str, Tensor] = {
-        name: curve(getattr(given, name), error) for name in ("color", "backdrop", "reference")
-    }
+    varied: dict[str, Tensor] = {n: curve(getattr(given, n), error) for n in ("color", "backdrop", "reference")}
     varied["semantics"], varied["backdrop_semantics"] = _worse_ids(given.semantics, given.backdrop_semantics, rng)
     if rng.random() >= 0.5:
         return replace(clip, rgb=rgb, condition=replace(given, **varied))

@@ -1,10 +1,10 @@
-"""MP4 video (H.264, 4:2:0) through PyAV, and the panels of an observation side by side."""
+"""MP4 video (H.264, 4:2:0) through PyAV."""
 
 from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -14,31 +14,27 @@ import av
 import av.error
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from mudg.base import store
 from mudg.base.errors import InputError, ResourceError
-from mudg.base.types import Observation
-from mudg.core.pictures import class_colors, depth_colors, to_bytes
 
 _H264_ENCODERS = ("libx264", "h264_videotoolbox", "libopenh264")
 _CODECS = ("libx264", "h264", "mpeg4")
 
 
-def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 20) -> Path:
+def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 10.0) -> Path:
     """Encode frames u8[H, W, 3] to ``path`` atomically; odd sizes are padded by one pixel of the edge.
 
     Raises:
         InputError: no frames, or frames of different sizes. ResourceError: no usable encoder, or the disk is full.
     """
     with store.atomic_path(Path(path)) as temporary:
-        _encode(str(temporary), frames, fps, crf)
+        _encode(str(temporary), frames, fps, crf=20)
     return Path(path)
 
 
-def mp4_bytes(
-    frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 27, preset: str = "medium"
-) -> bytes:
+def mp4_bytes(frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int = 27, preset: str = "medium") -> bytes:
     """The same as bytes, for embedding in a page. ``preset``: x264's name for speed against size."""
     buffer = io.BytesIO()
     _encode(buffer, frames, fps, crf, preset)
@@ -73,18 +69,7 @@ def jpeg_bytes(picture: NDArray[np.uint8], quality: int) -> bytes:
     return target.getvalue()
 
 
-def read_mp4(path: Path) -> NDArray[np.uint8]:
-    """All frames of a video, u8[T, H, W, 3]."""
-    try:
-        with av.open(str(path)) as container:
-            return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
-    except (av.error.FFmpegError, ValueError, IndexError) as error:
-        raise InputError("not a readable video", where=str(path), got=str(error)) from error
-
-
-def _encode(
-    target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int, preset: str = "medium"
-) -> None:
+def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int, preset: str = "medium") -> None:
     container = stream = None
     size: tuple[int, ...] = ()
     try:
@@ -131,50 +116,6 @@ def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if height % 2 == 0 and width % 2 == 0:
         return np.ascontiguousarray(frame)
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-# ---- pictures ------------------------------------------------------------------------------------------------------
-
-
-def panels_of(observation: Observation) -> list[NDArray[np.uint8]]:
-    """Colour, depth and semantics of an observation as pictures of one size (those that exist)."""
-    panels = [to_bytes(observation.rgb)]
-    if observation.depth is not None:
-        panels.append(depth_colors(observation.depth[0].cpu().numpy()))
-    if observation.semantics is not None:
-        panels.append(class_colors(observation.semantics.cpu().numpy()))
-    return panels
-
-
-def side_by_side(
-    panels: Sequence[NDArray[np.uint8]], titles: Sequence[str] = (), columns: int = 0, gap_px: int = 2
-) -> NDArray[np.uint8]:
-    """Panels u8[H, W, 3] of one size in a grid (``columns`` per row; 0 = one row), titles drawn in their upper left corner.
-
-    Raises:
-        InputError: no panels, or panels of different sizes.
-    """
-    if not panels or any(panel.shape != panels[0].shape for panel in panels):
-        raise InputError("panels must be of one size, at least one", got=str([panel.shape for panel in panels]))
-    per_row = columns or len(panels)
-    height, width = panels[0].shape[:2]
-    rows = -(-len(panels) // per_row)
-    canvas = np.full((rows * (height + gap_px) - gap_px, per_row * (width + gap_px) - gap_px, 3), 255, np.uint8)
-    for index, panel in enumerate(panels):
-        top, left = (index // per_row) * (height + gap_px), (index % per_row) * (width + gap_px)
-        canvas[top : top + height, left : left + width] = _titled(panel, titles[index]) if index < len(titles) else panel
-    return canvas
-
-
-def _titled(panel: NDArray[np.uint8], title: str) -> NDArray[np.uint8]:
-    if not title:
-        return panel
-    image = Image.fromarray(panel)
-    draw = ImageDraw.Draw(image)
-    left, top, right, bottom = draw.textbbox((4, 2), title)
-    draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill=(0, 0, 0))
-    draw.text((4, 2), title, fill=(255, 255, 255))
-    return np.asarray(image)
 
 
 def video_encoders() -> list[str]:

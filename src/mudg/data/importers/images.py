@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mudg.base import store
+from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera
 from mudg.core.pictures import resize_nearest, shrink_exact
@@ -264,11 +264,10 @@ class _Table:
     def of(cls, target: Camera, camera: Camera, lens: Lens) -> _Table:
         size = (target.height, target.width)
         corner, right, down = np.empty(size, np.int32), np.empty(size, np.uint8), np.empty(size, np.uint8)
-        u = (np.arange(target.width) + 0.5 - target.cx) / target.fx
+        u, rays_v = geometry.pixel_rays(target)
         for top in range(0, target.height, _STRIP_ROWS):
             rows = slice(top, min(top + _STRIP_ROWS, target.height))
-            v = (np.arange(rows.start, rows.stop) + 0.5 - target.cy) / target.fy
-            xy = np.stack(np.broadcast_arrays(u[None], v[:, None]), -1).reshape(-1, 2)
+            xy = np.stack(np.broadcast_arrays(u[None], rays_v[rows, None]), -1).reshape(-1, 2)
             place = lens(xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5
             outside = (place < -0.51) | (place > np.array([camera.width, camera.height]) - 0.49)
             if not np.isfinite(place).all() or outside.any():

@@ -15,28 +15,31 @@ that one is computed here. The noise is the same for every image.
 
 from __future__ import annotations
 
-import abc
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import seeds, shards
+from mudg.base import records, seeds, shards
+from mudg.base.config import STRICT
 from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
 from mudg.models import folders
-from mudg.models.depth.inputs import DepthInput, Prediction
-from mudg.models.depth.marigold import ddim_scheduler
+from mudg.models.depth.inputs import PLAIN, DepthInput, DepthOptions, Prediction
+from mudg.models.depth.marigold import check_steps, ddim_scheduler, working_size
 from mudg.models.folders import CPU, Place
+from mudg.models.published import clip
 
 KIND: Final = "depthlab"
 SCHEMA: Final = 1
@@ -49,10 +52,9 @@ _VISION: Final = (
     "hidden_size", "intermediate_size", "projection_dim", "num_hidden_layers", "num_attention_heads", "num_channels", "image_size",
     "patch_size", "hidden_act", "layer_norm_eps",
 )  # fmt: skip
-_CLIP_MEAN, _CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
 
-@dataclass(frozen=True, slots=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class DepthLabSampling:
     """How depth is denoised; the defaults are those of MuDG's depth ground truth.
 
@@ -63,18 +65,18 @@ class DepthLabSampling:
         normalize_scale: known depth spans -scale..scale; below 1 it leaves room for what is farther.
     """
 
-    processing_px: int = 768
+    processing_px: Annotated[int, Field(ge=8)] = 768
     steps: int = 50
-    strength: float = 0.8
-    normalize_scale: float = 1.0
+    strength: Annotated[float, Field(gt=0, le=1)] = 0.8
+    normalize_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
 
     def __post_init__(self) -> None:
-        if self.processing_px < 8 or not 0 < self.strength <= 1 or not 0 < self.normalize_scale <= 1:
-            raise InputError("sampling of DepthLab is out of range", where="sampling", got=str(self),
-                             expected="processing_px >= 8, 0 < strength <= 1, 0 < normalize_scale <= 1")  # fmt: skip
         if int(self.steps * self.strength) < 1:
-            raise UsageError("too few denoising steps: none is left of them", where="--depth-steps", got=str(self.steps),
-                             expected=f"at least {int(np.ceil(1 / self.strength))}")  # fmt: skip
+            raise UsageError("too few denoising steps: none is left of them", where="--depth-steps",
+                got=str(self.steps), expected=f"at least {int(np.ceil(1 / self.strength))}")  # fmt: skip
+
+
+PUBLISHED_SAMPLING: Final = DepthLabSampling()
 
 
 # --- the networks -----------------------------------------------------------------------------------------------------
@@ -96,7 +98,7 @@ def part_configs(
         raise InputError("a network's description lacks a number", where="DepthLab", expected=str(error)) from error
     if abs(float(vae.get("scaling_factor", LATENT_SCALE)) - LATENT_SCALE) > 1e-9:
         raise InputError("the autoencoder scales its latents otherwise than DepthLab does", where="vae: scaling_factor",
-                         expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))  # fmt: skip
+            expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))  # fmt: skip
     return {
         "denoising_unet": {**plain, "in_channels": 3 * latent},
         "reference_unet": {**plain, "in_channels": latent},
@@ -131,9 +133,8 @@ def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module
             network_class = folders.member(transformers, "CLIPVisionModelWithProjection")
             made[name] = network_class(vision(**configs[name]))
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise InputError(
-            "a network cannot be made as it is described", where=f"DepthLab: {name}", got=str(error)[:300]
-        ) from error
+        raise InputError("a network cannot be made as it is described", where=f"DepthLab: {name}",
+            got=str(error)[:300]) from error  # fmt: skip
     reference: Any = made["reference_unet"]
     reference.conv_norm_out, reference.conv_out = None, nn.Identity()
     return made
@@ -144,9 +145,9 @@ def shapes_of(network: nn.Module) -> dict[str, tuple[int, ...]]:
     return {name: tuple(value.shape) for name, value in network.state_dict().items()}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class DepthLabParts:
-    """The networks, ready to be asked, and the noise schedule of diffusers (DDIM)."""
+    """The networks, ready for use, and the noise schedule of diffusers (DDIM)."""
 
     denoising_unet: Any
     reference_unet: Any
@@ -170,19 +171,15 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
         schedule = dict(described["scheduler"])
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError("the description of a DepthLab model is not whole", where=str(where), got=repr(error)[:200],
-                         remedy="convert the published files again") from error  # fmt: skip
+            remedy="convert the published files again") from error  # fmt: skip
     made = blank_parts(configs)
     for name, network in made.items():
         state = shards.read_shards(folder / name, files[name], remedy="convert the published files again")
-        wanted = shapes_of(network)
-        wrong = sorted(set(wanted) ^ set(state)) or [n for n in wanted if tuple(state[n].shape) != wanted[n]]
-        if wrong:
-            raise InputError("weights do not fit the configuration", where=str(folder / name), got=", ".join(wrong[:6]))
+        shards.check_fit(state, network.state_dict(), folder / name)
         network.load_state_dict({n: value.float() for n, value in state.items()}, assign=True)
         _fill_tables(network, name)
         network.to(device).eval().requires_grad_(False)
-    scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
-    return DepthLabParts(**made, scheduler=ddim_scheduler(scheduler_class, schedule, f"{where}: scheduler"))
+    return DepthLabParts(**made, scheduler=ddim_scheduler(schedule, f"{where}: scheduler"))
 
 
 def _fill_tables(network: nn.Module, part: str) -> None:
@@ -196,47 +193,32 @@ def _fill_tables(network: nn.Module, part: str) -> None:
         setattr(network.get_submodule(owner), short, torch.arange(table.shape[-1]).expand(table.shape).clone())
 
 
-# --- what one U-Net hands to the other --------------------------------------------------------------------------------
+# --- from the reference U-Net to the denoising U-Net ------------------------------------------------------------------
 
 
-class _Kept:
-    """What the self-attention of one block of the reference U-Net has read, [N, L, C]."""
+class _SharedAttention:
+    """A processor of diffusers for one self-attention: the given one, with features passed from one U-Net to the other.
+
+    Without a ``source`` it keeps the block's features [N, L, C]; with one, keys and values also come from the features kept there.
+    """
 
     features: Tensor
 
-
-class _Sharing(abc.ABC):
-    """An attention processor: the given one, told what to read by ``read``."""
-
-    def __init__(self, attend: Any, kept: _Kept) -> None:
-        self._attend, self._kept = attend, kept
+    def __init__(self, attend: Any, source: _SharedAttention | None = None) -> None:
+        self._attend, self._source = attend, source
 
     def __call__(
         self, attn: Any, hidden_states: Tensor, encoder_hidden_states: Tensor | None = None,
         attention_mask: Tensor | None = None, temb: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
-        return self._attend(attn, hidden_states, self.read(hidden_states), attention_mask, temb)
-
-    @abc.abstractmethod
-    def read(self, hidden_states: Tensor) -> Tensor | None:
-        """What keys and values come from; None: from the block's own features."""
-
-
-class _Writing(_Sharing):
-    """In the reference U-Net: keeps what is read, and changes nothing."""
-
-    def read(self, hidden_states: Tensor) -> None:
-        self._kept.features = hidden_states
+        if self._source is None:
+            self.features, context = hidden_states, None
+        else:
+            context = torch.cat([hidden_states, self._source.features.to(hidden_states.dtype)], 1)
+        return self._attend(attn, hidden_states, context, attention_mask, temb)
 
 
-class _Reading(_Sharing):
-    """In the denoising U-Net: reads the kept features beside its own."""
-
-    def read(self, hidden_states: Tensor) -> Tensor:
-        return torch.cat([hidden_states, self._kept.features.to(hidden_states.dtype)], 1)
-
-
-def hand_over(reference_unet: Any, denoising_unet: Any) -> None:
+def share_features(reference_unet: Any, denoising_unet: Any) -> None:
     """Let every self-attention of the denoising U-Net read, beside its own, the features of the same block of the reference U-Net.
 
     From then on a pass of the reference U-Net must come before those of the denoising U-Net, with the same size and batch.
@@ -250,17 +232,17 @@ def hand_over(reference_unet: Any, denoising_unet: Any) -> None:
     )
     if set(writers) != set(readers) or not writers:
         raise InputError("the two U-Nets differ in their self-attentions", where="DepthLab",
-                         got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all")  # fmt: skip
+            got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all")  # fmt: skip
     for name, writer in writers.items():
-        kept = _Kept()
-        writer.set_processor(_Writing(writer.processor, kept))
-        readers[name].set_processor(_Reading(readers[name].processor, kept))
+        source = _SharedAttention(writer.processor)
+        writer.set_processor(source)
+        readers[name].set_processor(_SharedAttention(readers[name].processor, source))
 
 
-# --- what the networks are given --------------------------------------------------------------------------------------
+# --- inputs of the networks -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
     """One image and its known depth at the size of the networks, padded to whole latent cells by the last row and column.
 
@@ -285,14 +267,12 @@ class Prepared:
 
 
 def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: int) -> Prepared:
-    """What the networks are given for an image; ``cell``: pixels per latent cell and side, ``crop_px``: side of CLIP's image.
+    """Inputs of the networks for an image; ``cell``: pixels per latent cell and side, ``crop_px``: side of CLIP's image.
 
     Raises:
         InputError: no depth is known.
     """
-    height, width = given.rgb.shape[:2]
-    longest = max(height, width)
-    size = (max(1, height * sampling.processing_px // longest), max(1, width * sampling.processing_px // longest))
+    size = working_size(given.rgb, sampling.processing_px)
     depth = known_depth(np.where(given.sky, np.float32(np.nan), given.measured), size)
     known = np.isfinite(depth)
     if not known.any():
@@ -340,9 +320,7 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
     high, wide = height * side_px // shorter, width * side_px // shorter
     scaled = resize_bicubic(rgb, wide, high)
     top, left = (high - side_px) // 2, (wide - side_px) // 2
-    cut = torch.from_numpy(scaled[top : top + side_px, left : left + side_px]).permute(2, 0, 1)[None].float() / 255
-    mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (_CLIP_MEAN, _CLIP_DEVIATION))
-    return (cut - mean) / deviation
+    return folders.normalized(scaled[top : top + side_px, left : left + side_px], clip.MEAN, clip.DEVIATION)
 
 
 # --- denoising --------------------------------------------------------------------------------------------------------
@@ -351,22 +329,16 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
 class DepthLab:
     """A DepthLab model ready for use; ``load`` makes one from a converted folder."""
 
-    def __init__(
-        self, parts: DepthLabParts, sampling: DepthLabSampling = DepthLabSampling(), place: Place = CPU
-    ) -> None:
+    def __init__(self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, place: Place = CPU) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
-        most = int(parts.scheduler.config.num_train_timesteps)
-        if sampling.steps > most:
-            raise UsageError(
-                "too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(sampling.steps)
-            )
+        check_steps(parts.scheduler, sampling.steps)
         self._parts, self._sampling, self._place = parts, sampling, place
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
-        hand_over(parts.reference_unet, parts.denoising_unet)
+        share_features(parts.reference_unet, parts.denoising_unet)
 
     @classmethod
-    def load(cls, folder: str | Path, place: Place = CPU, *, steps: int = 0) -> DepthLab:
-        """Read a folder that ``mudg convert`` wrote; ``steps`` 0 = as many as it says.
+    def load(cls, folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthLab:
+        """Read a folder that ``mudg convert`` wrote.
 
         Raises:
             InputError: not such a folder, or not of this version. IntegrityError: a file is missing or altered.
@@ -375,10 +347,11 @@ class DepthLab:
         file = Path(folder) / DESCRIPTION
         described = folders.read_settings(file)
         if described.get("kind") != KIND or described.get("schema") != SCHEMA:
-            raise InputError("not a DepthLab model of this version", where=str(file), expected=f"kind {KIND}, schema {SCHEMA}",
-                             got=f"{described.get('kind')}, {described.get('schema')}",
-                             remedy="convert the published files again")  # fmt: skip
-        sampling = _sampling(described.get("sampling"), steps, str(file))
+            raise InputError("not a DepthLab model of this version", where=str(file),
+                expected=f"kind {KIND}, schema {SCHEMA}", got=f"{described.get('kind')}, {described.get('schema')}",
+                remedy="convert the published files again")  # fmt: skip
+        sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
+        sampling = dataclasses.replace(sampling, steps=options.steps or sampling.steps)
         return cls(read_parts(Path(folder), described, place), sampling, place)
 
     def __call__(self, given: DepthInput) -> Prediction:
@@ -391,8 +364,7 @@ class DepthLab:
         shape = (1, self._parts.vae.config.latent_channels, *(side // self._cell for side in made.image.shape[2:]))
         noise = torch.randn(shape, generator=seeds.torch_generator(0, 0, "depthlab"))
         found = self.predict(made, noise) * (made.high_m - made.low_m) + made.low_m
-        found = functional.interpolate(found, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
-        return Prediction(found[0, 0].clamp(min=0).cpu().numpy(), "depth")
+        return Prediction.resized(found, given, "depth", least=0)
 
     def predict(self, made: Prepared, noise: Tensor) -> Tensor:
         """Depth f32[1, 1, h, w], 0..1 between the least and the greatest known (others go beyond), from noise [1, C, H, W] in cells."""
@@ -429,14 +401,3 @@ class DepthLab:
         with self._place.autocast():
             latent = self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._place.device)).latent_dist.mode()
         return latent.float() * LATENT_SCALE
-
-
-def _sampling(told: object, steps: int, where: str) -> DepthLabSampling:
-    """The sampling that a description tells, with other steps if asked; InputError for another kind of value."""
-    names = {field.name for field in fields(DepthLabSampling)}
-    numbers = isinstance(told, dict) and all(type(value) in (int, float) for value in told.values())
-    if not isinstance(told, dict) or set(told) != names or not numbers:
-        raise InputError("the sampling of a DepthLab model is not described", where=f"{where}: sampling",
-                         expected=", ".join(sorted(names)), got=str(told)[:200])  # fmt: skip
-    return DepthLabSampling(int(told["processing_px"]), steps or int(told["steps"]), float(told["strength"]),
-                    float(told["normalize_scale"]))  # fmt: skip

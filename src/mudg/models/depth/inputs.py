@@ -1,19 +1,22 @@
-"""What every depth network is given and gives."""
+"""Input, options and output of every depth network."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
 
 from mudg.core.align import Space
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthInput:
-    """What a depth network is given for one image.
+    """Input of a depth network for one image.
 
     Args:
         rgb: u8[H, W, 3].
@@ -35,10 +38,16 @@ class Prediction:
     values: NDArray[np.float32]
     space: Space
 
+    @classmethod
+    def resized(cls, values: Tensor, given: DepthInput, space: Space, least: float | None = None) -> Prediction:
+        """From a network's values f32[1, 1, h, w], at the size of the image and at least ``least``."""
+        found = functional.interpolate(values, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
+        return cls((found if least is None else found.clamp(min=least))[0, 0].cpu().numpy(), space)
+
 
 @dataclass(frozen=True, slots=True)
 class DepthOptions:
-    """Numbers for networks that denoise; others do not read them.
+    """Options of networks that denoise; others do not use them.
 
     Args:
         guided: Marigold: LiDAR steers every denoising step, instead of aligning the result only.
@@ -49,4 +58,5 @@ class DepthOptions:
     steps: int = 0
 
 
+PLAIN: Final = DepthOptions()
 DepthNetwork = Callable[[DepthInput], Prediction]

@@ -1,4 +1,4 @@
-"""Depth by a latent diffusion model from a Marigold folder of diffusers, steered by LiDAR if asked.
+"""Depth by a latent diffusion model from a Marigold folder of diffusers, optionally guided by LiDAR.
 
 Ke et al., "Repurposing diffusion-based image generators for monocular depth estimation" (2024): a U-Net denoises the latent of a depth
 map beside the latent of the image; the decoder's mean over three channels, from -1 to 1, is depth up to scale and shift.
@@ -30,7 +30,7 @@ from mudg.base import seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.core.align import AffineFit, Space, fit_affine
 from mudg.models import folders
-from mudg.models.depth.inputs import DepthInput, Prediction
+from mudg.models.depth.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.models.folders import CPU, Place
 
 GUIDED_STEPS: Final = 50
@@ -71,16 +71,14 @@ class Marigold:
         longest_px: int = PROCESSING_PX, place: Place = CPU,
     ) -> None:  # fmt: skip
         """``longest_px``: longest side at which the networks work. Raises: UsageError: more steps than the noise schedule has."""
-        most = int(parts.scheduler.config.num_train_timesteps)
-        if steps > most:
-            raise UsageError("too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(steps))
+        check_steps(parts.scheduler, steps)
         self._parts, self._space, self._steps, self._guided = parts, space, steps, guided
         self._longest_px, self._place = longest_px, place
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
 
     @classmethod
-    def load(cls, folder: str | Path, place: Place = CPU, *, guided: bool = False, steps: int = 0) -> Marigold:
-        """Read the networks of a folder; ``steps`` 0 = as many as it says (50 with guidance).
+    def load(cls, folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> Marigold:
+        """Read the networks of a folder.
 
         Raises:
             ResourceError: a package or the device is missing. InputError: a part is missing or another kind. UsageError: too many steps.
@@ -95,13 +93,13 @@ class Marigold:
         parts = MarigoldParts(
             folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet"),
             folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae"),
-            ddim_scheduler(folders.member(diffusers, "DDIMScheduler"), folders.read_settings(schedule), str(schedule)),
+            ddim_scheduler(folders.read_settings(schedule), str(schedule)),
             empty_text,
         )  # fmt: skip
         space: Space = "disparity" if index.get("prediction_type") == "disparity" else "depth"
-        usual = GUIDED_STEPS if guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
+        usual = GUIDED_STEPS if options.guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
         longest_px = int(index.get("default_processing_resolution") or PROCESSING_PX)
-        return cls(parts, space=space, steps=steps or usual, guided=guided, longest_px=longest_px, place=place)
+        return cls(parts, space=space, steps=options.steps or usual, guided=options.guided, longest_px=longest_px, place=place)
 
     def __call__(self, given: DepthInput) -> Prediction:
         """Depth of one image at the image's size, up to scale and shift (to what is near the LiDAR's with guidance)."""
@@ -113,15 +111,12 @@ class Marigold:
         found = self.predict(
             image, size, noise, _returns(given, self._space, self._place.device) if self._guided else None
         )
-        found = functional.interpolate(found, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
-        return Prediction(found[0, 0].cpu().numpy(), self._space)
+        return Prediction.resized(found, given, self._space)
 
     def _prepared(self, rgb: NDArray[np.uint8]) -> tuple[Tensor, tuple[int, int]]:
         """Image u8[H, W, 3] -> f32[1, 3, h, w] in -1..1 with the last row and column repeated to whole cells; and its unpadded size."""
         image = torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
-        height, width = rgb.shape[:2]
-        longest = max(height, width)
-        size = (max(1, height * self._longest_px // longest), max(1, width * self._longest_px // longest))
+        size = working_size(rgb, self._longest_px)
         image = functional.interpolate(image, size=size, mode="bilinear", antialias=True)
         fill = (0, -size[1] % self._cell, 0, -size[0] % self._cell)
         return functional.pad(image, fill, mode="replicate").to(self._place.device), size
@@ -226,14 +221,31 @@ def _returns(given: DepthInput, space: Space, device: str) -> _Returns | None:
     )
 
 
-def ddim_scheduler(scheduler_class: Any, told: Mapping[str, Any], where: str) -> Any:
-    """The DDIM scheduler of diffusers that a description tells; InputError for another one."""
-    if told.get("_class_name") != "DDIMScheduler" or told.get("prediction_type", "epsilon") not in _PREDICTIONS:
-        raise InputError(
-            "the folder's noise schedule is of another kind", where=where, expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}",
-            got=f"{told.get('_class_name')}, {told.get('prediction_type')}",
-        )  # fmt: skip
-    return scheduler_class.from_config({name: value for name, value in told.items() if not name.startswith("_")})
+def working_size(rgb: NDArray[np.uint8], longest_px: int) -> tuple[int, int]:
+    """Height and width of an image u8[H, W, 3] whose longest side gets ``longest_px`` pixels."""
+    height, width = rgb.shape[:2]
+    return max(1, height * longest_px // max(height, width)), max(1, width * longest_px // max(height, width))
+
+
+def check_steps(scheduler: Any, steps: int) -> None:
+    """UsageError for more denoising steps than the noise schedule has."""
+    most = int(scheduler.config.num_train_timesteps)
+    if steps > most:
+        raise UsageError("too many denoising steps", where="--depth-steps", expected=f"<= {most}", got=str(steps))
+
+
+def ddim_scheduler(settings: Mapping[str, Any], where: str) -> Any:
+    """The DDIM scheduler of diffusers with the settings of a folder.
+
+    Raises:
+        InputError: the settings are of another scheduler. ResourceError: diffusers is missing.
+    """
+    kind, prediction = settings.get("_class_name"), settings.get("prediction_type", "epsilon")
+    if kind != "DDIMScheduler" or prediction not in _PREDICTIONS:
+        raise InputError("the folder's noise schedule is of another kind", where=where, got=f"{kind}, {prediction}",
+            expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}")  # fmt: skip
+    scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
+    return scheduler_class.from_config({name: value for name, value in settings.items() if not name.startswith("_")})
 
 
 _PREDICTIONS: Final = ("v_prediction", "epsilon", "sample")

@@ -7,9 +7,9 @@
 | Marigold (``models.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
 | DepthLab (``models.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
-Whatever comes out is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the
-sky is put at its fixed distance, and the confidence is taken from how far the aligned depth is off at the returns near a pixel.
-Where too few returns are seen, or the network's depth does not fit them, there is no result.
+The result is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the sky gets
+its fixed distance, and the confidence follows from the error of the aligned depth at the returns near a pixel. There is no result
+where too few returns are visible, or where the network's depth does not fit them.
 """
 
 from __future__ import annotations
@@ -32,13 +32,12 @@ from mudg.core.complete import CompletionRules, DenseDepth
 from mudg.core.pictures import resize_bicubic
 from mudg.models import folders
 from mudg.models.depth.depthlab import DepthLab
-from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions, Prediction
+from mudg.models.depth.inputs import PLAIN, DepthInput, DepthNetwork, DepthOptions, Prediction
 from mudg.models.depth.marigold import Marigold
 from mudg.models.folders import CPU, Place
 
 CUE_PX: Final = 256
 """Longest side of the small depth map that PromptDepthAnything is given (its training had 256x192)."""
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _ERROR_SCALE: Final = 0.05
 _SKY_CONFIDENCE: Final = 0.8
 
@@ -48,8 +47,7 @@ _SKY_CONFIDENCE: Final = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """How a folder wants its images: the size that a side shall get, the multiple that both sides shall have, mean and deviation of
-    colours in 0..1."""
+    """Preparation of images as a folder describes it: size in pixels, the multiple of both sides, mean and deviation of colours in 0..1."""
 
     height: int
     width: int
@@ -62,14 +60,14 @@ class Preparation:
     def read(cls, folder: Path, side_px: int, multiple: int) -> Preparation:
         """From ``preprocessor_config.json``; side and multiple where it is silent."""
         file = folder / "preprocessor_config.json"
-        told = folders.read_settings(file) if file.is_file() else {}
-        size = told.get("size") or {}
+        settings = folders.read_settings(file) if file.is_file() else {}
+        size = settings.get("size") or {}
         if not isinstance(size, dict):
             size = {"height": size, "width": size}
         return cls(
-            int(size.get("height", side_px)), int(size.get("width", side_px)), int(told.get("ensure_multiple_of") or multiple),
-            bool(told.get("keep_aspect_ratio", True)), tuple(told.get("image_mean") or _MEAN),
-            tuple(told.get("image_std") or _DEVIATION),
+            int(size.get("height", side_px)), int(size.get("width", side_px)), int(settings.get("ensure_multiple_of") or multiple),
+            bool(settings.get("keep_aspect_ratio", True)), tuple(settings.get("image_mean") or folders.MEAN),
+            tuple(settings.get("image_std") or folders.DEVIATION),
         )  # fmt: skip
 
     def size_for(self, height: int, width: int) -> tuple[int, int]:
@@ -85,10 +83,7 @@ class Preparation:
     def pixels(self, rgb: NDArray[np.uint8]) -> Tensor:
         """Image u8[H, W, 3] -> f32[1, 3, h, w] as the network wants it."""
         height, width = self.size_for(*rgb.shape[:2])
-        scaled = resize_bicubic(rgb, width, height)
-        image = torch.from_numpy(scaled).permute(2, 0, 1)[None].float() / 255
-        mean, deviation = (torch.tensor(numbers)[None, :, None, None] for numbers in (self.mean, self.deviation))
-        return (image - mean) / deviation
+        return folders.normalized(resize_bicubic(rgb, width, height), self.mean, self.deviation)
 
 
 class TransformersDepth:
@@ -107,9 +102,7 @@ class TransformersDepth:
             inputs["prompt_depth"] = lidar_cue(given)
         with torch.inference_mode(), self._place.autocast():
             output = self._network(**{name: value.to(self._place.device) for name, value in inputs.items()})
-        found = output.predicted_depth.float()[:, None]
-        found = functional.interpolate(found, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
-        return Prediction(found[0, 0].cpu().numpy(), self._space)
+        return Prediction.resized(output.predicted_depth.float()[:, None], given, self._space)
 
 
 def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
@@ -124,61 +117,44 @@ def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     if not ground.any():
         raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
     far_m, near_m = (float(np.quantile(given.filled[ground], share)) for share in (0.995, 0.005))
-    whole = np.where(ground, given.filled, np.float32(far_m)).clip(near_m, max(far_m, near_m * 1.01))
-    height, width = whole.shape
+    dense = np.where(ground, given.filled, np.float32(far_m)).clip(near_m, max(far_m, near_m * 1.01))
+    height, width = dense.shape
     scale = min(1.0, longest_px / max(height, width))
     size = (max(1, round(height * scale)), max(1, round(width * scale)))
     small = functional.interpolate(
-        torch.from_numpy(whole.astype(np.float32))[None, None], size=size, mode="nearest-exact"
+        torch.from_numpy(dense.astype(np.float32))[None, None], size=size, mode="nearest-exact"
     )
     if float(small.max() - small.min()) <= 0:
         small[..., 0, 0] *= 1.01  # the network divides by the range
     return small
 
 
-def _with_lidar(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    del options
-    network_class = folders.member(folders.package("transformers"), "PromptDepthAnythingForDepthEstimation")
+def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> TransformersDepth:
+    class_name = "PromptDepthAnythingForDepthEstimation" if with_lidar else "DepthAnythingForDepthEstimation"
+    network_class = folders.member(folders.package("transformers"), class_name)
     network: Any = folders.load_network(network_class, folder, place)
-    preparation = Preparation.read(folder, 756, int(network.config.patch_size))
-    return TransformersDepth(network, preparation, "depth", with_lidar=True, place=place)
-
-
-def _from_image(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    del options
-    network_class = folders.member(folders.package("transformers"), "DepthAnythingForDepthEstimation")
-    network: Any = folders.load_network(network_class, folder, place)
-    preparation = Preparation.read(folder, 518, int(network.config.patch_size))
-    space: Space = "depth" if network.config.depth_estimation_type == "metric" else "disparity"
-    return TransformersDepth(network, preparation, space, with_lidar=False, place=place)
-
-
-def _marigold(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    return Marigold.load(folder, place, guided=options.guided, steps=options.steps)
-
-
-def _depthlab(folder: Path, place: Place, options: DepthOptions) -> DepthNetwork:
-    return DepthLab.load(folder, place, steps=options.steps)
+    preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
+    metric = with_lidar or network.config.depth_estimation_type == "metric"
+    return TransformersDepth(network, preparation, "depth" if metric else "disparity", with_lidar=with_lidar, place=place)
 
 
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
 KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] = {
-    "prompt_depth_anything": _with_lidar,
-    "depth_anything": _from_image,
-    "MarigoldDepthPipeline": _marigold,
-    "MarigoldPipeline": _marigold,
-    "depthlab": _depthlab,
+    "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
+    "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
+    "MarigoldDepthPipeline": Marigold.load,
+    "MarigoldPipeline": Marigold.load,
+    "depthlab": DepthLab.load,
 }
 """``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the ``model.json`` that
 ``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders have the shorter name."""
-PLAIN: Final = DepthOptions()
 _DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_class_name"), ("model.json", "kind"))
 
 
 def kind_of(folder: str | Path) -> str:
-    """Kind of network that a folder says it holds; nothing but its description is read.
+    """Kind of network according to a folder's description; nothing else of it is read.
 
     Raises:
         ResourceError: no such folder, or it has no description. InputError: another kind of network.
@@ -189,13 +165,11 @@ def kind_of(folder: str | Path) -> str:
             kind = str(folders.read_settings(path / name).get(key))
             if kind not in KINDS:
                 raise InputError("the folder holds another kind of network", where=str(path / name),
-                                 expected=", ".join(KINDS), got=kind)  # fmt: skip
+                    expected=", ".join(KINDS), got=kind)  # fmt: skip
             return kind
-    raise ResourceError(
-        "the depth network's weights are missing", where=str(folder) or "--depth-network",
+    raise ResourceError("the depth network's weights are missing", where=str(folder) or "--depth-network",
         expected="a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)",
-        remedy="give the folder of such a network as --depth-network, or leave the flag out",
-    )  # fmt: skip
+        remedy="give the folder of such a network as --depth-network, or leave the flag out")  # fmt: skip
 
 
 def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
@@ -208,7 +182,7 @@ def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOpt
     return KINDS[kind_of(path)](path, place, options)
 
 
-# --- what every network's depth goes through --------------------------------------------------------------------------
+# --- alignment to LiDAR, for every network ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +201,7 @@ def align_to_lidar(prediction: Prediction, given: DepthInput, rules: CompletionR
     """
     if prediction.values.shape != given.measured.shape:
         raise InputError("a network's depth and its image differ in size", where="depth network",
-                         expected=str(given.measured.shape), got=str(prediction.values.shape))  # fmt: skip
+            expected=str(given.measured.shape), got=str(prediction.values.shape))  # fmt: skip
     known = np.isfinite(given.measured) & ~given.sky
     values, measured = prediction.values[known], given.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
@@ -270,5 +244,5 @@ def residual_confidence(
 
 
 def enough_returns(given: DepthInput) -> bool:
-    """Whether there are returns enough in the image to align to."""
+    """Whether the image has enough returns for an alignment."""
     return int((np.isfinite(given.measured) & ~given.sky).sum()) >= MIN_POINTS

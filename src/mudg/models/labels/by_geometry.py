@@ -1,12 +1,12 @@
-"""Labels for images that came without any: what LiDAR, tracked boxes and plain colour can tell, and how sure it is.
+"""Labels from rules on LiDAR, tracked boxes and colour, with a confidence, for images that came without labels.
 
-The rules hold no parameters and needs no download. It starts from dense depth (``core.complete``), knows few classes and says 255
-(unlabelled) where it cannot tell:
+The rules hold no parameters and need no download. They start from dense depth (``core.complete``), know few classes and give 255
+(unlabelled) where they cannot tell:
 
 * **road**: what lies near a ground plane fitted to the LiDAR. Green ground is **terrain**; other ground that the path
   does not reach without a step or a detour (``ground.map_ground``) is **sidewalk**. Far beside the path all of it has less confidence.
 * **car, truck, bus, train, person, rider, ...**: tracked boxes, where the dense surface lies in them.
-* **sky**: bright or blue, smooth, above the horizon, joined to the top of the image, and without LiDAR returns.
+* **sky**: bright or blue, smooth, above the horizon, connected to the top of the image, and without LiDAR returns.
 * **vegetation**: what rises from the ground, or stands above the horizon, and is green.
 * **building**: any other such thing. It means "something static that stands", not architecture.
 """
@@ -21,40 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mudg.base import geometry
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import Track, View
-from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation, visible_depth
-from mudg.core.fusion import points_in_box
+from mudg.base.types import View
+from mudg.core.complete import CompletionRules, beyond_reach, complete_depth, ray_elevation
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.labels.ground import above_plane, beside_path, map_ground
-from mudg.models.labels.inputs import (
-    FLOOR_M,
-    GROWTH_M,
-    TRAIN_ID_OF,
-    LabelInput,
-    Labels,
-    box_outline,
-    far_to_near,
-)
+from mudg.models.labels.inputs import LabelInput, Labels, PlacedBox, far_to_near, surface_points
 
 GROUND_M: Final = 0.2
 """Height above the ground plane up to which a pixel is ground (and a little more far away)."""
-
-
 LANE_M: Final = 2.5
 """Nearer to the path than this, ground beyond a step is still road: the step is an error."""
-
-
-RULES: Final = CompletionRules()
-
-
 NEAR_ROAD_M: Final = 4.0
-
-
+"""Nearer to the path than this, flat ground is almost surely road."""
+RULES: Final = CompletionRules()
 GRASS: Final = 6.0
 """Ground greener than this (``greenness_of``) is terrain."""
-
-
 _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
 
 
@@ -95,14 +78,14 @@ def label_by_geometry(given: LabelInput) -> Labels:
     semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
     confidence[standing] = 0.3
     semantics[sky], confidence[sky] = ID["sky"], 0.8
-    for _, track in far_to_near(given):
-        _paint_box(semantics, confidence, track, given.view, measured, surface)
+    for box in far_to_near(given):
+        _paint_box(semantics, confidence, box, given.view, measured, surface)
     sky &= semantics == ID["sky"]
     return _with_surface(given, semantics, confidence, sky, surface)
 
 
 def label_by_network(given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32]) -> Labels:
-    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, depth and movers from the rest."""
+    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, depth and dynamic objects as by rules."""
     measured = _measure(given)
     sky = (semantics == ID["sky"]) & ~np.isfinite(measured.depth_m)
     return _with_surface(given, semantics, confidence, sky, _complete(given, measured, sky))
@@ -120,7 +103,7 @@ def _with_surface(
 
 def _measure(given: LabelInput) -> _Measured:
     gap_px = max(1.5, float(np.deg2rad(given.beam_gap_deg)) * given.view.camera.fy)
-    depth = visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg)
+    depth = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
     known = np.isfinite(depth)
     away = ndimage.distance_transform_edt(~known) if known.any() else np.full(depth.shape, np.inf)
     return _Measured(depth, np.asarray(away, np.float32), gap_px)
@@ -129,16 +112,12 @@ def _measure(given: LabelInput) -> _Measured:
 def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) -> _Surface:
     """Dense depth of what is not sky, and its points."""
     beyond = beyond_reach(given.view, measured.depth_m, given.highest_rad, gap_deg=given.beam_gap_deg)
-    for _, track in far_to_near(given):  # windows of what is tracked are silent, not far
-        pose = track.pose_at(given.view.time_s)
-        outline = None if pose is None else box_outline(given.view, pose, track.size_m)
+    for box in far_to_near(given):  # the windows of vehicles return nothing, although they are near
+        outline = box.outline(given.view, 0.0)
         if outline is not None:
             beyond &= ~outline
     dense = complete_depth(given.rgb, measured.depth_m, sky, beyond, RULES)
-    rows, columns = np.indices(sky.shape)
-    uv = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], 1)
-    xyz = geometry.unproject(given.view, uv, dense.depth.ravel().astype(np.float64))
-    return _Surface(xyz.reshape(*sky.shape, 3).astype(np.float32), dense.depth, dense.confidence)
+    return _Surface(surface_points(given.view, dense.depth), dense.depth, dense.confidence)
 
 
 def _paint_surface(
@@ -152,7 +131,7 @@ def _paint_surface(
     ground = map_ground(given.xyz_world, given.path_world, given.view.center_world)
     if ground is not None:
         height = above_plane(ground.plane, surface.xyz_world)
-        _, direct, _ = ground.at(surface.xyz_world)
+        _, direct, _ = ground.under(surface.xyz_world)
     flat = known & (np.abs(height) < GROUND_M + 0.005 * surface.depth)
     beside = beside_path(surface.xyz_world, given.path_world, 4)
     green = greenness > GRASS
@@ -168,57 +147,51 @@ def _paint_surface(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BoxPixels:
-    """Pixels of a box: the part of the image around it, its outline in there, and where the surface lies in the box, both
-    bool[h, w]; ``middle_m`` and ``reach_m`` are its depth and half its diagonal."""
+    """Pixels of a box: the part of the image around it; in there its outline, and where the surface lies in the box, both bool[h, w]."""
 
     window: tuple[slice, slice]
     outline: NDArray[np.bool_]
     inside: NDArray[np.bool_]
-    middle_m: float
-    reach_m: float
 
 
-def _box_pixels(track: Track, view: View, surface: _Surface) -> _BoxPixels | None:
-    pose = track.pose_at(view.time_s)
-    outline = None if pose is None else box_outline(view, pose, track.size_m + 2 * GROWTH_M)
-    if pose is None or outline is None:
+def _box_pixels(box: PlacedBox, view: View, surface: _Surface) -> _BoxPixels | None:
+    outline = box.outline(view)
+    if outline is None:
         return None
     window = (_span(outline.any(1), 1), _span(outline.any(0), 1))
     outline = outline[window]
-    at = np.nonzero(outline & np.isfinite(surface.depth[window]))
-    local = geometry.transform_points(geometry.invert(pose), surface.xyz_world[window][at].astype(np.float64))
+    known = outline & np.isfinite(surface.depth[window])
     inside = np.zeros(outline.shape, bool)
-    inside[at] = points_in_box(local, track.size_m, GROWTH_M, FLOOR_M)
-    middle = float((view.cam_from_world @ pose)[2, 3])
-    return _BoxPixels(window, outline, inside, middle, float(np.linalg.norm(track.size_m)) / 2)
+    inside[known] = box.contains(surface.xyz_world[window][known])
+    return _BoxPixels(window, outline, inside)
 
 
 def _paint_box(
-    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], track: Track, view: View, measured: _Measured, surface: _Surface
+    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], box: PlacedBox, view: View, measured: _Measured, surface: _Surface
 ) -> None:  # fmt: skip
     """Paint a tracked box: surely where the surface lies in it, less surely in the rest of its outline; not behind nearer things."""
-    box = _box_pixels(track, view, surface)
-    if box is None:
+    pixels = _box_pixels(box, view, surface)
+    if pixels is None:
         return
-    semantics, confidence, depth = (m[box.window] for m in (semantics, confidence, surface.depth))
-    certain = surface.confidence[box.window]
-    if measured.any and not (box.inside & np.isfinite(measured.depth_m[box.window])).any():
+    semantics, confidence, depth = (m[pixels.window] for m in (semantics, confidence, surface.depth))
+    certain, inside = surface.confidence[pixels.window], pixels.inside
+    if measured.any and not (inside & np.isfinite(measured.depth_m[pixels.window])).any():
         return  # the LiDAR sees around there and nothing is in the box: it is hidden, or empty
-    label = TRAIN_ID_OF[track.label]
-    if not (measured.any and label in _THIN):  # people and bicycles fill little of their boxes
-        guessed = box.outline & ~box.inside & ~(depth < box.middle_m + box.reach_m) & (certain < 0.15)
-        semantics[guessed], confidence[guessed] = label, 0.4
-    semantics[box.inside], confidence[box.inside] = label, (0.5 + 0.4 * certain)[box.inside]
+    if not (measured.any and box.train_id in _THIN):  # people and bicycles fill little of their boxes
+        far_side_m = box.depth_m(view) + float(np.linalg.norm(box.track.size_m)) / 2
+        guessed = pixels.outline & ~inside & ~(depth < far_side_m) & (certain < 0.15)
+        semantics[guessed], confidence[guessed] = box.train_id, 0.4
+    semantics[inside], confidence[inside] = box.train_id, (0.5 + 0.4 * certain)[inside]
 
 
 def find_dynamic(given: LabelInput, semantics: NDArray[np.uint8], surface: _Surface) -> NDArray[np.bool_]:
-    """Pixels of tracked things that move, bool[H, W]: the surface lies in their box, or is unsure and has their class."""
+    """Pixels of dynamic objects, bool[H, W]: the surface lies in their box, or is uncertain and has their class."""
     dynamic = np.zeros(semantics.shape, bool)
-    for number, track in far_to_near(given):
-        box = _box_pixels(track, given.view, surface) if number in given.moving else None
-        if box is not None:
-            unsure = box.outline & ~(surface.confidence[box.window] > 0.3)
-            dynamic[box.window] |= box.inside | (unsure & (semantics[box.window] == TRAIN_ID_OF[track.label]))
+    for box in far_to_near(given):
+        pixels = _box_pixels(box, given.view, surface) if box.number in given.moving else None
+        if pixels is not None:
+            uncertain = pixels.outline & ~(surface.confidence[pixels.window] > 0.3)
+            dynamic[pixels.window] |= pixels.inside | (uncertain & (semantics[pixels.window] == box.train_id))
     return dynamic
 
 
@@ -238,13 +211,13 @@ def greenness_of(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 def find_sky(
     rgb: NDArray[np.uint8], elevation: NDArray[np.float32], away_px: NDArray[np.float32], gap_px: float
 ) -> NDArray[np.bool_]:
-    """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, joined to the top of the image.
+    """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, connected to the top of the image.
 
     Args:
         rgb: u8[H, W, 3].
         elevation: of the rays, radians, f32[H, W].
         away_px: distance to the nearest LiDAR return f32[H, W].
-        gap_px: sky is looked for farther from returns than this, and then grown up to them where it looks the same.
+        gap_px: sky is found farther from returns than this, and then extended up to them where the image looks the same.
     """
     candidates = (elevation > 0) & (away_px > gap_px)
     if not candidates.any():
@@ -254,28 +227,24 @@ def find_sky(
     score = smooth.max(2) + 1.5 * np.clip(blueness, 0, 60)
     threshold = _two_group_threshold(score[candidates])
     rough = ndimage.gaussian_gradient_magnitude(smooth.mean(2), 1.0) > 20
-    looks_so = (score > threshold) & (blueness > -25) & ~rough
-    sky = _at_edges_too(ndimage.binary_opening, candidates & looks_so)
+    sky_like = (score > threshold) & (blueness > -25) & ~rough
+    sky = _morphology(ndimage.binary_opening, candidates & sky_like)
     pieces, _ = ndimage.label(sky)
     top = np.flatnonzero(candidates.any(1))[0]
-    joined = np.unique(pieces[top : top + 3])
+    connected = np.unique(pieces[top : top + 3])
     large = np.flatnonzero(np.bincount(pieces.ravel()) > 0.002 * sky.size)
-    keep = np.union1d(joined, large)
+    keep = np.union1d(connected, large)
     sky = np.isin(pieces, keep[keep > 0])
     if not sky.any():
         return sky
-    sky = _at_edges_too(ndimage.binary_closing, sky) & candidates
+    sky = _morphology(ndimage.binary_closing, sky) & candidates
     free = (elevation > 0) & (away_px > 1.5)
-    return ndimage.binary_dilation(sky, iterations=int(np.ceil(gap_px)) + 1, mask=free & (looks_so | sky))
+    return ndimage.binary_dilation(sky, iterations=int(np.ceil(gap_px)) + 1, mask=free & (sky_like | sky))
 
 
-def _at_edges_too(
-    morphology: Callable[..., NDArray[np.bool_]], mask: NDArray[np.bool_], reach_px: int = 1
-) -> NDArray[np.bool_]:
-    """Opening or closing by a square, the image going on beyond its edges as it ends there."""
-    grown = reach_px + 1
-    padded = morphology(np.pad(mask, grown, mode="edge"), np.ones((3, 3), bool), iterations=reach_px)
-    return padded[grown:-grown, grown:-grown]
+def _morphology(operation: Callable[..., NDArray[np.bool_]], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Opening or closing by 3x3 pixels; beyond its edges the mask continues with its last row and column."""
+    return operation(np.pad(mask, 2, mode="edge"), np.ones((3, 3), bool))[2:-2, 2:-2]
 
 
 def _two_group_threshold(values: NDArray[np.float32]) -> float:

@@ -1,29 +1,28 @@
-"""What LiDAR, calibration, path and boxes tell about each pixel, as planes of numbers for a segmentation network.
+"""Measured facts about each pixel, from LiDAR, calibration, driven path and boxes, as input planes for a segmentation network.
 
-These numbers mean the same in a generated city and in a recorded log, which colours do not: how high a pixel's surface lies above the
-ground, how far away and how far beside the driven path it is, whether a kerb lies between, whether it faces upwards, how rough the
-returns around it are, how far the nearest return is, at which elevation the camera looks, and which tracked boxes it lies in.
+Unlike colours, these numbers mean the same in a generated city and in a recorded log: height above the ground, distance to the camera
+and to the driven path, whether a kerb lies between, surface orientation, roughness of the returns, distance to the nearest return,
+elevation of the ray, and the tracked boxes that contain the pixel.
 
-Depth is filled from the returns at the size of the given view, sky not excepted: where nothing was measured, ``away_deg`` says so.
+Depth is filled from the returns at the size of the given view, also in the sky; ``away_deg`` says how far the nearest return is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mudg.base import geometry
 from mudg.base.palette import ID
-from mudg.base.types import View
-from mudg.core.complete import beyond_reach, complete_depth, ray_elevation, visible_depth
-from mudg.core.fusion import points_in_box
+from mudg.core.complete import beyond_reach, complete_depth, ray_elevation
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.labels.ground import GroundMap, above_plane, beside_path, map_ground
-from mudg.models.labels.inputs import FLOOR_M, GROWTH_M, TRAIN_ID_OF, LabelInput, box_outline, far_to_near
+from mudg.models.labels.inputs import LabelInput, far_to_near, surface_points
 
 BOX_GROUPS: Final[tuple[tuple[str, ...], ...]] = (
     ("car",), ("truck",), ("bus", "train"), ("person",), ("rider", "motorcycle", "bicycle"),
@@ -33,7 +32,7 @@ GROUP_OF: Final[Mapping[int, int]] = {ID[name]: n for n, names in enumerate(BOX_
 """Number of the group of each class that boxes have."""
 PLANES: Final = (
     "height, fine", "height", "log depth", "distance to a return", "upwards", "beside the path", "elevation", "silent", "roughness",
-    "measured at all", "joined to the path", "raised",
+    "measured at all", "reachable from the path", "raised",
 )  # fmt: skip
 """Planes that ``encode`` makes, before one for each of ``BOX_GROUPS``."""
 PLANE_COUNT: Final = len(PLANES) + len(BOX_GROUPS)
@@ -54,7 +53,7 @@ class Evidence:
         upwards: upward part of the surface's normal f32[H, W], 0..1.
         beside_m: horizontal distance to the driven path f32[H, W].
         elevation_rad: of the pixel's ray above the horizontal f32[H, W].
-        joined: bool[H, W], ground that is reached from the driven path without a step.
+        reachable: bool[H, W], ground that is reached from the driven path without a step.
         direct: bool[H, W], and that without much of a detour (not given to the network).
         raised_m: above the lowest ground within 3 m f32[H, W], 0 where it is no ground.
         silent: bool[H, W], the scanner looked, above the road, and nothing came back.
@@ -69,7 +68,7 @@ class Evidence:
     away_deg: NDArray[np.float32]
     upwards: NDArray[np.float32]
     beside_m: NDArray[np.float32]
-    joined: NDArray[np.bool_]
+    reachable: NDArray[np.bool_]
     direct: NDArray[np.bool_]
     raised_m: NDArray[np.float32]
     elevation_rad: NDArray[np.float32]
@@ -79,15 +78,11 @@ class Evidence:
     in_box: NDArray[np.bool_]
     box_labels: NDArray[np.int64]
 
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """All arrays by their names."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
 
 def gather(given: LabelInput) -> Evidence:
     """Facts at every pixel of ``given.view``; works, with less, without returns, path or boxes."""
     view, gap_deg = given.view, given.beam_gap_deg
-    measured = visible_depth(view, given.xyz_world, gap_deg=gap_deg)
+    measured = visible_depth(view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg)
     known = np.isfinite(measured)
     shape = measured.shape
     elevation = ray_elevation(view)
@@ -99,14 +94,14 @@ def gather(given: LabelInput) -> Evidence:
     away_px = np.asarray(ndimage.distance_transform_edt(~known), np.float32)
     beyond = beyond_reach(view, measured, given.highest_rad, gap_deg=gap_deg)
     depth = complete_depth(given.rgb, measured, None, beyond).depth
-    xyz = _points(view, depth)
+    xyz = surface_points(view, depth)
     box, in_box, labels = _boxes(given, xyz, depth, known)
     ground = map_ground(given.xyz_world, given.path_world, view.center_world)
-    joined, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.at(xyz)
+    reachable, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.under(xyz)
     beside = beside_path(xyz, given.path_world, 2) if len(given.path_world) else np.full(shape, NO_PATH_M, np.float32)
     return Evidence(
         _height(ground, xyz), depth, np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32), _upwards(xyz),
-        beside, joined, direct, raised, elevation, beyond,
+        beside, reachable, direct, raised, elevation, beyond,
         _roughness(measured, gap_deg, view.camera.fy), box, in_box, labels,
     )  # fmt: skip
 
@@ -119,24 +114,17 @@ def encode(evidence: Evidence) -> NDArray[np.float32]:
         np.tanh(evidence.height_m / 0.3), np.tanh(evidence.height_m / 4), np.log(depth / 20) / 1.5,
         np.where(known, np.tanh(evidence.away_deg / 1.5), 1), evidence.upwards, np.tanh(evidence.beside_m / 12),
         np.clip(evidence.elevation_rad / 0.4, -2, 2), evidence.silent, np.tanh(evidence.rough / 0.04), known,
-        evidence.joined, np.tanh(evidence.raised_m / 0.15),
+        evidence.reachable, np.tanh(evidence.raised_m / 0.15),
     ]  # fmt: skip
     group = np.full(256, 255)
     group[1 : 1 + len(evidence.box_labels)] = [GROUP_OF[int(label)] for label in evidence.box_labels]
-    at = group[evidence.box]
-    sure = np.where(evidence.in_box, 1, _OUTLINE)
-    planes += [np.where(at == n, sure, 0) for n in range(len(BOX_GROUPS))]
+    group_here = group[evidence.box]
+    certainty = np.where(evidence.in_box, 1, _OUTLINE)
+    planes += [np.where(group_here == n, certainty, 0) for n in range(len(BOX_GROUPS))]
     return np.stack(planes).astype(np.float32)
 
 
 # --- the facts --------------------------------------------------------------------------------------------------------
-
-
-def _points(view: View, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    rows, columns = np.indices(depth.shape)
-    uv = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], 1)
-    xyz = geometry.unproject(view, uv, depth.ravel().astype(np.float64))
-    return xyz.reshape(*depth.shape, 3).astype(np.float32)
 
 
 def _height(ground: GroundMap | None, xyz: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -181,25 +169,20 @@ def _boxes(
     view = given.view
     box, in_box = np.zeros(depth.shape, np.uint8), np.zeros(depth.shape, bool)
     labels: list[int] = []
-    for _, track in far_to_near(given)[-_MAX_BOXES:]:
-        pose = track.pose_at(view.time_s)
-        if pose is None:
-            continue
-        outline = box_outline(view, pose, track.size_m + 2 * GROWTH_M)
+    for placed in far_to_near(given)[-_MAX_BOXES:]:
+        outline = placed.outline(view)
         if outline is None:
             continue
-        middle = float((view.cam_from_world @ pose)[2, 3])
-        reach = float(np.linalg.norm(track.size_m)) / 2
-        seen = np.nonzero(outline & ~(depth < middle - reach))
+        reach = float(np.linalg.norm(placed.track.size_m)) / 2
+        seen = np.nonzero(outline & ~(depth < placed.depth_m(view) - reach))
         if len(seen[0]) == 0:
             continue
         inside = np.zeros(len(seen[0]), bool)
         if xyz is not None:
-            local = geometry.transform_points(geometry.invert(pose), xyz[seen].astype(np.float64))
-            inside = points_in_box(local, track.size_m, GROWTH_M, FLOOR_M)
+            inside = placed.contains(xyz[seen])
             if not known[seen][inside].any():
                 continue
-        labels.append(TRAIN_ID_OF[track.label])
+        labels.append(placed.train_id)
         free = inside | ~in_box[seen]  # what lies in a farther box is not taken by the outline of a nearer one
         box[seen] = np.where(free, len(labels), box[seen])
         in_box[seen] |= inside

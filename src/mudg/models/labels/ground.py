@@ -1,7 +1,7 @@
-"""The ground around a vehicle: the plane it drives on, and which of it can be reached from the driven path without a step.
+"""The ground around a vehicle: its plane, and the part that can be reached from the driven path without a step.
 
-A kerb is a decimetre; nothing else that a scanner measures tells a road from a sidewalk as well, and unlike colour it means the same in
-every town. ``map_ground`` looks for it from above, in cells of ``CELL_M``.
+A kerb of a decimetre separates a road from a sidewalk better than anything else that a scanner measures, and unlike colour it is the
+same in every town. ``map_ground`` finds it from above, in cells of ``CELL_M``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ CELL_M: Final = 0.3
 REACH_M: Final = 45.0
 """The map goes this far from the camera to each side."""
 LOW_M: Final = 0.7
-"""Points farther than this above or below the plane are no ground."""
+"""Points farther above or below the plane than this are not ground."""
 KERB_M: Final = 0.07
 """Heights of neighbouring cells that differ by more than this are a step."""
 _KNOWN_M: Final = 2.5
@@ -36,10 +36,8 @@ _STOOD_M: Final = 0.5
 """A path that goes no farther than this shows no direction."""
 
 
-def fit_ground(
-    xyz_world: NDArray[np.floating], path_world: NDArray[np.float64], reach_m: float = 40.0
-) -> NDArray[np.float64] | None:
-    """Ground plane z = a x + b y + c around the path, f64[3], or None with too few points to tell.
+def fit_ground(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Ground plane z = a x + b y + c within 40 m of the path's middle, f64[3], or None with too few points to tell.
 
     Starts from the lowest returns of 2 m cells (their lower half by height), then least squares on what lies within
     0.5, 0.3 and 0.2 m of the plane. A slope above 20 percent is not believed.
@@ -48,7 +46,7 @@ def fit_ground(
         return None
     xyz = np.asarray(xyz_world, np.float64)
     centre = path_world.mean(0)
-    xyz = xyz[(np.abs(xyz[:, :2] - centre[:2]) < reach_m).all(1)]
+    xyz = xyz[(np.abs(xyz[:, :2] - centre[:2]) < 40.0).all(1)]
     xyz = xyz[:: max(1, len(xyz) // 60_000)]
     cells = np.floor(xyz[:, :2] / 2.0).astype(np.int64)
     key = cells[:, 0] * 1_000_003 + cells[:, 1]
@@ -127,24 +125,24 @@ class GroundMap:
 
     Args:
         corner_m: world x and y, f64[2]. plane: of ``fit_ground``, f64[3].
-        joined: bool[N, N], reached from the driven path over known ground without a step.
+        reachable: bool[N, N], reached from the driven path over known ground without a step.
         direct: bool[N, N], and that without much of a detour: one lowered kerb joins a whole sidewalk, but not directly.
         raised_m: f32[N, N], height above the lowest ground within 3 m, 0 where unknown.
     """
 
     corner_m: NDArray[np.float64]
     plane: NDArray[np.float64]
-    joined: NDArray[np.bool_]
+    reachable: NDArray[np.bool_]
     direct: NDArray[np.bool_]
     raised_m: NDArray[np.float32]
 
-    def at(self, xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-        """``joined``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for what is no ground."""
+    def under(self, xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
+        """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for what is no ground."""
         place = np.floor(np.nan_to_num((xyz_world[..., :2] - self.corner_m) / CELL_M, nan=-1.0)).astype(np.int64)
-        last = len(self.joined) - 1
+        last = len(self.reachable) - 1
         low = (place >= 0).all(-1) & (place <= last).all(-1) & (np.abs(above_plane(self.plane, xyz_world)) < LOW_M)
         i, j = np.moveaxis(np.clip(place, 0, last), -1, 0)
-        return self.joined[i, j] & low, self.direct[i, j] & low, np.where(low, self.raised_m[i, j], np.float32(0))
+        return self.reachable[i, j] & low, self.direct[i, j] & low, np.where(low, self.raised_m[i, j], np.float32(0))
 
 
 def map_ground(
@@ -168,13 +166,13 @@ def map_ground(
     behind = cKDTree(path_world[:, :2]).query(centres, distance_upper_bound=_BLIND_M)[0].reshape(side, side)
     passable = (known & (step < KERB_M)) | ((away_m > 2 * CELL_M) & (behind < _BLIND_M) & (step < KERB_M))
     way_m = _way(passable, beside)
-    joined, direct = np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1]
-    joined, direct = (
-        reached | (_grown(reached) & known) for reached in (joined, direct)
-    )  # a step takes a cell from the road, too
+    # a step takes a cell from the road, too: neighbours of cells that are reached count as reached
+    reachable, direct = (
+        cells | (_dilated(cells) & known) for cells in (np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1])
+    )
     floor = ndimage.minimum_filter(ndimage.uniform_filter(height, 3), 2 * round(_FLOOR_WINDOW_M / CELL_M) + 1)
     raised = np.where(known, np.maximum(height - floor, 0), 0).astype(np.float32)
-    return GroundMap(corner, plane, joined, direct, raised)
+    return GroundMap(corner, plane, reachable, direct, raised)
 
 
 def _way(passable: NDArray[np.bool_], beside_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -187,14 +185,14 @@ def _way(passable: NDArray[np.bool_], beside_m: NDArray[np.float64]) -> NDArray[
     count = idle = 0
     while idle < 2:  # neither four nor eight neighbours bring more
         count += 1
-        grown = _grown(reached, diagonally=count % 2 == 1) & passable
-        new = grown & ~reached
-        way[new], reached = count * CELL_M, grown
+        wider = _dilated(reached, diagonally=count % 2 == 1) & passable
+        new = wider & ~reached
+        way[new], reached = count * CELL_M, wider
         idle = 0 if new.any() else idle + 1
     return way
 
 
-def _grown(mask: NDArray[np.bool_], diagonally: bool = False) -> NDArray[np.bool_]:
+def _dilated(mask: NDArray[np.bool_], diagonally: bool = False) -> NDArray[np.bool_]:
     """A mask and the four, or eight, neighbours of its cells."""
     return np.asarray(ndimage.binary_dilation(mask, ndimage.generate_binary_structure(2, 1 + diagonally)), np.bool_)
 

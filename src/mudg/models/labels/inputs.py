@@ -1,4 +1,4 @@
-"""What every labeller is given and gives, and where tracked boxes lie in an image."""
+"""Input and output of every labeller, and where tracked boxes lie in an image."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import Track, View
+from mudg.core.fusion import points_in_box
 
 TRAIN_ID_OF: Final[Mapping[str, int]] = {
     "car": ID["car"], "van": ID["car"], "vehicle": ID["car"], "misc": ID["car"], "truck": ID["truck"], "bus": ID["bus"],
@@ -20,32 +21,27 @@ TRAIN_ID_OF: Final[Mapping[str, int]] = {
     "motorcyclist": ID["rider"], "bicycle": ID["bicycle"],
 }  # fmt: skip
 """Class of a tracked box by its label; labels not listed here are not painted."""
-
-
 GAP_DEG: Final = 0.6
 """Beams of a turning LiDAR are at most this far apart; between two returns closer than this the surface goes on."""
-
-
 FLOOR_M: Final = 0.1
-
-
+"""Boxes begin this far above their floor."""
 GROWTH_M: Final = 0.15
-"""Boxes begin this far above their floor and are grown by this on each side: annotations are not exact."""
+"""Boxes are enlarged by this on each side: annotations are not exact."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelInput:
-    """What a labeller is given for one image.
+    """Input of a labeller for one image.
 
     Args:
         view: camera and pose.
         rgb: u8[H, W, 3].
-        xyz_world: f32[N, 3] metres: LiDAR returns of static things and of things as they stand at the image's time.
+        xyz_world: f32[N, 3] metres: LiDAR returns of the static scene, and of dynamic objects where they are at the image's time.
         tracks: tracked boxes.
         path_world: f64[M, 3], places of the vehicle (``ground.driven_path``).
         beam_gap_deg: largest angle between neighbouring beams of the LiDAR.
         highest_rad: elevation of its highest beam above the horizontal.
-        moving: numbers of the tracks that move at some time of the log.
+        moving: numbers of the tracks of dynamic objects: those that move at some time of the log.
     """
 
     view: View
@@ -74,15 +70,47 @@ class Labels:
 Labeller = Callable[[LabelInput], Labels]
 
 
-def far_to_near(given: LabelInput) -> list[tuple[int, Track]]:
-    """Tracks with a class that are present, the farthest first, and their numbers."""
+def surface_points(view: View, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Points f32[H, W, 3] in the world, metres, of the pixels of dense depth f32[H, W]; NaN where depth is."""
+    rows, columns = np.indices(depth.shape)
+    uv = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], 1)
+    xyz = geometry.unproject(view, uv, depth.ravel().astype(np.float64))
+    return xyz.reshape(*depth.shape, 3).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedBox:
+    """A tracked box at the time of an image: its number among the tracks, and its pose ``world_from_box`` f64[4, 4]."""
+
+    number: int
+    track: Track
+    world_from_box: NDArray[np.float64]
+
+    @property
+    def train_id(self) -> int:
+        """Class of the box."""
+        return TRAIN_ID_OF[self.track.label]
+
+    def depth_m(self, view: View) -> float:
+        """Camera z of the middle of the box."""
+        return float((view.cam_from_world @ self.world_from_box)[2, 3])
+
+    def outline(self, view: View, growth_m: float = GROWTH_M) -> NDArray[np.bool_] | None:
+        """``box_outline`` of the box, enlarged by ``growth_m`` on each side."""
+        return box_outline(view, self.world_from_box, self.track.size_m + 2 * growth_m)
+
+    def contains(self, xyz_world: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Which points ``[N, 3]`` lie in the enlarged box, above its floor, bool[N]."""
+        local = geometry.transform_points(geometry.invert(self.world_from_box), xyz_world.astype(np.float64))
+        return points_in_box(local, self.track.size_m, GROWTH_M, FLOOR_M)
+
+
+def far_to_near(given: LabelInput) -> list[PlacedBox]:
+    """Boxes that have a class and are present, the farthest first."""
+    poses = (track.pose_at(given.view.time_s) if track.label in TRAIN_ID_OF else None for track in given.tracks)
+    placed = [PlacedBox(n, track, pose) for n, (track, pose) in enumerate(zip(given.tracks, poses)) if pose is not None]
     here = given.view.center_world
-    placed: list[tuple[float, int, Track]] = []
-    for number, track in enumerate(given.tracks):
-        pose = track.pose_at(given.view.time_s) if track.label in TRAIN_ID_OF else None
-        if pose is not None:
-            placed.append((float(np.linalg.norm(pose[:3, 3] - here)), number, track))
-    return [(number, track) for _, number, track in sorted(placed, key=lambda item: -item[0])]
+    return sorted(placed, key=lambda box: -float(np.linalg.norm(box.world_from_box[:3, 3] - here)))
 
 
 def box_outline(

@@ -25,13 +25,9 @@ def _network(weights: str, place: Place) -> Labeller:
     return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
 
 
-def _embedded(weights: str, place: Place) -> Labeller:
-    return StreetLabeller.load(weights, place)
-
-
 LABELLERS: Mapping[str, Callable[[str, Place], Labeller]] = {
     "geometry": lambda *_: label_by_geometry,
-    "embedded": _embedded,
+    "embedded": StreetLabeller.load,
     "network": _network,
 }
 """Name -> what makes a labeller of one image from a folder of weights and a place to compute (unused by those that hold no

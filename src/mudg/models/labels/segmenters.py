@@ -85,27 +85,22 @@ class Segmenter:
         """
         path = folders.find(folder)
         if not folder or not (path / "config.json").is_file():
-            raise ResourceError(
-                "the labeller's weights are missing", where=str(folder) or "weights",
+            raise ResourceError("the labeller's weights are missing", where=str(folder) or "weights",
                 expected="a folder with config.json and model.safetensors",
                 remedy="give the folder of a segmentation network with Cityscapes classes as --weights, or its name in the Hugging Face "
-                "cache, or use --labeller geometry",
-            )  # fmt: skip
+                "cache, or use --labeller geometry")  # fmt: skip
         settings = folders.read_settings(path / "config.json")
         kind = str(settings.get("model_type"))
         if kind not in KINDS:
             raise InputError("the folder holds another kind of network", where=str(path / "config.json"),
-                             expected=", ".join(KINDS), got=kind)  # fmt: skip
+                expected=", ".join(KINDS), got=kind)  # fmt: skip
         train_ids = match_classes(settings.get("id2label", {}), str(path / "config.json"))
         prepared = path / "preprocessor_config.json"
         colors = folders.read_settings(prepared) if prepared.is_file() else {}
         network_class = folders.member(folders.package("transformers"), KINDS[kind].class_name)
         network = folders.load_network(network_class, path, place)
         square_px = int(network.config.image_size) if KINDS[kind].square else 0  # type: ignore[union-attr, arg-type]
-        mean, deviation = (
-            colors.get("image_mean", [0.485, 0.456, 0.406]),
-            colors.get("image_std", [0.229, 0.224, 0.225]),
-        )
+        mean, deviation = colors.get("image_mean", folders.MEAN), colors.get("image_std", folders.DEVIATION)
         return cls(network, kind, train_ids, mean, deviation, square_px, place)
 
     def classes(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -165,8 +160,8 @@ def match_classes(names: Mapping[str, str], where: str) -> NDArray[np.intp]:
     ordered = [names[key] for key in sorted(names, key=int)]
     found = [wanted.get(str(name).replace(" ", "").replace("_", "").lower(), UNLABELLED) for name in ordered]
     if not any(index != UNLABELLED for index in found):
-        raise InputError("none of the network's classes is a Cityscapes class", where=where, expected=", ".join(CLASSES),
-                         got=", ".join(map(str, ordered[:8])) or "no id2label")  # fmt: skip
+        raise InputError("none of the network's classes is a Cityscapes class", where=where,
+            expected=", ".join(CLASSES), got=", ".join(map(str, ordered[:8])) or "no id2label")  # fmt: skip
     return np.array(found, np.intp)
 
 

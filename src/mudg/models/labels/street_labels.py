@@ -1,8 +1,8 @@
 """Labels by the network that comes with the package: ``mudg annotate --labeller embedded``.
 
-The network looks at a picture of at most its own focal length, so that things have the size on it that they had in training, with
-the measured evidence of ``models.labels.evidence`` at the same size. What evidence and colour rules settle is then taken out of
-its hands (``settled``, ``settled_by_color``), and classes are brought to the image's size by their probabilities.
+Images of a longer focal length than in training are made smaller, so that objects have the size they had there; the measured
+evidence of ``models.labels.evidence`` has the same size. Rules then correct what evidence and colour decide (``settled``,
+``settled_by_color``), and the probabilities are resampled to the image's size.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from mudg.models.labels.inputs import GAP_DEG, TRAIN_ID_OF, LabelInput, Labels
 from mudg.models.labels.street_net import StreetNet
 
 RETURN_DEG: Final = 0.12
-"""A pixel nearer than this to a return has a surface: it is no sky."""
+"""A pixel nearer than this to a return shows a surface, not the sky."""
 BELOW_RAD: Final = -0.02
-"""Rays that point lower than this do not meet the sky."""
+"""Rays below this elevation do not meet the sky."""
 ROAD_M: Final = 0.8
-"""What surely lies this high above the ground is no road or sidewalk."""
+"""A surface higher above the ground than this is neither road nor sidewalk."""
 CORRIDOR_M: Final = 1.8
-"""Flat ground this near to the driven path is road: the vehicle went there."""
+"""Flat ground nearer to the driven path than this is road: the vehicle drove there."""
 _FLAT: Final = (ID["road"], ID["sidewalk"])
 _THIN: Final = tuple(ID[name] for name in ("person", "rider", "motorcycle", "bicycle"))
-"""These fill little of their boxes: what a measured surface says counts, not the outline."""
+"""Classes that fill little of their boxes: the measured surface counts, not the outline."""
 _SMALL: Final = 1e-3
-"""What is left of the probability of a class that is ruled out."""
+"""Remaining share of the probability of a class that is ruled out."""
 _RARE: Final = 0.1
-"""And of one that contradicts evidence which is wrong now and then: things that nobody drew a box for."""
+"""Remaining share where the evidence is sometimes wrong: objects that were not given a box."""
 _RARER: Final = 0.02
-"""And where plain rules are better than the network on recorded roads: sunlit lanes look like generated sidewalks, dark crowns of trees
-like what it takes for sky."""
+"""Remaining share where rules are better than the network on recorded roads: sunlit lanes resemble generated sidewalks, and dark
+treetops resemble what the network takes for sky."""
 
 
 class StreetLabeller:
@@ -82,11 +82,11 @@ def reduced(given: LabelInput, focal_px: float) -> LabelInput:
 
 
 def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known: bool = False) -> NDArray[np.float32]:
-    """Probabilities f32[19, H, W] without what the evidence rules out, with sum 1.
+    """Probabilities f32[19, H, W], with sum 1, without the classes that the evidence rules out.
 
     No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface
     lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
-    Ground that is directly joined to the path is road rather than sidewalk; where the log has boxes (``boxes_known``), there is hardly
+    Ground that the path reaches directly is road rather than sidewalk; where the log has boxes (``boxes_known``), there is hardly
     anything outside them that boxes are drawn around.
     """
     found = probabilities.copy()
@@ -118,10 +118,10 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known:
 def settled_by_color(
     probabilities: NDArray[np.float32], rgb: NDArray[np.uint8], evidence: Evidence
 ) -> NDArray[np.float32]:
-    """Probabilities f32[19, H, W] without what the image u8[H, W, 3] speaks against, with sum 1.
+    """Probabilities f32[19, H, W], with sum 1, without the classes that the colours of the image u8[H, W, 3] contradict.
 
     Hardly any sky where the image does not look like it (``labellers.find_sky``: bright or blue, smooth), unless nothing in it does,
-    as at night. Ground that is directly joined to the path and not green is road rather than terrain.
+    as at night. Ground that the path reaches directly and that is not green is road rather than terrain.
     """
     found = probabilities.copy()
     px_per_deg = 1 / max(1e-6, float(np.rad2deg(np.abs(np.diff(evidence.elevation_rad, axis=0)).max(initial=0))))

@@ -1,4 +1,4 @@
-"""A small network that tells the Cityscapes classes of a street from colour and measured evidence.
+"""A small segmentation network: Cityscapes classes of a street from colour and measured evidence.
 
 An encoder and decoder with skips at strides 2 to 32. Colour and the planes of ``models.labels.evidence`` enter together as cells of
 2x2 pixels, and the scores of a cell's four pixels leave together: nothing is computed at full size, and nothing of it is lost.
@@ -7,18 +7,21 @@ An encoder and decoder with skips at strides 2 to 32. Colour and the planes of `
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import store
-from mudg.base.errors import InputError, IntegrityError, ResourceError
+from mudg.base import records, shards, store
+from mudg.base.config import STRICT
+from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES
 from mudg.models.labels.evidence import PLANE_COUNT
 
@@ -29,23 +32,26 @@ EMBEDDED: Final = Path(__file__).resolve().parents[2] / "assets" / "segmenter_sm
 STRIDE: Final = 32
 RGB_MEAN: Final = 0.42
 RGB_SCALE: Final = 0.25
+Width = Annotated[int, Field(ge=1, le=1024, multiple_of=8)]
+BlockCount = Annotated[int, Field(ge=1, le=1024)]
+Positive = Annotated[float, Field(gt=0, lt=1e5)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class StreetNetConfig:
     """Shape of the network, the largest focal length it was trained at, and what its scores are divided by.
 
     Args:
         widths: channels at strides 2, 4, 8, 16 and 32.
         blocks: residual blocks there, on the way down.
-        focal_px: images of a longer focal length are made smaller before they are looked at.
+        focal_px: images of a longer focal length are made smaller first.
         temperature: scores are divided by this, so that probabilities tell how often the class is right.
     """
 
-    widths: tuple[int, ...] = (32, 64, 96, 144, 144)
-    blocks: tuple[int, ...] = (1, 2, 2, 2, 1)
-    focal_px: float = 480.0
-    temperature: float = 1.0
+    widths: tuple[Width, Width, Width, Width, Width] = (32, 64, 96, 144, 144)
+    blocks: tuple[BlockCount, BlockCount, BlockCount, BlockCount, BlockCount] = (1, 2, 2, 2, 1)
+    focal_px: Positive = 480.0
+    temperature: Positive = 1.0
 
 
 class _Block(nn.Module):
@@ -131,22 +137,12 @@ def load(folder: Path | str = EMBEDDED) -> StreetNet:
     where = _described(folder)
     content = store.parse_json(store.read_bytes(where), str(where))
     if not isinstance(content, dict) or content.get("schema") != 1 or content.get("kind") != "street_net":
-        raise InputError(
-            "not a segmentation network of this package", where=str(where), expected="kind street_net, schema 1"
-        )
-    net = StreetNet(_config(content.get("config"), str(where)))
-    file = where.parent / WEIGHTS_FILE
-    digest = dict(content.get("files", {})).get(WEIGHTS_FILE)
-    if not file.is_file() or store.sha256_file(file) != digest:
-        raise IntegrityError(
-            "a weight file is missing or altered", where=str(file), expected=f"sha256 {str(digest)[:16]}..."
-        )
-    state = {name: torch.from_numpy(value.copy()).float() for name, value in store.read_safetensors(file).items()}
-    wanted = net.state_dict()
-    wrong = sorted(set(wanted) ^ set(state)) or [n for n in wanted if wanted[n].shape != state[n].shape]
-    if wrong:
-        raise InputError("weights do not fit the configuration", where=str(folder), got=", ".join(wrong[:6]))
-    net.load_state_dict(state)
+        raise InputError("not a segmentation network of this package", where=str(where), expected="kind street_net, schema 1")
+    net = StreetNet(records.parse_dataclass(StreetNetConfig, content.get("config"), f"{where}: config"))
+    digest = str(dict(content.get("files", {})).get(WEIGHTS_FILE))
+    state = shards.read_shards(where.parent, {WEIGHTS_FILE: digest})
+    shards.check_fit(state, net.state_dict(), where.parent)
+    net.load_state_dict({name: value.float() for name, value in state.items()})
     return net.eval().to(memory_format=torch.channels_last)
 
 
@@ -166,24 +162,3 @@ def _described(folder: Path | str) -> Path:
         raise ResourceError("the labeller's weights are missing", where=str(folder), expected=f"a folder with {MODEL_FILE}",
                             remedy="leave out --weights to use the network that comes with the package")  # fmt: skip
     return where
-
-
-def _config(content: Any, where: str) -> StreetNetConfig:
-    """The shape from a file, each number checked before anything is allocated."""
-    names = {field.name for field in fields(StreetNetConfig)}
-    if not isinstance(content, dict) or set(content) != names:
-        raise InputError("the network's shape has other fields", where=where, expected=", ".join(sorted(names)))
-    widths, blocks = content["widths"], content["blocks"]
-    levels = [*widths, *blocks] if isinstance(widths, list) and isinstance(blocks, list) else []
-    if (
-        len(levels) != 10
-        or len(widths) != 5
-        or not all(type(n) is int and 1 <= n <= 1024 for n in levels)
-        or any(w % 8 for w in widths)
-    ):
-        raise InputError("the network's shape is not possible", where=where,
-                         expected="5 widths, multiples of 8 up to 1024, and 5 numbers of blocks", got=f"{widths}, {blocks}")  # fmt: skip
-    focal, temperature = content["focal_px"], content["temperature"]
-    if not all(isinstance(n, int | float) and 0 < n < 1e5 for n in (focal, temperature)):
-        raise InputError("focal_px and temperature are positive numbers", where=where, got=f"{focal}, {temperature}")
-    return StreetNetConfig(tuple(widths), tuple(blocks), float(focal), float(temperature))

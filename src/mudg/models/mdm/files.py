@@ -14,10 +14,8 @@ from typing import Any
 
 import torch
 
-from mudg.base import shards, store
+from mudg.base import records, shards, store
 from mudg.base.errors import InputError
-from mudg.core.noise import ScheduleConfig
-from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 
 MODEL_FILE = "model.json"
@@ -75,28 +73,21 @@ def config_from_dict(values: Any, where: str = "model configuration") -> MDMConf
         InputError: names unknown or missing fields, a value of a wrong type, and a variant that is no longer built.
     """
 
-    def strict(cls: Any, given: Any, path: str) -> dict[str, Any]:
-        known, former = {f.name for f in dataclasses.fields(cls)}, FORMER_FIELDS.get(path, {})
-        names = set(given) - set(former) if isinstance(given, Mapping) else set()
-        if names != known:
-            raise InputError(
-                "a model configuration has other fields than this version knows",
-                where=f"{where}: {path}", expected=", ".join(sorted(known)),
-                got="missing " + ", ".join(sorted(known - names)) + "; unknown " + ", ".join(sorted(names - known)),
-            )  # fmt: skip
-        for name, value in former.items():
-            if given.get(name, value) != value:
-                raise InputError("the model is of a variant that this version no longer has", where=f"{where}: {path}.{name}",
-                                 expected=repr(value), got=repr(given[name]), remedy="train it anew with mudg learn")  # fmt: skip
-        return {name: tuple(given[name]) if isinstance(given[name], list) else given[name] for name in known}
+    top = _without_former(values, "top", where)
+    if isinstance(top, Mapping):
+        top = {**top, "codec": _without_former(top.get("codec"), "codec", f"{where}: codec")}
+    return records.parse_dataclass(MDMConfig, top, f"{where}: ")
 
-    top = strict(MDMConfig, values, "top")
-    top["codec"] = CodecConfig(**strict(CodecConfig, top["codec"], "codec"))
-    top["schedule"] = ScheduleConfig(**strict(ScheduleConfig, top["schedule"], "schedule"))
-    try:
-        return MDMConfig(**top)
-    except TypeError as error:
-        raise InputError("a model configuration has a value of a wrong type", where=where, got=str(error)) from error
+
+def _without_former(values: Any, group: str, where: str) -> Any:
+    """A group of a configuration without its `FORMER_FIELDS`; InputError for a variant that is no longer built."""
+    if not isinstance(values, Mapping):
+        return values
+    for name, value in FORMER_FIELDS[group].items():
+        if values.get(name, value) != value:
+            raise InputError("the model is of a variant that this version no longer has", where=f"{where}.{name}", expected=repr(value),
+                             got=repr(values[name]), remedy="train it anew with mudg learn")  # fmt: skip
+    return {name: value for name, value in values.items() if name not in FORMER_FIELDS[group]}
 
 
 def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:

@@ -102,9 +102,9 @@ class LossSettings:
     reference_dropout  share of the clips that go without their reference image; the published kind
     """
 
-    class_weights: Tensor | None = None
-    refined_share: float = 1.0
-    reference_dropout: float = 0.2
+    class_weights: Tensor | None
+    refined_share: float
+    reference_dropout: float
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,11 @@ from mudg.models.published.video_unet import attend
 CAPTION = "A photo a of driving scene."
 """The caption of every training clip; its word order is part of what the model knows."""
 TEXT_TOKENS = 77
-_KNOWN_TOKENS: dict[str, tuple[int, ...]] = {
-    "": (49406, 49407),
-    CAPTION: (49406, 320, 1125, 320, 539, 4161, 3562, 269, 49407),
-}
-_MEAN = (0.48145466, 0.4578275, 0.40821073)
-_DEVIATION = (0.26862954, 0.26130258, 0.27577711)
+CAPTION_IDS = (49406, 320, 1125, 320, 539, 4161, 3562, 269, 49407)
+EMPTY_IDS = (49406, 49407)
+"""Token ids of the published caption and of the empty one."""
+MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+"""Statistics of the colours in 0..1 that CLIP's image towers were trained with."""
 
 
 @dataclass(frozen=True)
@@ -43,19 +42,8 @@ TEXT_TOWER = TowerConfig(width=1024, layers=24, heads=16)
 IMAGE_TOWER = TowerConfig(width=1280, layers=32, heads=16)
 
 
-def caption_tokens(text: str) -> Tensor:
-    """Token ids i64[77] of the published caption or of the empty one.
-
-    Raises:
-        UsageError: any other text; that would need a tokenizer, and the model has never seen another caption.
-    """
-    if text not in _KNOWN_TOKENS:
-        raise UsageError(
-            "only the captions of the published training are known", where="clip.caption_tokens",
-            expected=" or ".join(repr(t) for t in _KNOWN_TOKENS), got=repr(text)[:120],
-            remedy="use the published caption: the model was trained with no other",
-        )  # fmt: skip
-    ids = _KNOWN_TOKENS[text]
+def padded_tokens(ids: tuple[int, ...]) -> Tensor:
+    """Token ids as the text tower reads them, i64[77]."""
     return torch.tensor(ids + (0,) * (TEXT_TOKENS - len(ids)))
 
 
@@ -136,7 +124,7 @@ def prepare_image(image: Tensor, side: int = 224) -> Tensor:
         for axis, factor in zip((-2, -1), factors):
             image = _blur(image, max((factor - 1) / 2, 0.001), axis)
     image = functional.interpolate(image, size=(side, side), mode="bicubic", align_corners=True)
-    mean, deviation = (torch.tensor(v, device=image.device).view(3, 1, 1) for v in (_MEAN, _DEVIATION))
+    mean, deviation = (torch.tensor(v, device=image.device).view(3, 1, 1) for v in (MEAN, DEVIATION))
     return ((image + 1) / 2 - mean) / deviation
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mudg.base import shards, store
+from mudg.base import records, shards, store
 from mudg.base.errors import InputError
 from mudg.models.mdm.files import MODEL_FILE, folder_of, read_description
 from mudg.models.published.model import PublishedConfig, PublishedMDM
@@ -23,36 +23,6 @@ def is_published(path: Path | str) -> bool:
     where = folder_of(path) / MODEL_FILE
     content = store.read_json(where) if where.is_file() else None
     return isinstance(content, dict) and content.get("kind") == KIND
-
-
-def config_from_dict(values: Any, where: str = "model configuration") -> PublishedConfig:
-    """Inverse of `dataclasses.asdict`; unknown, missing or ill-typed fields are an InputError that names them."""
-    return _rebuild(PublishedConfig(), values, where)
-
-
-def _rebuild(default: Any, values: Any, where: str) -> Any:
-    known = {f.name for f in dataclasses.fields(default)}
-    given = set(values) if isinstance(values, Mapping) else set()
-    if given != known:
-        raise InputError(
-            "a model configuration has other fields than this version knows", where=where, expected=", ".join(sorted(known)),
-            got="missing " + ", ".join(sorted(known - given)) + "; unknown " + ", ".join(sorted(given - known)),
-        )  # fmt: skip
-    built: dict[str, Any] = {}
-    for name in sorted(known):
-        before, value = getattr(default, name), values[name]
-        if dataclasses.is_dataclass(before):
-            built[name] = _rebuild(before, value, f"{where}: {name}")
-            continue
-        value = tuple(value) if isinstance(value, list) else value
-        number = isinstance(before, float) and isinstance(value, int) and not isinstance(value, bool)
-        if not number and type(value) is not type(before) and not (name == "base_scale" and value is None):
-            raise InputError(
-                "a model configuration has a value of a wrong type", where=f"{where}: {name}", expected=type(before).__name__,
-                got=repr(value)[:80],
-            )  # fmt: skip
-        built[name] = value
-    return type(default)(**built)
 
 
 def save(
@@ -82,7 +52,7 @@ def save(
         store.sync_tree(partial)
 
 
-def load(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None, *, verify: bool = True) -> PublishedMDM:
+def load(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> PublishedMDM:
     """Read a model folder; weights are mapped from the files and converted to `dtype` (None: as stored).
 
     Raises:
@@ -92,8 +62,8 @@ def load(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None, *,
     if content.get("kind") != KIND:
         raise InputError("not a published-type model of this version", where=where, expected=f"schema 1, kind {KIND}")
     with torch.device("meta"):
-        model = PublishedMDM(config_from_dict(content.get("config"), where))
-    state = shards.read_shards(Path(folder), content["files"], verify=verify, remedy="convert the checkpoint again")
+        model = PublishedMDM(records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config"))
+    state = shards.read_shards(Path(folder), content["files"], remedy="convert the checkpoint again")
     shards.check_fit(state, model.state_dict(), Path(folder))
     model.load_state_dict(state, assign=True)
     model.adopt_scale()

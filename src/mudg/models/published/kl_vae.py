@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import palette
-from mudg.base.errors import UsageError
 from mudg.models.mdm.codec import Decoded, Modality
 
 GROUPS = 32
@@ -158,7 +157,6 @@ class Autoencoder(nn.Module):
         super().__init__()
         self.config = config
         self.factor = 2 ** (len(config.multipliers) - 1)
-        self.channels: dict[Modality, int] = dict.fromkeys(("rgb", "depth", "semantics"), config.latent_channels)
         self.encoder, self.decoder = Encoder(config), Decoder(config)
         self.to_moments = nn.Conv2d(2 * config.latent_channels, 2 * config.latent_channels, 1)
         self.from_latent = nn.Conv2d(config.latent_channels, config.latent_channels, 1)
@@ -193,8 +191,6 @@ class Autoencoder(nn.Module):
 
     def decode_image(self, z: Tensor, frames_at_once: int = 1) -> Tensor:
         """Images f32[..,3,H,W], about [-1,1], of scaled latents [..,4,H/8,W/8], a few frames at a time."""
-        if frames_at_once < 1:
-            raise UsageError("decoding needs at least one frame at a time", got=str(frames_at_once))
         lead = z.shape[:-3]
         flat = (z.reshape(-1, *z.shape[-3:]) / LATENT_SCALE).to(self.dtype)
         image = torch.cat([self.decoder(self.from_latent(part)).float() for part in flat.split(frames_at_once)])
@@ -212,18 +208,6 @@ class Autoencoder(nn.Module):
         table = torch.zeros(256, 3)
         table[: len(palette.COLORS)] = torch.from_numpy(palette.COLORS.copy()).float()
         return (table.to(ids.device)[ids.clamp(0, 255)] / 127.5 - 1.0).movedim(-1, -3)
-
-    def encode_rgb(self, rgb: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Colour [..,3,H,W] in [0,1] -> scaled latent."""
-        return self.encode(rgb * 2 - 1, generator)
-
-    def encode_depth(self, depth_m: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Depth [..,1,H,W] metres -> scaled latent. The three channels being alike, it is one encoder pass."""
-        return self.encode(self.depth_image(depth_m), generator)
-
-    def encode_semantics(self, ids: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Train ids i64[..,H,W] -> scaled latent."""
-        return self.encode(self.semantic_image(ids), generator)
 
     def decode(self, latents: dict[Modality, Tensor], frames_at_once: int = 1) -> Decoded:
         """Pixels of scaled latents [..,4,h,w] of all modalities.

@@ -40,7 +40,13 @@ from mudg.models.mdm.model import BatchPart, Losses, LossSettings
 from mudg.models.published.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, ImageTower, TowerConfig
 from mudg.models.published.kl_vae import Autoencoder, AutoencoderConfig
 from mudg.models.published.resampler import Resampler, ResamplerConfig
-from mudg.models.published.video_unet import SeededDropout, VideoUNet, VideoUNetConfig, temporal_layers
+from mudg.models.published.video_unet import (
+    SeededDropout,
+    TemporalConv,
+    TemporalTransformer,
+    VideoUNet,
+    VideoUNetConfig,
+)
 
 LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
 """Modality labels of the published checkpoints; fed through a sinusoid like a time step."""
@@ -77,23 +83,18 @@ class PublishedConfig:
 
     def __post_init__(self) -> None:
         if self.text.width != self.net.context_width or self.image_tokens.context_width != self.net.context_width:
-            raise UsageError(
-                "caption and image tokens must have the width of the network's context", expected=str(self.net.context_width),
-                got=f"{self.text.width}, {self.image_tokens.context_width}",
-            )  # fmt: skip
+            raise UsageError("caption and image tokens must have the width of the network's context",
+                expected=str(self.net.context_width), got=f"{self.text.width}, {self.image_tokens.context_width}")  # fmt: skip
         if self.image.width != self.image_tokens.image_width:
-            raise UsageError(
-                "image tower and resampler differ in width", got=f"{self.image.width}, {self.image_tokens.image_width}"
-            )
+            raise UsageError("image tower and resampler differ in width",
+                got=f"{self.image.width}, {self.image_tokens.image_width}")  # fmt: skip
         if (
             self.net.channels_in != 3 * self.codec.latent_channels
             or self.net.channels_out != self.codec.latent_channels
         ):
-            raise UsageError(
-                "the network must take three latents (noisy, colour, depth) and give one",
+            raise UsageError("the network must take three latents (noisy, colour, depth) and give one",
                 expected=f"{3 * self.codec.latent_channels} -> {self.codec.latent_channels}",
-                got=f"{self.net.channels_in} -> {self.net.channels_out}",
-            )  # fmt: skip
+                got=f"{self.net.channels_in} -> {self.net.channels_out}")  # fmt: skip
 
     @property
     def window(self) -> int:
@@ -139,16 +140,14 @@ class ContextDropout:
     reference: float = 0.15
 
     @classmethod
-    def of(cls, reference: float) -> ContextDropout:
+    def for_reference(cls, reference: float) -> ContextDropout:
         """With the reference missing in this share of the clips (0.2: the paper, 0.1: the released code)."""
         both = min(cls.both, reference)
         return cls(cls.text, both, round(min(reference - both, 1 - cls.text - both), 12))
 
 
 PAPER_DROPOUT = ContextDropout()
-"""The reference is missing in 20 % of the clips, as the paper says."""
-RELEASED_DROPOUT = ContextDropout(0.05, 0.05, 0.05)
-"""What the released training code does: each of the three in 5 % of the clips."""
+"""The reference is missing in 20 % of the clips, as the paper says; the released training code does each of the three in 5 %."""
 
 MODALITY_SHARES: dict[Modality, float] = {"rgb": 0.5, "semantics": 0.25, "depth": 0.25}
 """How often a training clip shows which modality."""
@@ -209,8 +208,7 @@ class PublishedMDM(nn.Module):
             raise UsageError(
                 "a clip of the published model has a fixed number of frames: its image tokens belong to one frame each",
                 where="PublishedMDM", expected=f"{self.config.window} frames", got=f"{frames}",
-                remedy=f"use trajectories of at least {self.config.window} frames; they are made in windows of that length",
-            )  # fmt: skip
+                remedy=f"use trajectories of at least {self.config.window} frames; they are made in windows of that length")  # fmt: skip
 
     def encode_condition(
         self,
@@ -220,9 +218,10 @@ class PublishedMDM(nn.Module):
     ) -> PublishedLatents:
         """Latents of the conditions of clips of one shape, and image features of their references (see `PublishedLatents`).
 
-        generator   noise of the autoencoder's posterior; needed unless the configuration asks for its mean
-        known       colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
-                    colour there (of every clip), frame 0 excepted
+        Args:
+            generator: noise of the autoencoder's posterior; needed unless the configuration names its mean.
+            known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
+                colour there (of every clip), frame 0 excepted.
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
         color, depth, valid, reference = (
@@ -266,11 +265,8 @@ class PublishedMDM(nn.Module):
         if self.config.codec.posterior == "mean":
             return None
         if generator is None:
-            raise UsageError(
-                "encoding draws from the posterior and needs a generator",
-                where="PublishedMDM",
-                remedy='or use posterior = "mean"',
-            )
+            raise UsageError("encoding draws from the posterior and needs a generator", where="PublishedMDM",
+                remedy='or use posterior = "mean"')  # fmt: skip
         return generator
 
     # network ----------------------------------------------------------------------------------------------------------
@@ -299,11 +295,9 @@ class PublishedMDM(nn.Module):
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
-                    raise InputError(
-                        "the training clips show warped images in their condition", where=f"step {part.step}",
-                        expected="points alone, as the published-type model is given",
-                        remedy="give another folder of clips; they are made anew",
-                    )  # fmt: skip
+                    raise InputError("the training clips show warped images in their condition",
+                        where=f"step {part.step}", expected="points alone, as the published-type model is given",
+                        remedy="give another folder of clips; they are made anew")  # fmt: skip
                 draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
                 encoded.append(self.encode_condition(clip.condition, draws))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
@@ -316,7 +310,7 @@ class PublishedMDM(nn.Module):
         planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
         return self.velocity_loss(
             truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
-            dropout=ContextDropout.of(settings.reference_dropout), known=known, first=part.first, whole=part.count,
+            dropout=ContextDropout.for_reference(settings.reference_dropout), known=known, first=part.first, batch_clips=part.count,
         )  # fmt: skip
 
     forward = loss
@@ -335,34 +329,36 @@ class PublishedMDM(nn.Module):
         dropout: ContextDropout = PAPER_DROPOUT,
         known: Mapping[Modality, Tensor] | None = None,
         first: int = 0,
-        whole: int = 0,
+        batch_clips: int = 0,
     ) -> Losses:
         """Mean squared error of the velocity; every clip of the batch shows one modality, drawn by `MODALITY_SHARES`.
 
-        truth       latents of `encode_truth`, each [B,T,4,h,w]
-        generator   of all draws: modality, noise step, noise, which context is left out, dropout inside the network
-        known       f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere
-        first, whole  these clips are number `first` and following of a batch of `whole` clips (0 = of just these); what is
-                    drawn for a clip does not depend on how that batch is divided
+        Args:
+            truth: latents of `encode_truth`, each [B,T,4,h,w].
+            generator: of all draws: modality, noise step, noise, which context is left out, dropout inside the network.
+            known: f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere.
+            first: number of the first of these clips in the batch of a training step.
+            batch_clips: clips of that batch (0 = just these); what is drawn for a clip does not depend on how the batch is divided.
 
-        Terms: one for each modality that any clip of the whole batch shows, so that all parts have the same; scaled so that the
-        mean over equal parts is the mean over the clips that show it.
+        Returns:
+            A term for each modality that any clip of the batch shows, so that all parts have the same terms; scaled so that the
+            mean over equal parts is the mean over the clips that show it.
         """
-        batch = encoded.planes.shape[0]
-        whole, own = whole or batch, slice(first, first + batch)
-        t = noise.stratified_steps(whole, len(self.schedule), generator)[own].to(self.device)
-        shown = _draw_modalities(whole, generator)
-        names = shown[own]
+        count = encoded.planes.shape[0]
+        batch_clips, own = batch_clips or count, slice(first, first + count)
+        t = noise.stratified_steps(batch_clips, len(self.schedule), generator)[own].to(self.device)
+        drawn = _draw_modalities(batch_clips, generator)
+        names = drawn[own]
         x0 = torch.stack([truth[m][n] for n, m in enumerate(names)])
         seed, shape = generator.initial_seed(), (1, *x0.shape[1:])
-        draws = [noise.video_noise(shape, seeds.torch_generator(seed, first + n, "noise")) for n in range(batch)]
+        draws = [noise.video_noise(shape, seeds.torch_generator(seed, first + n, "noise")) for n in range(count)]
         eps = torch.cat(draws).to(self.device)
-        u = torch.rand(whole, generator=generator)[own].to(self.device)
+        u = torch.rand(batch_clips, generator=generator)[own].to(self.device)
         no_text = u < dropout.text + dropout.both
         no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
         text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
         features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
-        self._seed_dropout(seed, range(first, first + batch))
+        self._seed_dropout(seed, range(first, first + count))
         stated = self.predict(
             self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
         )
@@ -371,8 +367,8 @@ class PublishedMDM(nn.Module):
             everywhere = torch.ones_like(x0[0, :, :1])
             squares = squares * torch.stack([known[m][n] if m in known else everywhere for n, m in enumerate(names)])
         errors = squares.flatten(1).mean(1)
-        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in shown}
-        return Losses(errors.mean(), {m: total * whole / (batch * shown.count(m)) for m, total in sums.items()})
+        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in drawn}
+        return Losses(errors.mean(), {m: total * batch_clips / (count * drawn.count(m)) for m, total in sums.items()})
 
     def _seed_dropout(self, seed: int, clips: range) -> None:
         layers = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]
@@ -384,9 +380,13 @@ class PublishedMDM(nn.Module):
         return nn.ModuleDict({"net": self.net, "image_tokens": self.image_tokens})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
-        """Names in `trained_part` of the parameters that mix frames: of the temporal transformers inside the blocks, which is
-        what the published second stage froze, or of `all` temporal layers, which is what its text says."""
-        layers = temporal_layers(self.net, all_layers=which == "all")
+        """Names in `trained_part` of the parameters that mix frames.
+
+        Those of the temporal transformers inside the blocks, which is what the published second stage froze; or of `all` temporal
+        layers, that after the input convolution and the temporal convolutions included, which is what its text says.
+        """
+        kinds = (TemporalTransformer, TemporalConv) if which == "all" else TemporalTransformer
+        layers = [m for m in self.net.modules() if isinstance(m, kinds) and (which == "all" or m is not self.net.first)]
         ids = {id(parameter) for layer in layers for parameter in layer.parameters()}
         return {name for name, parameter in self.trained_part().named_parameters() if id(parameter) in ids}
 
@@ -399,8 +399,7 @@ class PublishedMDM(nn.Module):
         if "last" not in noise.SAMPLER_SETTINGS[request.sampler]:
             raise UsageError(
                 "the sampler does not suit a published-type model, which has a dynamic rescale and ends at the first noise level",
-                where="sampler", expected="ddim", got=request.sampler,
-            )  # fmt: skip
+                where="sampler", expected="ddim", got=request.sampler)  # fmt: skip
 
     def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
         """Width and height the model works at: its own whatever the camera's are, or about `width_px` wide in the same aspect."""
@@ -496,25 +495,3 @@ def _draw_modalities(count: int, generator: torch.Generator) -> list[Modality]:
     limits = torch.tensor(list(MODALITY_SHARES.values()), dtype=torch.float64).cumsum(0)[:-1]
     names = list(MODALITY_SHARES)
     return [names[int(place)] for place in torch.bucketize(u, limits, right=True)]
-
-
-def choose_trainable(
-    model: PublishedMDM, stage: Literal[1, 2], temporal: Literal["transformers", "all"] = "transformers"
-) -> list[nn.Parameter]:
-    """Switch gradients on for the parameters that a training stage moves, off for the rest; returns those that move.
-
-    Stage 1 (low resolution): the whole denoising network and the resampler. Stage 2 (high resolution): the same without the temporal
-    transformers of the blocks, which is what the published training did, or with `temporal = "all"` without any temporal layer,
-    which is what its text says. Autoencoder and image tower never move.
-    """
-    if stage not in (1, 2) or temporal not in ("transformers", "all"):
-        raise UsageError(
-            "unknown training stage", expected="stage 1 or 2, temporal transformers or all", got=f"{stage}, {temporal}"
-        )
-    model.requires_grad_(False)
-    model.net.requires_grad_(True)
-    model.image_tokens.requires_grad_(True)
-    if stage == 2:
-        for layer in temporal_layers(model.net, all_layers=temporal == "all"):
-            layer.requires_grad_(False)
-    return [p for p in model.parameters() if p.requires_grad]

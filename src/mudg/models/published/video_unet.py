@@ -47,15 +47,11 @@ class VideoUNetConfig:
 
     def __post_init__(self) -> None:
         if len(self.multipliers) != len(self.attention):
-            raise UsageError(
-                "multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}"
-            )
+            raise UsageError("multipliers and attention need one entry per level",
+                got=f"{self.multipliers}, {self.attention}")  # fmt: skip
         if self.width % GROUPS:
-            raise UsageError(
-                "the width is no multiple of the normalisation groups",
-                expected=f"multiple of {GROUPS}",
-                got=str(self.width),
-            )
+            raise UsageError("the width is no multiple of the normalisation groups", expected=f"multiple of {GROUPS}",
+                got=str(self.width))  # fmt: skip
 
 
 class SeededDropout(nn.Module):
@@ -76,10 +72,9 @@ class SeededDropout(nn.Module):
         if not self.training or self.share == 0:
             return x
         if not self.seeds or len(x) % len(self.seeds):
-            raise UsageError(
-                "dropout needs a seed for every clip", where="SeededDropout", expected=f"a divisor of {len(x)} seeds",
-                got=str(len(self.seeds)), remedy="call PublishedMDM.loss, or eval()",
-            )  # fmt: skip
+            raise UsageError("dropout needs a seed for every clip", where="SeededDropout",
+                expected=f"a divisor of {len(x)} seeds", got=str(len(self.seeds)),
+                remedy="call PublishedMDM.loss, or eval()")  # fmt: skip
         shape = (len(x) // len(self.seeds), *x.shape[1:])
         draws = [
             torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
@@ -327,25 +322,18 @@ class VideoUNet(nn.Module):
         self.norm = nn.GroupNorm(GROUPS, inside)
         self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))
 
-    @property
-    def multiple(self) -> int:
-        """Latent sides must be multiples of this."""
-        return 2 ** (len(self.config.multipliers) - 1)
-
     def forward(self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor) -> Tensor:
         """One denoiser pass.
 
-        x      [B,T,channels_in,h,w]: noisy latent, latent of the colour condition, latent of the depth condition
-        t      i64[B] noise step; label i64[B] modality; fps i64[B] frames per second
-        text   [B,77,D] caption tokens; image [B,T,16,D] image tokens of each frame
-        Returns v [B,T,channels_out,h,w]. Raises UsageError when the image tokens are for another number of frames.
+        Args:
+            x: [B,T,channels_in,h,w], noisy latent, latent of the colour condition, latent of the depth condition.
+            t: i64[B] noise step. label: i64[B] modality. fps: i64[B] frames per second.
+            text: [B,77,D] caption tokens. image: [B,T,16,D] image tokens of each frame.
+
+        Returns:
+            Velocity [B,T,channels_out,h,w].
         """
         batch, frames = x.shape[:2]
-        if image.shape[1] != frames:
-            raise UsageError(
-                "the image tokens are made for another number of frames", where="VideoUNet", expected=f"{image.shape[1]} frames",
-                got=f"{frames}", remedy="give the model clips of exactly the length it was trained on",
-            )  # fmt: skip
         wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)  # noqa: E731
         embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
         embedding = embedding.repeat_interleave(frames, 0)
@@ -367,12 +355,3 @@ class VideoUNet(nn.Module):
         if not (self.checkpointing and self.training and torch.is_grad_enabled()):
             return stage(*inputs)
         return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)  # type: ignore[return-value]
-
-
-def temporal_layers(net: VideoUNet, *, all_layers: bool) -> list[nn.Module]:
-    """What stage 2 keeps frozen: the temporal transformers inside the blocks, as the published training did, or with
-    `all_layers` the one after the input convolution and the temporal convolutions too."""
-    found: list[nn.Module] = [m for m in net.modules() if isinstance(m, TemporalTransformer) and m is not net.first]
-    if all_layers:
-        found += [net.first, *(m for m in net.modules() if isinstance(m, TemporalConv))]
-    return found

@@ -1,4 +1,4 @@
-"""What differs from picture to picture though the scene does not: exposure and colour, small errors of camera poses.
+"""Corrections of single images: exposure and colour, and small errors of camera poses, which vary although the scene does not.
 
 Three corrections, each optional, each the identity at the start, none of them used when a fitted scene is rendered:
 
@@ -43,18 +43,14 @@ class Appearance:
     """
 
     def __init__(self, names: Mapping[str, Sequence[str]], tables: Mapping[str, Table] | None = None) -> None:
-        self.names = {group: tuple(of) for group, of in names.items() if len(of)}
-        self._row = {group: {name: row for row, name in enumerate(of)} for group, of in self.names.items()}
-        self.tables = (
-            dict(tables)
-            if tables is not None
-            else {group: _identity(group, len(of)) for group, of in self.names.items()}
-        )
-        for group, of in self.names.items():
-            if group not in self.tables or len(self.tables[group]) != len(of):
-                raise InputError(
-                    "corrections of appearance do not fit their names", where=group, expected=f"{len(of)} rows"
-                )
+        self.names = {group: tuple(members) for group, members in names.items() if len(members)}
+        self._row = {group: {name: row for row, name in enumerate(members)} for group, members in self.names.items()}
+        if tables is None:
+            tables = {group: _identity(group, len(members)) for group, members in self.names.items()}
+        self.tables = dict(tables)
+        for group, members in self.names.items():
+            if group not in self.tables or len(self.tables[group]) != len(members):
+                raise InputError("corrections of appearance do not fit their names", where=group, expected=f"{len(members)} rows")
 
     @classmethod
     def of_views(
@@ -93,10 +89,8 @@ class Appearance:
         row = self._row.get(CAMERA_POSE, {}).get(name)
         if row is None:
             return None
-        table = self.tables[CAMERA_POSE]
-        return torch.from_numpy(view.world_from_cam.copy()).to(table["shift"].dtype) @ rigid_motion(
-            table["shift"][row], table["turn"][row]
-        )
+        shift, turn = (self.tables[CAMERA_POSE][name][row] for name in ("shift", "turn"))
+        return torch.from_numpy(view.world_from_cam.copy()).to(shift.dtype) @ rigid_motion(shift, turn)
 
     def _affine(self, name: str, kind: str) -> Tensor | None:
         """Difference ``[3, 4]`` of the view's colour map from the identity."""
@@ -136,7 +130,7 @@ class Appearance:
         tensors = {
             f"{group}/{key}": value for group, table in self.tables.items() for key, value in table.state().items()
         }
-        return {group: list(of) for group, of in self.names.items()}, tensors
+        return {group: list(members) for group, members in self.names.items()}, tensors
 
     @classmethod
     def from_state(cls, values: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Appearance:
@@ -145,7 +139,7 @@ class Appearance:
         for group in values:
             own = {key.partition("/")[2]: value for key, value in tensors.items() if key.startswith(f"{group}/")}
             tables[group] = Table.from_state(own)
-        return cls({group: tuple(map(str, of)) for group, of in values.items()}, tables)
+        return cls({group: tuple(map(str, members)) for group, members in values.items()}, tables)
 
 
 def owner(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Densification by screen gradient: grow Gaussians where the image asks for detail, drop those that do nothing.
+"""Densification by screen gradient: add Gaussians where the image lacks detail, remove those without effect.
 
 The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): every ``every`` steps rows whose mean screen
 gradient exceeds a threshold are cloned (small) or split in two (large); rows that are transparent, grown out of proportion,
@@ -6,8 +6,8 @@ or have left their box are removed; now and then opacities are pulled down so th
 is judged by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain ones. Growth is
 bounded by ``max_rows``: the rows with the largest gradients go first.
 
-State is explicit: statistics belong to rows of the table, the schedule is a function of the step. Which views may speak is the
-caller's choice (``stages/fit.py`` feeds recorded views only, see ``Observation.kind``). ``models/scene/mcmc.py`` is the alternative.
+State is explicit: statistics belong to rows of the table, the schedule is a function of the step. The caller chooses the views that
+count (``stages/fit.py``: recorded views only, see ``Observation.kind``). ``models/scene/mcmc.py`` is the alternative.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
     clone_rows = (grow & (largest <= settings.split_above_m)).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool)
     keep[split_rows] = False
-    for columns, labels in (_rows(model, clone_rows), *_halves(model, split_rows, step, run_seed)):
+    for columns, labels in (copied_rows(model.table, clone_rows), *_halves(model, split_rows, step, run_seed)):
         model.table.append(columns, labels)
     keep = torch.cat([keep, torch.ones(len(model.table) - len(keep), dtype=torch.bool)])
     doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
@@ -170,17 +170,17 @@ def _rows_to_grow(model: SceneModel, stats: DensifyStats, settings: DensifySetti
     return wanted
 
 
-def _rows(model: SceneModel, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    table = model.table
-    columns = {name: value.detach()[rows].clone() for name, value in table.columns.items()}
-    return columns, {name: value[rows].clone() for name, value in table.labels.items()}
+def copied_rows(table: Table, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Columns and labels of the rows with the numbers i64[n], as ``Table.append`` takes them."""
+    columns = {name: value.detach()[rows] for name, value in table.columns.items()}
+    return columns, {name: value[rows] for name, value in table.labels.items()}
 
 
 def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
     """Two smaller Gaussians drawn from each split one (centres sampled from its own density)."""
     halves = []
     for half in (0, 1):
-        columns, labels = _rows(model, rows)
+        columns, labels = copied_rows(model.table, rows)
         generator = seeds.torch_generator(run_seed, step, f"split half {half}")
         noise = torch.randn(len(rows), 3, generator=generator)
         local = torch.exp(columns["log_scales"]) * noise

@@ -8,9 +8,11 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 SH_C0: Final = 0.28209479177387814
+START_OPACITY: Final = 0.1
 
 
 def voxel_filter(xyz: NDArray[np.float32], size_m: NDArray[np.floating] | float) -> NDArray[np.int64]:
@@ -29,8 +31,6 @@ def voxel_filter(xyz: NDArray[np.float32], size_m: NDArray[np.floating] | float)
 
 def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest_m: float = 1.5) -> NDArray[np.float32]:
     """Root mean square distance to the three nearest other points, f32[N] metres, kept within bounds."""
-    from scipy.spatial import cKDTree
-
     if len(xyz) < 4:
         return np.full(len(xyz), 0.1, np.float32)
     distance, _ = cKDTree(xyz).query(xyz, k=4, workers=1)
@@ -39,7 +39,7 @@ def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest
 
 def columns_from_points(
     xyz: NDArray[np.float32], rgb: NDArray[np.uint8], semantics: NDArray[np.uint8] | None, classes: Sequence[int],
-    sh_degree: int, opacity: float = 0.1, scale_m: NDArray[np.float32] | None = None,
+    sh_degree: int, scale_m: NDArray[np.float32] | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known.
 
@@ -59,7 +59,7 @@ def columns_from_points(
         "means": torch.from_numpy(np.array(xyz, np.float32)),
         "quats": torch.from_numpy(quats),
         "log_scales": torch.from_numpy(np.log(scale))[:, None].repeat(1, 3),
-        "logits": torch.full((count,), float(np.log(opacity / (1 - opacity)))),
+        "logits": torch.full((count,), float(np.log(START_OPACITY / (1 - START_OPACITY)))),
         "sh_dc": torch.from_numpy((rgb.astype(np.float32) / 255 - 0.5) / SH_C0)[:, None],
         "semantics": torch.from_numpy(logits),
     }
@@ -68,11 +68,9 @@ def columns_from_points(
     return columns
 
 
-def box_grid(
-    size_m: Sequence[float], rgb: Sequence[float], per_axis: int = 12
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def box_grid(size_m: Sequence[float], rgb: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one colour."""
-    axis = np.linspace(-0.5, 0.5, per_axis)
+    axis = np.linspace(-0.5, 0.5, 12)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     surface = grid[(np.abs(grid) > 0.5 - 1e-9).any(1)]
     xyz = (surface * 0.9 * np.asarray(size_m)).astype(np.float32)

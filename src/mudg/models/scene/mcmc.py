@@ -1,4 +1,4 @@
-"""Densification as sampling: Gaussians that do nothing move to where something is, and the number stays below a cap.
+"""Densification as sampling: Gaussians without effect move to where others are, and their number stays below a cap.
 
 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). Every ``every`` steps
 
@@ -20,12 +20,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mudg.base import seeds
 from mudg.core.quaternions import rotate
-from mudg.models.scene.densify import useless_rows
+from mudg.models.scene.densify import copied_rows, useless_rows
 from mudg.models.scene.model import SceneModel
 
 LARGEST_STACK = 51
@@ -112,10 +113,7 @@ def systematic_counts(weights: Tensor, total: int, offset: float) -> Tensor:
 
 def order_of_place(means: Tensor) -> Tensor:
     """Row numbers i64[N] sorted by x, then y, then z: an order that belongs to the Gaussians, not to the table."""
-    order = torch.argsort(means[:, 2], stable=True)
-    for axis in (1, 0):
-        order = order[torch.argsort(means[order, axis], stable=True)]
-    return order
+    return torch.from_numpy(np.lexsort(means.T.flip(0).numpy()))
 
 
 def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_seed: int) -> dict[str, Any]:
@@ -138,26 +136,20 @@ def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_
     dead &= alive_in[owner] > 0
     weights = torch.where(dead, 0.0, opacity)
     copies = _draw_copies(model, weights, dead, step, settings, run_seed)
-    room = torch.floor(
-        torch.log1p(-opacity.clamp(max=SURE_OPACITY)) / torch.log1p(torch.tensor(-settings.dead_opacity).double())
-    )
+    dead_transmittance = torch.log1p(torch.tensor(-settings.dead_opacity).double())
+    room = torch.floor(torch.log1p(-opacity.clamp(max=SURE_OPACITY)) / dead_transmittance)
     copies = torch.minimum(copies, (room.long() - 1).clamp(0, LARGEST_STACK - 1))
     sources = copies.nonzero()[:, 0]
     _correct(model, sources, copies[sources] + 1, opacity[sources])
     repeated = sources.repeat_interleave(copies[sources])
-    columns = {name: value.detach()[repeated] for name, value in table.columns.items()}
-    labels = {name: value[repeated] for name, value in table.labels.items()}
+    columns, labels = copied_rows(table, repeated)
     table.take(~dead)
     if len(repeated):
         table.append(columns, labels)
     model.sort_rows()
-    gone, came = int(dead.sum()), len(repeated)
-    return {
-        "relocated": min(gone, came),
-        "added": max(0, len(table) - rows),
-        "dropped": max(0, rows - len(table)),
-        "rows": len(table),
-    }
+    change = len(table) - rows
+    relocated = min(int(dead.sum()), len(repeated))
+    return {"relocated": relocated, "added": max(0, change), "dropped": max(0, -change), "rows": len(table)}
 
 
 def _draw_copies(
@@ -170,17 +162,13 @@ def _draw_copies(
     order = order[torch.argsort(owner[order], stable=True)]
     offsets = seeds.numpy_rng(run_seed, step, "relocation").random(len(model.nodes) + 1)
     copies = torch.zeros(len(table), dtype=torch.int64)
-    bounds = torch.cat(
-        [torch.zeros(1, dtype=torch.int64), torch.cumsum(torch.bincount(owner, minlength=len(model.nodes)), 0)]
-    )
-    for index in range(len(model.nodes)):
-        block = order[int(bounds[index]) : int(bounds[index + 1])]
+    for index, block in enumerate(order.split(model.counts())):
         wanted = int(dead[block].sum())
         if wanted:
             copies[block] += systematic_counts(weights[block], wanted, float(offsets[index]))
-    grown = max(0, min(settings.max_rows - len(table), int(settings.growth * len(table))))
-    if grown and float(weights.sum()) > 0:
-        copies[order] += systematic_counts(weights[order], grown, float(offsets[-1]))
+    added = max(0, min(settings.max_rows - len(table), int(settings.growth * len(table))))
+    if added and float(weights.sum()) > 0:
+        copies[order] += systematic_counts(weights[order], added, float(offsets[-1]))
     return copies
 
 

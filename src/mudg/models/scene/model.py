@@ -90,10 +90,8 @@ class SceneModel:
             if isinstance(node, RigidNode) and node.name == name:
                 return node
         known = ", ".join(self.node_names())
-        raise UsageError(
-            f"the fitted scene has no dynamic object {name!r}",
-            expected=f"one of {known}" if known else "a scene with dynamic objects",
-        )
+        raise UsageError(f"the fitted scene has no dynamic object {name!r}",
+                         expected=f"one of {known}" if known else "a scene with dynamic objects")  # fmt: skip
 
     def without_nodes(self, names: Sequence[str]) -> SceneModel:
         """A copy without the named dynamic objects (the rest keeps its parameters, not its moments).
@@ -108,9 +106,7 @@ class SceneModel:
         owner = renumber[self.table.labels["node"].long()]
         rows = (owner >= 0).nonzero()[:, 0]
         table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]})
-        return SceneModel(
-            table, tuple(self.nodes[i] for i in kept), self.sky, self.classes, self.sh_degree, dict(self.facts)
-        )
+        return replace(self, table=table, nodes=tuple(self.nodes[i] for i in kept), facts=dict(self.facts))
 
     def with_object_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:
         """A copy with one dynamic object displaced in its own frame by a rigid 4x4; it shares the table of Gaussians.
@@ -120,7 +116,7 @@ class SceneModel:
         """
         moved = self.dynamic_object(name)
         nodes = tuple(moved.moved(object_from_new) if node is moved else node for node in self.nodes)
-        return SceneModel(self.table, nodes, self.sky, self.classes, self.sh_degree, dict(self.facts))
+        return replace(self, nodes=nodes, facts=dict(self.facts))
 
     # -- state ------------------------------------------------------------------------------------------------------
 
@@ -158,9 +154,7 @@ class SceneModel:
         table = Table.from_state(groups["gaussians"])
         owner = table.labels["node"]
         if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
-            raise InputError(
-                "a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}"
-            )
+            raise InputError("a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}")
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
@@ -176,8 +170,8 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
         semantics: add the class logits as ``extra`` channels.
     """
     table, counts = model.table, model.counts()
-    whole = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
-    blocks = zip(*(column.split(counts) for column in (whole.means, whole.quats, whole.opacity, whole.sh_dc)))
+    all_rows = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
+    blocks = zip(*(column.split(counts) for column in (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)))
     own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
     given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
     found = []
@@ -189,7 +183,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
         """One column of all nodes; a column that no node changed is passed on without a copy."""
         parts = [getattr(rows, name) for rows in found]
         changed = any(part is not getattr(rows, name) for part, rows in zip(parts, given))
-        return torch.cat(parts) if changed else getattr(whole, name)
+        return torch.cat(parts) if changed else getattr(all_rows, name)
 
     return Gaussians(
         means=column("means"),
@@ -213,11 +207,9 @@ def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
 
     The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
     """
-    return (
-        None
-        if ID["sky"] not in model.classes
-        else (model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0]))
-    )
+    if ID["sky"] not in model.classes:
+        return None
+    return model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0])
 
 
 def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import torch
@@ -56,43 +56,24 @@ class NodeRows:
     own: Mapping[str, Tensor] = field(default_factory=dict)
 
 
-class Node(Protocol):
-    """Says how a block of the table's rows lies in the world at a time."""
-
-    kind: str
-    name: str
-
-    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """The rows as they are at a time, differentiable in all they hold; None: the node is not there then."""
-        ...
-
-    def parameters(self) -> Table | None:
-        """The node's own optimisable table beside the shared one (pose offsets), or None."""
-        ...
-
-    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """What rebuilds it: plain JSON values and tensors."""
-        ...
-
-
 class StaticNode:
-    """Rows already in the world."""
+    """Rows already in the world. Other kinds of node have the same methods, and an optimisable table of their own if they need one."""
 
     kind = "static"
 
     def __init__(self, name: str = "background") -> None:
         self.name = name
 
-    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows:
-        """The rows as they are."""
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """The rows as they are at a time, differentiable in all they hold; None: the node does not exist then."""
         return rows
 
-    def parameters(self) -> None:
-        """None: nothing beside the shared rows."""
-        return
+    def parameters(self) -> Table | None:
+        """The node's own optimisable table beside the shared one, or None."""
+        return None
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``Node``."""
+        """What rebuilds the node: plain JSON values and tensors."""
         return {"name": self.name}, {}
 
     @classmethod
@@ -178,12 +159,9 @@ class RigidNode:
         position1, quat1 = self._key_pose(after)
         return position0 + u * (position1 - position0), slerp(quat0, quat1, u)
 
-    def corrected_keys(self) -> NDArray[np.float64]:
-        """The keys with their offsets: world_from_object f64[K, 4, 4]."""
-        return self._corrected(slice(None))
-
     @torch.no_grad()
-    def _corrected(self, which: slice) -> NDArray[np.float64]:
+    def corrected_keys(self, which: slice = slice(None)) -> NDArray[np.float64]:
+        """The keys, or some of them, with their offsets: world_from_object f64[K, 4, 4]."""
         shift, yaw = self.offsets["shift"][which].double().numpy(), self.offsets["yaw"][which].double().numpy()
         return self.world_from_object[which] @ np.stack([geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)])
 
@@ -193,7 +171,7 @@ class RigidNode:
         if found is None:
             return None
         before, after, u = found
-        keys = self._corrected(slice(before, after + 1))
+        keys = self.corrected_keys(slice(before, after + 1))
         return keys[0] if before == after else geometry.interpolate_pose(keys[0], keys[1], u)
 
     @torch.no_grad()
@@ -229,7 +207,7 @@ class RigidNode:
     # -- rows -------------------------------------------------------------------------------------------------------
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``Node``."""
+        """See ``StaticNode``."""
         placement = self._placement(time_s)
         if placement is None:
             return None
@@ -260,7 +238,7 @@ class RigidNode:
         return type(self)(self.name, self.label, self.size_m, self.times_s, keys, Table(columns), self.learn_pose)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``Node``."""
+        """See ``StaticNode``."""
         facts = {"name": self.name, "label": self.label, "size_m": list(self.size_m), "learn_pose": self.learn_pose}
         tensors = {
             "times_s": torch.from_numpy(self.times_s.copy()),
@@ -300,7 +278,7 @@ class DeformableNode(RigidNode):
         return {"deform": torch.zeros(keys, 3, up, across, along)}
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``Node``."""
+        """See ``StaticNode``."""
         if self.keys_around(time_s) is None:
             return None
         return super().at_time(replace(rows, means=rows.means + self.displacement(rows.means, time_s)), time_s)

@@ -1,4 +1,4 @@
-"""The sky of a scene: a picture of all directions, seen wherever nothing covers it."""
+"""The sky of a scene: a panorama of all directions, visible where no Gaussian covers it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from mudg.base import geometry
 from mudg.base.types import View
 from mudg.core.table import Table
 
@@ -54,9 +56,7 @@ class SkyNode:
 
     def _grid(self, view: View, height: int, width: int) -> NDArray[np.float32]:
         """Sampling positions in the padded panorama, ``f32[height, width, 2]`` in [-1, 1]."""
-        camera = view.camera.resized(width, height)
-        x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
-        y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
+        x, y = geometry.pixel_rays(view.camera.resized(width, height))
         # Written out: a matrix product of this shape wakes the threads of BLAS at every step of a fit.
         right, down, ahead = view.world_from_cam[:3, 0], view.world_from_cam[:3, 1], view.world_from_cam[:3, 2]
         rays = x[None, :, None] * right + (y[:, None, None] * down + ahead)
@@ -78,8 +78,6 @@ class SkyNode:
         """
         if len(rgb) == 0:
             return
-        from scipy.ndimage import distance_transform_edt
-
         rows, columns = self.rows, 2 * self.rows
         grid = self.panorama_grid(directions_world)
         column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
@@ -95,7 +93,7 @@ class SkyNode:
         self.table.columns["panorama"].detach().copy_(torch.from_numpy(filled).float()[None])
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``Node``."""
+        """What rebuilds the sky: plain JSON values and tensors."""
         return {"name": "sky"}, self.table.state()
 
     @classmethod

@@ -13,27 +13,29 @@ from mudg.base.config import STRICT
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class StartConfig:
-    """What the fit starts from."""
+    """Initial Gaussians."""
 
     gaussians: int = Field(default=70_000, ge=50)
-    """Upper bound for the static points taken from the fused cloud, and for those of all objects together."""
+    """Largest number of static Gaussians taken from the fused cloud; the same limit holds for all objects together."""
     voxel_m: float = Field(default=0.15, gt=0)
-    """Static points are thinned to one per cube of this size (finer close to the drive)."""
+    """Static points are thinned to one per cube of this size, in metres (finer close to the recorded path). Smaller gives more
+    detail and takes longer."""
     far_m: float = Field(default=150.0, gt=1)
-    """Distance of what is neither sky nor within LiDAR reach."""
+    """Distance, in metres, at which pixels start that are neither sky nor within LiDAR range."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class DensifyConfig:
-    """How the number and the shape of Gaussians change."""
+    """Adding, removing and shaping Gaussians during the fit."""
 
     kind: Literal["gradient", "mcmc", "none"] = "gradient"
-    """gradient: clone, split and prune by screen gradients; mcmc: move those that do nothing, grow to max_gaussians; none: as they
-    start."""
+    """gradient: clone, split and prune by image gradients. mcmc: move unused Gaussians and grow to max_gaussians. none: keep the
+    initial number."""
     max_gaussians: int = Field(default=120_000, ge=100)
-    """Gaussians are added up to this number."""
+    """Largest number of Gaussians. More give finer detail and take more time and memory."""
     longest_to_middle: float = Field(default=10.0, ge=1)
-    """A Gaussian's longest axis is kept within this factor of its middle one: needles look right along the recorded path only."""
+    """Largest ratio of a Gaussian's longest axis to its middle axis. Long needles look right on the recorded path only, so lower
+    it if shifted views show them."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -41,100 +43,104 @@ class ObjectConfig:
     """Dynamic objects."""
 
     deformable: bool = True
-    """Let people and cyclists change their shape within their boxes."""
+    """Let pedestrians and cyclists change shape inside their boxes."""
     mirror_start: bool = True
-    """Start vehicles with their points mirrored to the side that nothing measured."""
+    """Initialise vehicles with their points mirrored to the side that LiDAR did not measure."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class PoseConfig:
-    """Correction of the boxes of dynamic objects."""
+    """Correction of the box poses of dynamic objects."""
 
     learn: bool = False
-    """Correct the boxes while fitting (offset and yaw per key)."""
+    """Correct the boxes while fitting (position and yaw at every key of a track). Use it if the boxes are noisy."""
     start: float = Field(default=0.25, ge=0, le=1)
-    """Share of the iterations before the first round of corrections."""
+    """Share of the iterations before the first round of corrections, 0 to 1."""
     rounds: int = Field(default=4, ge=0)
-    """Rounds of corrections, spread evenly up to 85 % of the iterations (0 = only take the noise out of the tracks)."""
+    """Number of correction rounds, spread evenly up to 85 % of the iterations (0 = only smooth the tracks)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class AppearanceConfig:
-    """Corrections of cameras and colours; not used in renders."""
+    """Correction of camera poses and exposure while fitting; renders do not use it."""
 
     exposure: Literal["none", "camera", "image"] = "none"
-    """Learn an affine colour map per camera, or per recorded image."""
+    """Learn an affine colour map per camera or per recorded image. Use it if exposure or white balance changes during the log."""
     exposure_weight: float = Field(default=0.01, ge=0)
-    """Pull of colour maps, of recorded and virtual views, towards the identity."""
+    """Weight that pulls the colour maps of recorded and virtual views towards the identity."""
     cameras: bool = False
-    """Correct the pose of every recorded image while fitting."""
+    """Correct the camera pose of every recorded image. Use it if calibration or vehicle poses are inaccurate."""
     virtual: bool = False
-    """mudg_s: learn an affine colour map per set of virtual views, so that their colours do not reach the recorded path."""
+    """mudg_s: learn an affine colour map per set of virtual views, so that a colour cast of generated views does not reach the
+    recorded path."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RecordedLossConfig:
-    """Weights of the loss terms of recorded views, and of those that every view has."""
+    """Loss weights of recorded views, and of the terms that every view has. 0 turns a term off."""
 
     ssim_weight: float = Field(default=0.2, ge=0, le=1)
-    """Share of structural similarity in the colour term; the rest is absolute difference."""
+    """Share of structural similarity (SSIM) in the colour term, 0 to 1; the rest is absolute difference."""
     lidar_weight: float = Field(default=0.1, ge=0)
-    """LiDAR depth (best 95 % of the points, relative error)."""
+    """Weight of LiDAR depth (relative error; the worst 5 % of the points are ignored)."""
     sky_weight: float = Field(default=0.05, ge=0)
-    """Sky stays free of Gaussians, on recorded and virtual views."""
+    """Weight of the term that keeps the sky free of Gaussians, on recorded and virtual views."""
     semantic_weight: float = Field(default=0.1, ge=0)
-    """Classes (cross-entropy)."""
+    """Weight of semantic classes (cross-entropy)."""
     semantic_every: int = Field(default=3, ge=1)
-    """Recorded views render and learn classes at every n-th step only (they converge early and cost a third of a step)."""
+    """Learn classes from recorded views at every n-th step only. Classes converge early and cost a third of a step."""
     object_weight: float = Field(default=0.0, ge=0)
-    """Dynamic objects decide, inside their boxes, between there and not there, and leave no haze outside (published: 0.1)."""
+    """Weight of the term that makes dynamic objects opaque or empty inside their boxes and removes haze outside (published:
+    0.1)."""
     opacity_weight: float | None = Field(default=None, ge=0)
-    """Pulls all opacities down, so that what no view needs fades (unset = 0.01 with mcmc, else 0)."""
+    """Weight that lowers all opacities, so that Gaussians that no view needs fade (not given: 0.01 with mcmc, else 0)."""
     scale_weight: float | None = Field(default=None, ge=0)
-    """Pulls all sizes down, per metre (unset = 0.001 with mcmc, else 0)."""
+    """Weight per metre that shrinks all Gaussians (not given: 0.001 with mcmc, else 0)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class VirtualConfig:
-    """mudg_s: what is learnt from virtual views, and when."""
+    """mudg_s: learning from virtual views. Loss weights of 0 turn a term off."""
 
     probability: float = Field(default=0.4, ge=0, le=1)
-    """How often a step takes a virtual view (theta; published: 0.2, in place of the recorded one)."""
+    """Probability that a step uses a virtual view, 0 to 1 (published: 0.2)."""
     beside: bool = True
-    """A step that takes a virtual view learns from its recorded one as well; off: from the virtual one alone, as published."""
+    """A step with a virtual view also learns from its recorded view. Off: from the virtual view alone, as published."""
     start: float = Field(default=0.15, ge=0, le=1)
-    """Share of the iterations before virtual views join."""
+    """Share of the iterations before virtual views are used, 0 to 1."""
     stop: float = Field(default=0.9, ge=0, le=1)
-    """Share of the iterations after which only recorded views are taken again, which gives the recorded path back what it lost."""
+    """Share of the iterations after which virtual views are no longer used, 0 to 1. Ending on recorded views restores quality on
+    the recorded path."""
     gaussians: int = Field(default=8000, ge=0)
-    """At most so many Gaussians start at surfaces that only virtual views show."""
+    """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
     densify: bool = False
-    """Virtual views also decide where Gaussians are added."""
+    """Let virtual views also decide where Gaussians are added."""
     confidence_power: float = Field(default=1.0, ge=0)
-    """Every term is weighted by the observation's confidence to this power (0 = all pixels alike)."""
+    """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all pixels count
+    the same)."""
     color_weight: float = Field(default=1.0, ge=0)
-    """Colour."""
+    """Weight of colour."""
     ssim_weight: float = Field(default=0.3, ge=0, le=1)
-    """Share of structural similarity in the colour term."""
+    """Share of structural similarity (SSIM) in the colour term, 0 to 1."""
     perceptual_weight: float = Field(default=0.3, ge=0)
-    """Perceptual distance, measured by `perception`."""
+    """Weight of the perceptual distance, measured by `perception`."""
     perception: Literal["filters", "codec", "lpips"] = "filters"
-    """Features that renders and virtual views are compared by. filters: fixed ones; codec: the shipped diffusion model's, which is
-    slower; lpips: that network, from `lpips_weights`."""
+    """Features of the perceptual distance. filters: a fixed filter bank. codec: the shipped diffusion model's codec, slower.
+    lpips: the LPIPS network, which needs `lpips_weights`."""
     lpips_weights: str = ""
-    """Safetensors file with LPIPS weights (AlexNet, version 0.1, the lpips package's names)."""
+    """Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package)."""
     depth_weight: float = Field(default=0.3, ge=0)
-    """Dense depth that the diffusion model made, robust and relative."""
+    """Weight of the generated dense depth (robust relative error)."""
     lidar_weight: float = Field(default=0.2, ge=0)
-    """Depth of the fused LiDAR points drawn at the virtual views (best 95 % of them, relative error)."""
+    """Weight of the fused LiDAR points' depth in virtual views (relative error; the worst 5 % of the points are ignored)."""
     semantic_weight: float = Field(default=0.02, ge=0)
-    """Classes (cross-entropy). Small: the shipped diffusion model tells classes less well than Gaussians that learned them from
-    recorded frames."""
+    """Weight of generated classes (cross-entropy). It is small because Gaussians that learned from recorded frames know classes
+    better than the shipped diffusion model."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FitConfig:
-    """Fit a dynamic Gaussian scene to recorded, and optionally virtual, views."""
+    """Fit a dynamic Gaussian scene to recorded and, optionally, virtual views."""
 
     MOVED: ClassVar[Mapping[str, str | None]] = {
         "initial_gaussians": "start.gaussians", "voxel_m": "start.voxel_m", "far_m": "start.far_m", "densify": "densify.kind",
@@ -155,25 +161,28 @@ class FitConfig:
     }  # fmt: skip
 
     method: Literal["gs3d", "street_gaussians", "mudg_s"] = "mudg_s"
-    """Which nodes and which supervision (see the table of methods)."""
+    """gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, also supervised by
+    virtual views."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
-    """Optimisation steps, one recorded view each (mudg_s: see virtual). Schedules and learning rates follow this number."""
+    """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
+    to this number."""
     seed: int = 0
-    """Fixes every random draw."""
+    """Seed of all random numbers; the same seed gives the same result."""
     cameras: tuple[str, ...] = ()
-    """Cameras whose recorded frames are fitted; empty = all."""
+    """Cameras whose recorded images are fitted (empty = all)."""
     width_px: int = Field(default=0, ge=0)
-    """Width of the recorded images while fitting; the height follows (0 = as recorded)."""
+    """Image width in pixels while fitting; the height follows (0 = as recorded). Lower it to save time and memory."""
     sh_degree: int = Field(default=0, ge=0, le=3)
-    """Bands of view-dependent colour. On short drives every band above 0 overfits to the recorded path."""
+    """Degree of the spherical harmonics for view-dependent colour. On short drives every degree above 0 overfits to the recorded
+    path."""
     semantics: bool = True
-    """Carry class logits on every Gaussian where labels exist."""
+    """Learn semantic classes where the scene has labels."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
-    """Backend of the renderer; auto takes the fastest there is and says which."""
+    """Rasteriser backend. auto picks the fastest one available and prints its name."""
     checkpoint_every: int = Field(default=500, ge=1)
-    """Steps per checkpoint."""
+    """Steps between checkpoints; an interrupted fit resumes at the last one."""
     preview_every: int = Field(default=500, ge=1)
-    """Steps per preview picture."""
+    """Steps between preview images."""
     start: StartConfig = Field(default_factory=StartConfig)
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     objects: ObjectConfig = Field(default_factory=ObjectConfig)

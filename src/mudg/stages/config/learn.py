@@ -14,43 +14,44 @@ BelowOne = Annotated[float, Field(ge=0, lt=1)]
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnData:
-    """Training clips: from recorded logs if scenes are given, else from generated cities."""
+    """Training clips: from recorded logs if `scenes` is given, else from generated cities."""
 
     width: int = Field(default=192, ge=32)
-    """Width of the training images, pixels."""
+    """Width of the training images in pixels."""
     height: int = Field(default=128, ge=32)
-    """Height, pixels. Logs: only the area counts; the aspect is the camera's."""
+    """Height of the training images in pixels. For logs only the area width x height counts; the aspect ratio is the camera's."""
     window: int = Field(default=8, ge=1)
     """Frames per clip."""
     clips: str = ""
-    """Folder of training clips to use and complete (empty = inside the output folder)."""
+    """Folder of training clips to read; missing clips are added to it (empty = a folder inside the output). Give an earlier run's
+    folder to reuse its clips."""
     augment: bool = True
-    """Vary colours, mirror, and spoil given classes."""
+    """Vary the training clips: change colours, mirror, and corrupt the classes in the condition."""
     reference_dropout: float = Field(default=0.2, ge=0, le=1)
-    """Published-type models: how often a clip goes without its reference image; 0.2 as the paper says, 0.1 as the released code
-    does."""
+    """Published-type models: share of the clips that are trained without their reference image (paper: 0.2, released code:
+    0.1)."""
     cities: int = Field(default=240, ge=1)
-    """Generated cities to train on."""
+    """Number of generated cities to train on."""
     first_cities: int = Field(default=40, ge=1)
-    """Cities in use from the first step; the others join as training goes on."""
+    """Number of cities in use from the first step. The others are generated and join while training runs."""
     all_cities_at: float = Field(default=0.6, ge=0, le=1)
-    """Share of the steps after which all cities are in use."""
+    """Share of the steps after which all cities are in use, 0 to 1."""
     clips_per_city: int = Field(default=4, ge=1)
-    """Clips that each generated city gives."""
+    """Clips taken from each generated city."""
     held_out: int = Field(default=6, ge=1)
-    """Cities kept for scoring only."""
+    """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()
-    """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED each."""
+    """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED for each."""
     cameras: tuple[str, ...] = ()
-    """Cameras of these logs (empty = all)."""
+    """Logs: cameras to take clips from (empty = all)."""
     stride: int = Field(default=4, ge=1)
-    """Logs: frames from the start of one clip to the next one's."""
+    """Logs: frames between the starts of two clips. Values below `window` give overlapping clips."""
     frame_step: int = Field(default=1, ge=1)
-    """Logs: take every n-th frame only."""
+    """Logs: use every n-th frame only."""
     held_out_every: int = Field(default=5, ge=0)
-    """Logs: every n-th clip is kept for scoring only (0 = none)."""
+    """Logs: every n-th clip is used for scoring only (0 = none)."""
     label_confidence: float = Field(default=0.5, ge=0, le=1)
-    """Logs: labels with less confidence than this are not learned from."""
+    """Logs: labels with a confidence below this, 0 to 1, are not learned."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -58,108 +59,112 @@ class LearnNetwork:
     """Shape of the denoising network and of the refiner behind it."""
 
     widths: tuple[int, ...] = (64, 128, 224)
-    """Channels of the network's levels."""
+    """Channels of the network at each resolution level."""
     blocks: tuple[int, ...] = (1, 1, 2)
-    """Residual blocks per level."""
+    """Residual blocks at each level."""
     spatial_attention: tuple[bool, ...] = (False, False, True)
-    """Whether a level attends between the places of a frame."""
+    """For each level: whether it has attention between positions of a frame."""
     temporal_attention: tuple[bool, ...] = (False, False, True)
-    """Whether a level attends between frames."""
+    """For each level: whether it has attention between frames."""
     patch: int = Field(default=2, ge=1)
-    """Side of the squares of latent pixels that the network takes as one."""
+    """Side of the squares of latent pixels that the network processes as one cell."""
     refine_widths: tuple[int, ...] = (64, 128)
-    """Channels of the refiner at the latent resolution and at half of it; none = no refiner."""
+    """Channels of the refiner at the latent resolution and at half of it (empty = no refiner)."""
     refine_blocks: tuple[int, ...] = (2, 3)
-    """Residual blocks per level of the refiner."""
+    """Residual blocks of the refiner at each level."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnCodec:
-    """Training of the latent codec, before the network."""
+    """Training of the latent codec, which precedes the network's."""
 
     steps: int = Field(default=400, ge=1)
-    """Steps of the codec's decoder."""
+    """Training steps of the codec's decoder."""
     batch: int = Field(default=16, ge=1)
     """Images per step of the codec's decoder."""
     fit_batches: int = Field(default=8, ge=1)
-    """Batches of eight images to which the codec's linear part is fitted."""
+    """Number of batches, of eight images each, to which the linear part of the codec is fitted."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnOptimizer:
-    """AdamW, its learning rate over the steps, and the size of a step."""
+    """AdamW, its learning-rate schedule, and the batch size."""
 
     batch_frames: int = Field(default=16, ge=1)
-    """Frames per step, over all processes: half windows first, whole windows at the end."""
+    """Frames per step over all processes. Steps use clips of half the window first, and whole windows at the end."""
     full_window_share: float = Field(default=0.3, ge=0, le=1)
-    """Share of the steps, at the end, with whole windows."""
+    """Share of the steps, at the end, that use whole windows, 0 to 1."""
     lr: float = Field(default=1e-3, gt=0)
-    """Largest learning rate of the network."""
+    """Largest learning rate. Use about a tenth of the default to fine-tune a trained model."""
     warmup_steps: int = Field(default=100, ge=0)
-    """Steps over which the learning rate rises to it."""
+    """Steps over which the learning rate rises to its largest value."""
     decay_share: float = Field(default=0.5, gt=0, le=1)
     """Share of the steps, at the end, over which the learning rate falls."""
     last_lr_share: float = Field(default=0.02, gt=0, le=1)
-    """Share of the learning rate at the end (1 = constant)."""
+    """Learning rate of the last step, as a share of the largest one (1 = constant)."""
     betas: tuple[BelowOne, BelowOne] = (0.9, 0.99)
-    """Decay of the gradients' mean, and of the mean of their squares."""
+    """AdamW's decay rates of the mean gradient and of the mean squared gradient."""
     weight_decay: float = Field(default=0.01, ge=0)
-    """How strongly weights are pulled to zero."""
+    """AdamW's weight decay."""
     clip_norm: float = Field(default=1.0, ge=0)
-    """Gradients are scaled down to this norm (0 = never)."""
+    """Gradients with a larger norm than this are scaled down to it (0 = never)."""
     average_decay: float = Field(default=0.998, ge=0, lt=1)
-    """Decay of the moving average of the weights (0 = no average)."""
+    """Decay of the moving average of the weights, which is the result (0 = no average)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnLoss:
-    """What counts how much in the loss."""
+    """Terms of the training loss."""
 
     class_balance: float = Field(default=0.0, ge=0, le=1)
-    """How strongly rare classes count in the semantic loss: 0 = as often as they occur, 1 = all classes alike. A refiner's
-    scores are freed of it at the end."""
+    """Balance of rare classes in the semantic loss: 0 = as frequent as they are, 1 = all classes count the same. The bias this
+    gives the refiner's class scores is removed after training."""
     refined_share: float = Field(default=0.5, gt=0, le=1)
-    """Share of each side of the image on which the refiner is trained at a step."""
+    """The refiner is trained on a crop whose sides are this share of the image's."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnScore:
-    """Scores and pictures of held-out clips."""
+    """Scores and sample images of held-out clips."""
 
     every: int = Field(default=400, ge=1)
-    """Steps per scoring and picture of the watched cities during training."""
+    """Steps between scorings during training."""
     watched: int = Field(default=1, ge=1)
-    """Held-out cities scored and drawn during training; all are at the end."""
+    """Number of held-out cities scored and drawn during training. At the end all are scored."""
     steps: int = Field(default=2, ge=1)
-    """Denoising steps."""
+    """Denoising steps of the scored samples."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnCompute:
-    """How the run is computed and recorded; none of this changes the result. A run may be continued with other values."""
+    """How the training is computed and logged. These settings do not change the result; a run may be resumed with other
+    values."""
 
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the network is trained. Clip making stays on the CPU, and scoring too, but of a published-type model."""
+    """Device on which the network is trained. Clips are made on the CPU; scoring also runs there, except for published-type
+    models."""
     parallel: Literal["ddp", "fsdp"] = "ddp"
-    """Under torchrun: ddp = a whole network per process; fsdp = parameters and moments in pieces."""
+    """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state."""
     accumulate: int = Field(default=1, ge=1)
-    """Portions in which each process goes through its share of a step: less memory, same result."""
+    """Gradient accumulation: each process computes its share of a step in this many portions. Larger needs less memory and gives
+    the same result."""
     recompute: bool = False
-    """Keep no activations inside the network's blocks; the backward pass computes them again."""
+    """Activation checkpointing: recompute the activations of the network's blocks in the backward pass. Needs less memory, takes
+    longer."""
     workers: int = Field(default=1, ge=0)
-    """Processes that generate clips while training runs (0 = none: wait for another process to fill the folder). Clips of
-    logs are made before training, by this process if 0."""
+    """Processes that generate clips of cities while training runs (0 = wait until another process has written them). Clips of
+    logs are made before training starts, by this process if 0."""
     checkpoint_every: int = Field(default=100, ge=1)
-    """Steps per checkpoint."""
+    """Steps between checkpoints; an interrupted training resumes at the last one."""
     log_every: int = Field(default=50, ge=1)
-    """Steps per line of log.jsonl."""
+    """Steps between lines of log.jsonl."""
     tensorboard: bool = False
-    """Also write losses for TensorBoard (needs the package tensorboard, extra [track])."""
+    """Also write the losses for TensorBoard (needs `pip install 'mudg[track]'`)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnConfig:
-    """Train a multi-modal diffusion model on generated cities, or on recorded logs."""
+    """Train a multi-modal diffusion model on generated cities or on recorded logs."""
 
     MOVED: ClassVar[dict[str, str | None]] = {
         **{name: f"data.{name}" for name in (
@@ -183,18 +188,19 @@ class LearnConfig:
     }  # fmt: skip
 
     seed: int = 0
-    """Fixes the cities, the weights' start and every draw."""
+    """Seed of the cities, the initial weights and all other random numbers."""
     start: str = ""
-    """Folder of a model to continue from, a converted one too, or "embedded" for the shipped one (empty = train from nothing)."""
+    """Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train from
+    scratch)."""
     steps: int = Field(default=2800, ge=1)
-    """Steps of the network."""
+    """Training steps of the network."""
     frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
-    """What keeps its weights. The published second stage freezes the temporal transformers alone; with denoiser only the
-    refiner is trained."""
+    """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that
+    mix frames. denoiser: train the refiner only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
+    """Number format of the computation. auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
-    """Threads of the training process. Results are repeatable at a fixed number."""
+    """Threads of the training process. Results are repeatable for the same number of threads."""
     data: LearnData = Field(default_factory=LearnData)
     network: LearnNetwork = Field(default_factory=LearnNetwork)
     codec: LearnCodec = Field(default_factory=LearnCodec)

@@ -16,7 +16,7 @@ from mudg.stages.config.views import RenderConfig, ScoreConfig
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunConfig:
-    """The whole chain. Each verb's settings carry its name as prefix."""
+    """Settings of all steps, in one group per step."""
 
     ingest: IngestConfig = Field(default_factory=IngestConfig)
     annotate: AnnotateConfig = Field(default_factory=AnnotateConfig)

@@ -13,48 +13,51 @@ from mudg.base.config import STRICT
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SynthesizeConfig:
-    """Generate dense RGB, depth and semantics on shifted trajectories with the diffusion model."""
+    """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
 
     MOVED: ClassVar[Mapping[str, str | None]] = {"start": None, "strength": None}
 
     cameras: tuple[str, ...] = ("front",)
-    """Cameras to move sideways. Names that the scene lacks are an error; empty = the first camera."""
+    """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""
     shifts_m: tuple[float, ...] = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
-    """Lateral shifts, metres, positive to the left of the direction of travel; 0 = the recorded path."""
+    """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path."""
     model: str = "embedded"
-    """"embedded" or "embedded-tiny", shipped with the package, or the folder of a model made by learn."""
+    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or
+    convert."""
     steps: int = Field(default=2, ge=1, le=1000)
-    """Denoising steps. More give more texture, and less agreement with the truth pixel by pixel."""
+    """Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type models."""
     sampler: Literal["ddim", "dpm_solver"] = "ddim"
-    """How the steps are taken. Each costs one pass of the network per step. ddim: first order, with fresh noise between steps.
-    dpm_solver: second order and deterministic, for many steps."""
+    """Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
+    deterministic, for many steps. Both cost one network pass per step."""
     eta: float | None = Field(default=None, ge=0, le=1)
-    """ddim: noise added between steps, 0 = deterministic, 1 = as much as the reverse process has (not given: 1)."""
+    """Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
+    1)."""
     samples: int = Field(default=1, ge=1)
-    """Samples per clip; the first is kept, the spread of all lowers the confidence. Costs that many times the passes."""
+    """Samples per clip. The first one is kept; the spread of all of them lowers the confidence. Time grows with this number."""
     given_classes: bool = True
-    """Let the classes of labelled points and recorded images into the condition, where the scene has labels."""
+    """Use the classes of labelled points and recorded images in the model's condition, if the scene has labels."""
     label_confidence: float = Field(default=0.5, ge=0, le=1)
-    """Labels of recorded images with less confidence than this are not given."""
+    """Labels of recorded images with a confidence below this, 0 to 1, are not used."""
     align_depth: bool = True
-    """Bring generated depth to the scale of the LiDAR points in the same view (scale and shift per frame)."""
+    """Align generated depth to the LiDAR points in the same view (one scale and one shift per frame)."""
     overlap: int = Field(default=2, ge=0)
-    """Frames that a window of the model shares with the one before; they are kept, so that the video continues."""
+    """Frames that a window of the model shares with the previous window; they are kept, so that the video continues smoothly.
+    Published-type models: 8."""
     width_px: int = Field(default=0, ge=0)
-    """Width the model works at (0 = about the area it was trained at, in the camera's aspect)."""
+    """Image width in pixels at which the model works (0 = about the area it was trained at, in the camera's aspect ratio)."""
     full_size: bool = True
-    """Write views at the camera's size, with detail of the warped recorded images put back; otherwise at the model's."""
+    """Write views at the camera's size, with detail restored from warped recorded images. Off: at the size the model works at."""
     held_out_images: bool = False
-    """Also warp in recorded images that are held out for scoring."""
+    """Also warp recorded images that are held out for scoring. Scores at those frames are then not meaningful."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
+    """Number format of the diffusion model. auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
     processes: int = Field(default=0, ge=0)
-    """Trajectories made at the same time, one thread each (0 = one per core; one for a published-type model)."""
+    """Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type models)."""
     guidance: float | None = Field(default=None, ge=1)
-    """Published-type models: weight of the guided prediction; 1 = none, at half the work (not given: 7.5)."""
+    """Published-type models: scale of classifier-free guidance; 1 = none, which halves the work (not given: 7.5)."""
     guidance_rescale: float | None = Field(default=None, ge=0, le=1)
-    """Published-type models: how far the spread of the guided prediction is pulled back (not given: 0.7)."""
+    """Published-type models: guidance rescale, 0 (off) to 1; limits overexposure by guidance (not given: 0.7)."""
     memory_budget_gb: float = Field(default=0.0, ge=0)
-    """Published-type models: cut the work so that it fits into this memory (0 = do not cut)."""
+    """Published-type models: memory in GB; the work is split to fit into it (0 = do not split). The result stays the same."""
     seed: int = 0
-    """Fixes the noise."""
+    """Seed of the noise."""

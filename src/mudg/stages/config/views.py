@@ -15,7 +15,7 @@ class RenderConfig:
     """Render a fitted scene on recorded and shifted trajectories."""
 
     cameras: tuple[str, ...] = ("front",)
-    """Cameras to render; empty = the first camera. A name that the scene lacks is an error."""
+    """Cameras to render (empty = the first camera). A name that the scene lacks is an error."""
     shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
     """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path."""
     height_m: float = 0.0
@@ -25,15 +25,15 @@ class RenderConfig:
     width_px: int = Field(default=0, ge=0)
     """Image width in pixels (0 = as recorded); the height follows."""
     remove_tracks: tuple[str, ...] = ()
-    """Ids of tracked objects to leave out."""
+    """Ids of tracked objects to leave out, as listed in the scene."""
     sky_below_alpha: float = Field(default=0.5, ge=0, le=1)
-    """Pixels with an opacity below this become sky: class sky, no depth."""
+    """Pixels whose opacity is below this, 0 to 1, become sky: class sky, no depth."""
     video: bool = True
     """Also write one MP4 video per trajectory."""
     fps: float = Field(default=10.0, gt=0)
     """Frames per second of the videos."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
-    """Rasteriser; auto picks the fastest one available and names it."""
+    """Rasteriser backend. auto picks the fastest one available and prints its name."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -43,12 +43,12 @@ class ScoreConfig:
     width_px: int = Field(default=0, ge=0)
     """Image width in pixels at which everything is compared; the height follows (0 = the size of the scene's camera)."""
     baseline: bool = True
-    """Also score a baseline without learning: the fused points, every hole filled with the nearest point."""
+    """Also score a baseline without learning: the fused points, with every hole filled by the nearest point."""
     perceptual_views: int = Field(default=8, ge=0)
-    """Number of views per trajectory, evenly spread, at which the perceptual distance is computed; it costs more than all other
-    metrics together (0 = never)."""
+    """Number of views per trajectory, evenly spread, at which the perceptual distance is computed (0 = none). It costs more than
+    all other metrics together."""
     lpips_weights: str = ""
-    """Safetensors file with LPIPS weights (AlexNet, version 0.1, names of the lpips package); LPIPS is computed at the same views
-    (empty = not computed)."""
+    """Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package). LPIPS is computed at the
+    same views as the perceptual distance (empty = not computed)."""
     error_pictures: bool = True
     """Write an image of the colour error at the middle view of every trajectory."""

@@ -22,7 +22,7 @@ NEAREST_CORNER_M = 0.3
 def objects_only(gaussians: Gaussians) -> Gaussians:
     """The rows of dynamic objects (node above 0), without class channels."""
     if gaussians.node is None:
-        raise ValueError("the Gaussians do not say which node they belong to")
+        raise ValueError("the Gaussians have no node index")
     rows = gaussians.node > 0
     return replace(
         gaussians, means=gaussians.means[rows], quats=gaussians.quats[rows], scales=gaussians.scales[rows],

@@ -32,10 +32,14 @@ def perception_of(config: VirtualConfig) -> Perception:
         codec = mdm_files.load("embedded").codec
         return _compared(CodecFeatures(codec.requires_grad_(False)), _lpips())
     if not config.lpips_weights:
-        raise UsageError("LPIPS needs a file of its weights", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
-    state = {name: torch.from_numpy(v.copy()) for name, v in store.read_safetensors(Path(config.lpips_weights)).items()}
-    trunk = LpipsFeatures(state, config.lpips_weights)
+        raise UsageError("LPIPS needs a weight file", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
+    trunk = lpips_network(config.lpips_weights)
     return _compared(trunk, _lpips(trunk.channel_weights))
+
+
+def lpips_network(weights: str) -> LpipsFeatures:
+    """The network of LPIPS with the weights of a file; InputError if that holds something else."""
+    return LpipsFeatures(store.read_tensors(Path(weights)), weights)
 
 
 def _lpips(channel_weights: Sequence[Tensor] | None = None) -> Callable[[list[Tensor], list[Tensor], Tensor], Tensor]:

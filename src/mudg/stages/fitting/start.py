@@ -9,7 +9,7 @@ there is none it is put on a far shell. This needs semantic labels; without them
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -38,6 +38,32 @@ FEWEST_OBJECT_POINTS = 150
 MIRROR_APART_M = 0.25
 
 
+@dataclass(frozen=True, eq=False)
+class StartPoints:
+    """Points that become Gaussians, in the frame of their node: xyz f32[N, 3] and scale f32[N] in metres, rgb u8[N, 3], train ids u8[N]."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8]
+    scale_m: NDArray[np.float32]
+
+    @classmethod
+    def joined(cls, parts: Sequence[StartPoints]) -> StartPoints:
+        """All points of the parts, in order."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def __getitem__(self, rows: NDArray[np.integer]) -> StartPoints:
+        """The points at these indices."""
+        return StartPoints(self.xyz[rows], self.rgb[rows], self.semantics[rows], self.scale_m[rows])
+
+    def columns(self, classes: tuple[int, ...], sh_degree: int) -> dict[str, torch.Tensor]:
+        """Rows of the table of Gaussians."""
+        return columns_from_points(self.xyz, self.rgb, self.semantics, classes, sh_degree, scale_m=self.scale_m)
+
+
 def start_model(
     scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
 ) -> SceneModel:
@@ -47,7 +73,7 @@ def start_model(
         InputError: the fused cloud has no points at all.
     """
     if len(fused.static) == 0:
-        raise InputError("the fused cloud has no static points to start from", where=scene.root, remedy="check the LiDAR of the scene")
+        raise InputError("the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene")
     kinds = METHODS[config.method].nodes
     blocks = [_static_columns(fused.static, views, classes, config)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]
@@ -60,7 +86,8 @@ def start_model(
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
     sky = _painted_sky(views) if "sky" in kinds else None
-    log.info(f"start: {len(blocks[0]['means'])} static Gaussians, {len(owner) - len(blocks[0]['means'])} on {len(nodes) - 1} objects")
+    static = len(blocks[0]["means"])
+    log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
     return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree)
 
 
@@ -69,14 +96,13 @@ def _static_columns(
 ) -> Mapping[str, torch.Tensor]:
     centers = np.stack([view.view.center_world for view in views]).astype(np.float32)
     rows = _thinned(cloud.xyz, centers, config)
-    xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
-    semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
-    scale = neighbour_scale(xyz)
-    filled = _fill_unreached(views, xyz, classes, config.start.far_m)
-    if filled is not None:
-        xyz, rgb = np.concatenate([xyz, filled.xyz]), np.concatenate([rgb, filled.rgb])
-        semantics, scale = np.concatenate([semantics, filled.semantics]), np.concatenate([scale, filled.scale_m])
-    return columns_from_points(xyz, rgb, semantics, classes, config.sh_degree, scale_m=scale)
+    points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
+    filled = _fill_unreached(views, points.xyz, classes, config.start.far_m)
+    return (points if filled is None else StartPoints.joined([points, filled])).columns(classes, config.sh_degree)
+
+
+def _labels(cloud: PointCloud) -> NDArray[np.uint8]:
+    return np.full(len(cloud), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics
 
 
 def _thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitConfig) -> NDArray[np.int64]:
@@ -106,8 +132,7 @@ def _object_columns(
 ) -> Mapping[str, torch.Tensor]:
     rows = voxel_filter(cloud.xyz, 0.06)
     rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
-    xyz, rgb = cloud.xyz[rows], cloud.rgb[rows]
-    semantics = np.full(len(rows), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics[rows]
+    xyz, rgb, semantics = cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows]
     if config.objects.mirror_start and node.symmetric:
         other, source = mirrored_points(xyz)
         xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
@@ -118,40 +143,25 @@ def _object_columns(
         commonest = np.bincount(semantics, minlength=256).argmax() if len(semantics) else UNLABELLED
         xyz, rgb = np.concatenate([xyz, grid_xyz]), np.concatenate([rgb, grid_rgb])
         semantics = np.concatenate([semantics, np.full(len(grid_xyz), commonest, np.uint8)])
-    return columns_from_points(xyz, rgb, semantics, classes, config.sh_degree, scale_m=neighbour_scale(xyz, 0.02, 0.3))
+    return StartPoints(xyz, rgb, semantics, neighbour_scale(xyz, 0.02, 0.3)).columns(classes, config.sh_degree)
 
 
 # ---- beyond LiDAR ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Fill:
-    xyz: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
-    semantics: NDArray[np.uint8]
-    scale_m: NDArray[np.float32]
-
-
 def _fill_unreached(
     views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float
-) -> _Fill | None:
+) -> StartPoints | None:
     """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
     labelled = [view for view in views if view.channels is not None]
     if not labelled or not classes:
         return None
     chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
-    parts = [_fill_view(view, xyz, classes, far_m) for view in chosen]
-    points = np.concatenate([part.xyz for part in parts])
-    scale = np.concatenate([part.scale_m for part in parts])
-    if len(points) == 0:
-        return None
-    rows = voxel_filter(points, np.maximum(scale * 2.0, 0.05))
-    rgb = np.concatenate([part.rgb for part in parts])
-    semantics = np.concatenate([part.semantics for part in parts])
-    return _Fill(points[rows], rgb[rows], semantics[rows], scale[rows])
+    points = StartPoints.joined([_fill_view(view, xyz, classes, far_m) for view in chosen])
+    return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))] if len(points) else None
 
 
-def _fill_view(stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float) -> _Fill:
+def _fill_view(stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float) -> StartPoints:
     view, cell = stored.view, FILL_CELL_PX
     rows, columns = view.camera.height // cell, view.camera.width // cell
     center_row = (np.arange(rows) * cell + cell // 2)[:, None]
@@ -177,7 +187,7 @@ def _fill_view(stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int,
     z = guess[row, column]
     color = stored.rgb[row * cell + cell // 2, column * cell + cell // 2]
     points = geometry.unproject(view, uv, z).astype(np.float32)
-    return _Fill(points, color, label[row, column], (0.5 * cell * z / view.camera.fx).astype(np.float32))
+    return StartPoints(points, color, label[row, column], (0.5 * cell * z / view.camera.fx).astype(np.float32))
 
 
 def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:
@@ -203,7 +213,7 @@ def _painted_sky(views: Sequence[StoredView]) -> SkyNode:
         camera = stored.view.camera
         row, column = stored.sky[::2, ::2].nonzero()
         row, column = row * 2, column * 2
-        rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))], 1)
+        rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
         directions.append(rays @ stored.view.world_from_cam[:3, :3].T)
         colors.append(stored.rgb[row, column].astype(np.float32) / 255)
     if directions:

@@ -20,9 +20,10 @@ from mudg.base import geometry, log, seeds
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.models.scene.initial import columns_from_points, voxel_filter
+from mudg.models.scene.initial import voxel_filter
 from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import RigidNode
+from mudg.stages.fitting.start import StartPoints
 from mudg.stages.fitting.views import StoredView
 
 WITNESSES = 36
@@ -56,7 +57,7 @@ def unseen_maps(
     chosen = [recorded[i] for i in np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))]
     witnesses = [_witness(model, stored.view, raster) for stored in chosen]
     objects = [node for node in model.nodes if isinstance(node, RigidNode)]
-    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "what virtual views add")]
+    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "finding unseen surfaces")]
 
 
 def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
@@ -91,19 +92,9 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
             exists[inside] = pose is not None
             if pose is not None:
                 moved[inside] = geometry.transform_points(pose, local)
-        seen |= exists & _looks_at_or_through(witness, moved)
+        seen |= exists & _sees_or_sees_past(witness, moved)
     coarse = ~seen.reshape(shape)
     return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
-
-
-@dataclass(frozen=True)
-class _Seeds:
-    """Points of one node, in its own frame."""
-
-    xyz: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
-    train_id: NDArray[np.uint8]
-    scale_m: NDArray[np.float32]
 
 
 def unseen_rows(
@@ -114,21 +105,20 @@ def unseen_rows(
     A point in the box of a dynamic object belongs to that object.
     """
     objects = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
-    found: dict[int, list[_Seeds]] = {index: [] for index in range(len(model.nodes))}
+    found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
     for stored, unseen_here in zip(virtual, unseen):
         for index, seeds_here in _seeds_of(stored, unseen_here, objects, model.classes):
             found[index].append(seeds_here)
     columns, owners = [], []
-    total = sum(len(part.xyz) for parts in found.values() for part in parts)
+    total = sum(len(part) for parts in found.values() for part in parts)
     for index, parts in found.items():
         if not parts:
             continue
-        xyz, scale = np.concatenate([p.xyz for p in parts]), np.concatenate([p.scale_m for p in parts])
-        rows = voxel_filter(xyz, np.maximum(2.0 * scale, 0.08))
-        share = max(1, most * sum(len(p.xyz) for p in parts) // total)
+        points = StartPoints.joined(parts)
+        rows = voxel_filter(points.xyz, np.maximum(2.0 * points.scale_m, 0.08))
+        share = max(1, most * len(points) // total)
         rows = rows[np.sort(seeds.numpy_rng(run_seed, index, "unseen rows").permutation(len(rows))[:share])]
-        rgb, train_id = np.concatenate([p.rgb for p in parts])[rows], np.concatenate([p.train_id for p in parts])[rows]
-        columns.append(columns_from_points(xyz[rows], rgb, train_id, model.classes, model.sh_degree, scale_m=scale[rows]))
+        columns.append(points[rows].columns(model.classes, model.sh_degree))
         owners.append(torch.full((len(rows),), index, dtype=torch.int32))
     if not columns:
         return {name: value.detach()[:0] for name, value in model.table.columns.items()}, {"node": torch.zeros(0, dtype=torch.int32)}
@@ -137,7 +127,7 @@ def unseen_rows(
 
 def _seeds_of(
     stored: StoredView, unseen: NDArray[np.bool_], objects: dict[int, RigidNode], classes: tuple[int, ...]
-) -> list[tuple[int, _Seeds]]:
+) -> list[tuple[int, StartPoints]]:
     """Points of one virtual view's unseen pixels, by node index."""
     if stored.depth is None:
         return []
@@ -164,12 +154,12 @@ def _seeds_of(
         if inside is not None:
             owner[inside[0]], local[inside[0]] = index, inside[1]
     return [
-        (int(index), _Seeds(local[mine].astype(np.float32), rgb[mine], train_id[mine], scale[mine]))
+        (int(index), StartPoints(local[mine].astype(np.float32), rgb[mine], train_id[mine], scale[mine]))
         for index in np.unique(owner) for mine in [owner == index]
     ]  # fmt: skip
 
 
-def _looks_at_or_through(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     camera = witness.view.camera
     uv, z = geometry.project(witness.view, points)
     with np.errstate(invalid="ignore"):

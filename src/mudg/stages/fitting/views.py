@@ -19,16 +19,16 @@ from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
+from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.data import scene as scenefile
 from mudg.data.clips.condition import ConditionRules, project_sparse
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 
 MAX_LIDAR_M = 100.0
 NEAREST_SWEEP_S = 0.1
-OCCLUSION_CELL_PX = (8, 3)
-"""Columns and rows of the neighbourhood in which a nearer point hides a farther one (rows: about one beam apart)."""
-OCCLUSION_MARGIN = 0.15
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
             raise UsageError(f"the scene has no camera named {name!r}", where=scene.root, expected=", ".join(scene.cameras))
     frames = tuple(f for f in scene.frames_in("train") if not cameras or f.view.camera.name in cameras)
     if not frames:
-        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a smaller held-out share")
+        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a larger --test-every, or 0")
     return frames
 
 
@@ -205,10 +205,10 @@ def virtual_sets(path: Path) -> dict[str, ObservationSet]:
     """
     sets = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
     if not sets:
-        raise InputError("no finished folders of observations here", where=str(path), remedy="run `mudg synthesize` first")
+        raise InputError("this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first")
     for found in sets.values():
         if found.kind == "recorded":
-            raise InputError("recorded views among the virtual ones: held-out truth must not be learnt from", where=str(found.path),
+            raise InputError("recorded views among the virtual ones: held-out views must not be trained on", where=str(found.path),
                              expected="views of kind virtual", got=f"kind recorded, source {found.source}",
                              remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
     return sets
@@ -268,29 +268,40 @@ def resized_view(view: View, width_px: int) -> View:
 # ---- LiDAR depth of a recorded view ---------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class _WorldSweep:
+    """World points f32[N, 3] of a sweep, their times after it f32[N] in seconds, and the largest angle between its beams."""
+
+    xyz: NDArray[np.float32]
+    dt_s: NDArray[np.float32]
+    gap_deg: float
+
+
 class _SweepCache:
     """World points of the sweeps nearest in time; each sweep is read once (several cameras share it)."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._read: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+        self._read: dict[str, _WorldSweep] = {}
 
     def pixels_of(self, view: View) -> LidarPixels | None:
         """Depths of the nearest sweep of every sensor as seen by the view; None if no sweep is near in time."""
-        clouds = []
+        clouds, gap_deg = [], 0.0
         for sensor in dict.fromkeys(sweep.sensor for sweep in self._scene.sweeps):
             sweeps = [sweep for sweep in self._scene.sweeps if sweep.sensor == sensor]
             nearest = min(sweeps, key=lambda sweep: abs(sweep.time_s - view.time_s))
             if abs(nearest.time_s - view.time_s) <= NEAREST_SWEEP_S:
-                clouds.append(self._at(nearest, view.time_s))
-        return visible_lidar(view, np.concatenate(clouds)) if clouds else None
+                clouds.append(self._points_at(nearest, view.time_s))
+                gap_deg = max(gap_deg, self._read[nearest.id].gap_deg)
+        return lidar_pixels(view, np.concatenate(clouds), gap_deg) if clouds else None
 
-    def _at(self, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
+    def _points_at(self, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
         """World points of a sweep, the points of every tracked box carried from when they were measured to ``time_s``."""
         if sweep.id not in self._read:
             points = scenefile.read_points(self._scene, sweep)
-            self._read[sweep.id] = geometry.transform_points(sweep.world_from_lidar, points.xyz), points.dt_s
-        world, dt_s = self._read[sweep.id]
+            world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
+            self._read[sweep.id] = _WorldSweep(world, points.dt_s, largest_beam_gap(points.xyz))
+        world, dt_s = self._read[sweep.id].xyz, self._read[sweep.id].dt_s
         moved = world.copy()
         for track in self._scene.tracks:
             then, soon, now = track.pose_at(sweep.time_s), track.pose_at(sweep.time_s + 0.05), track.pose_at(time_s)
@@ -315,25 +326,8 @@ def _within(xyz: NDArray[np.float32], center: NDArray[np.float32], reach_m: floa
     return near
 
 
-def visible_lidar(view: View, xyz_world: NDArray[np.float32], far_m: float = MAX_LIDAR_M) -> LidarPixels:
-    """Project points and keep those the camera can see.
-
-    The scanner sits elsewhere than the camera, so it sees past edges that hide things from the camera: a point more than
-    15 % and 0.5 m behind the nearest point of its 8 x 3 px neighbourhood is dropped (a flat road, seen at a grazing angle,
-    stays within that); of several in one pixel the nearest stays.
-    """
-    camera = view.camera
-    uv, z = geometry.project(view, xyz_world)
-    inside = (z > 0.5) & (z < far_m)
-    inside &= (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-    uv, z = uv[inside], z[inside]
-    column, row = uv[:, 0].astype(np.int64), uv[:, 1].astype(np.int64)
-    cell_x, cell_y = column // OCCLUSION_CELL_PX[0], row // OCCLUSION_CELL_PX[1]
-    nearest = np.full((camera.height // OCCLUSION_CELL_PX[1] + 1, camera.width // OCCLUSION_CELL_PX[0] + 1), np.inf)
-    np.minimum.at(nearest, (cell_y, cell_x), z)
-    kept = z <= nearest[cell_y, cell_x] * (1 + OCCLUSION_MARGIN) + 0.5
-    pixel, z = (row * camera.width + column)[kept], z[kept]
-    order = np.lexsort((z, pixel))
-    pixel, z = pixel[order], z[order]
-    first = np.concatenate([[True], pixel[1:] != pixel[:-1]]) if len(pixel) else np.zeros(0, bool)
-    return LidarPixels(torch.from_numpy(pixel[first]), torch.from_numpy(z[first].astype(np.float32)))
+def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> LidarPixels:
+    """Depth of the points that the camera sees (``core.visible``); ``gap_deg``: largest angle between neighbouring beams."""
+    depth = visible_depth(view, xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M).reshape(-1)
+    pixel = np.flatnonzero(np.isfinite(depth))
+    return LidarPixels(torch.from_numpy(pixel), torch.from_numpy(depth[pixel]))

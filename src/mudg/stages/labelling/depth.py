@@ -16,7 +16,8 @@ import numpy as np
 
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
-from mudg.core.complete import visible_depth
+from mudg.core.visible import RULES as HIDING_RULES
+from mudg.core.visible import visible_depth
 from mudg.models.depth.inputs import DepthInput, DepthNetwork, DepthOptions
 from mudg.models.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.models.folders import Place, find, title
@@ -55,8 +56,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
         found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
         if not config.depth:
-            raise UsageError("a depth network is named, but no depth is asked for", where="--depth-network",
-                             remedy="leave out --no-depth, or --depth-network")  # fmt: skip
+            raise UsageError("--depth-network contradicts --no-depth", where="--depth-network",
+                             remedy="leave out one of them")  # fmt: skip
         kind_of(config.depth_network)
         found["depth_network"] = store.digest(find(config.depth_network))
     return found
@@ -75,9 +76,9 @@ def load(config: AnnotateConfig) -> DepthNetwork | None:
     )
 
 
-def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame_id: str, aside: Path) -> Labels:
+def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame_id: str, staging: Path) -> Labels:
     """Labels with the network's depth, aligned to the frame's LiDAR, or as they are if it cannot be."""
-    measured = visible_depth(given.view, given.xyz_world, gap_deg=given.beam_gap_deg)
+    measured = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
     asked = DepthInput(given.rgb, measured, labels.depth, labels.sky)
     reason = "too few LiDAR returns"
     if enough_returns(asked):
@@ -86,31 +87,31 @@ def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame
             return replace(labels, depth=found.dense.depth, depth_confidence=found.dense.confidence)
         reason = f"the network's depth does not fit the LiDAR (half of the returns off by more than {found.fit.residual:.0%})"
         if not np.isfinite(found.fit.residual):
-            reason = "the network's depth does not grow with the LiDAR's"
+            reason = "the network's depth does not increase with the LiDAR's"
     log.warn(f"frame {frame_id}: {reason}; its depth is filled from LiDAR instead")
-    store.write_json(_mark(aside, frame_id), {"reason": reason})
+    store.write_json(_mark(staging, frame_id), {"reason": reason})
     return labels
 
 
-def origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequence[str], aside: Path) -> str:
+def origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequence[str], staging: Path) -> str:
     """Where the depth of these frames comes from, in words for the scene's notes."""
     filled = f"points of {config.sweeps} sweeps, filled along the image, sky at a fixed distance"
     if "depth_network" not in networks:
         return filled
-    without = sum(_mark(aside, frame_id).is_file() for frame_id in made)
+    without = sum(_mark(staging, frame_id).is_file() for frame_id in made)
     words = (
-        f"network '{kind_of(config.depth_network)}'{folder_words(config.depth_network, networks['depth_network'])}, aligned to "
+        f"network '{kind_of(config.depth_network)}'{describe_folder(config.depth_network, networks['depth_network'])}, aligned to "
         f"points of {config.sweeps} sweeps, sky at a fixed distance"
     )
     return words + (f"; {without} of them, where it did not fit: {filled}" if without else "")
 
 
-def folder_words(folder: str, digest: str) -> str:
+def describe_folder(folder: str, digest: str) -> str:
     """Name (of one that did not come with the package) and digest of a network's folder, in words for the scene's notes."""
     where = f" in folder '{title(find(folder))}'" if folder else ""
     return f"{where} (sha256 {digest[:16]})"
 
 
-def _mark(aside: Path, frame_id: str) -> Path:
+def _mark(staging: Path, frame_id: str) -> Path:
     """File that says that a frame kept its filled depth."""
-    return aside / f"{frame_id}{_FILLED}"
+    return staging / f"{frame_id}{_FILLED}"

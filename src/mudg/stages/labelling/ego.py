@@ -26,7 +26,7 @@ def find_ego(scene: Scene, camera: str) -> NDArray[np.bool_]:
     travel_m = float(np.linalg.norm(steps, axis=1).sum())
     if len(frames) < 4 or travel_m < MIN_TRAVEL_M:
         log.warn(
-            f"camera {camera}: the drive is too short to tell the own vehicle ({len(frames)} images, {travel_m:.0f} m)"
+            f"camera {camera}: the log is too short to find the own vehicle ({len(frames)} images, {travel_m:.0f} m)"
         )
         return np.zeros(size, bool)
     at = np.unique(np.linspace(0, len(frames) - 1, FRAMES).astype(int))

@@ -1,4 +1,4 @@
-"""LiDAR returns for an image: points of the sweeps around it, movers standing where they are at the image's time."""
+"""LiDAR returns for an image: points of the sweeps around it, dynamic objects standing where they are at the image's time."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.types import Frame, Scene, Sweep
-from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, measure_beam_gap, separate
+from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, largest_beam_gap, separate
 from mudg.data.scene import read_points
 
 MAX_GAP_S = 2.0
 """Sweeps farther in time than this from an image do not help: what moves without a track has gone elsewhere."""
-_GAP_SPREAD = 1.4
-"""Beams lie unevenly: the largest gap beside the median one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +28,7 @@ class Returns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Separated:
-    """Static points of a sweep in the world, those of each mover in its frame, and the sweep's beams."""
+    """Static points of a sweep in the world, those of each dynamic object in its frame, and the sweep's beams."""
 
     static: NDArray[np.float32]
     owned: dict[int, NDArray[np.float32]]
@@ -47,14 +45,14 @@ class NearbyReturns:
         moving = [n for n, track in enumerate(scene.tracks) if judge_track(track, self._rules).moving]
         self.moving = frozenset(moving)
         """Numbers of the scene's tracks that move."""
-        self._movers = [scene.tracks[n] for n in moving]
+        self._dynamic_tracks = [scene.tracks[n] for n in moving]
         self._sensors: dict[str, list[Sweep]] = {}
         for sweep in scene.sweeps:
             self._sensors.setdefault(sweep.sensor, []).append(sweep)
         self._kept: dict[str, _Separated] = {}
 
     def of(self, frame: Frame) -> Returns:
-        """Static points and movers as they stand at the frame's time; no points where no sweep is near."""
+        """Static points and dynamic objects as they stand at the frame's time; no points where no sweep is near."""
         time_s = frame.view.time_s
         chosen = [s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, self._count)]
         ids = {sweep.id for sweep in chosen}
@@ -63,13 +61,13 @@ class NearbyReturns:
         known = [self._separated(sweep) for sweep in chosen]
         for sweep in known:
             parts.append(sweep.static)
-            parts += list(self._movers_at(time_s, sweep.owned))
+            parts += list(self._dynamic_points_at(time_s, sweep.owned))
         gap = min((sweep.gap_deg for sweep in known), default=0.6)
         return Returns(np.concatenate(parts), gap, max((sweep.highest_rad for sweep in known), default=0.0))
 
-    def _movers_at(self, time_s: float, owned: dict[int, NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
+    def _dynamic_points_at(self, time_s: float, owned: dict[int, NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
         for index, xyz_object in owned.items():
-            pose = self._movers[index].pose_at(time_s)
+            pose = self._dynamic_tracks[index].pose_at(time_s)
             if pose is not None:
                 yield geometry.transform_points(pose, xyz_object).astype(np.float32)
 
@@ -77,10 +75,10 @@ class NearbyReturns:
         if sweep.id not in self._kept:
             points = read_points(self._scene, sweep)
             shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
-            owner, owned = separate(shots, self._movers, self._rules)
+            owner, owned = separate(shots, self._dynamic_tracks, self._rules)
             world = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
             self._kept[sweep.id] = _Separated(
-                world[owner == STATIC], owned, _GAP_SPREAD * measure_beam_gap(points.xyz), _highest(sweep, world)
+                world[owner == STATIC], owned, largest_beam_gap(points.xyz), _highest(sweep, world)
             )
         return self._kept[sweep.id]
 

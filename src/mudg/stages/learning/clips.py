@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import concurrent.futures
-import multiprocessing
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.errors import InputError, ResourceError
-from mudg.base.processes import run_in_processes
+from mudg.base.processes import child_environment, process_pool, run_in_processes
 from mudg.base.types import Clip
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
@@ -25,7 +24,7 @@ from mudg.models.mdm.codec import CLASSES
 from mudg.stages.config import LearnConfig
 
 
-def held_out(config: LearnConfig) -> list[int]:
+def held_out_cities(config: LearnConfig) -> list[int]:
     """Numbers of the shards used for scoring only."""
     return [from_city.HELD_OUT + n for n in range(config.data.held_out)]
 
@@ -57,7 +56,7 @@ class MakingClips:
 
     def __init__(self, config: LearnConfig, folder: Path, points_alone: bool = False) -> None:
         self._rules, self._folder = clip_rules(config, points_alone), folder
-        wanted = [*held_out(config), *range(config.data.cities)]
+        wanted = [*held_out_cities(config), *range(config.data.cities)]
         self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
         self._workers = config.compute.workers
         self._pool: concurrent.futures.ProcessPoolExecutor | None = None
@@ -67,9 +66,9 @@ class MakingClips:
         if not self._missing or self._workers == 0:
             return
         log.info(f"learn: {len(self._missing)} cities to generate into {self._folder}, {self._workers} processes")
-        context = multiprocessing.get_context("spawn")
-        self._pool = concurrent.futures.ProcessPoolExecutor(self._workers, mp_context=context)
-        self._futures = [self._pool.submit(from_city.write_city, self._rules, n, self._folder) for n in self._missing]
+        self._pool = process_pool(self._workers)
+        with child_environment(1):
+            self._futures = [self._pool.submit(from_city.write_city, self._rules, n, self._folder) for n in self._missing]
         for future in self._futures:
             future.add_done_callback(_stop_all_on_error(self._futures))
 
@@ -96,8 +95,8 @@ def await_shard(folder: Path, city: int, patience_s: float = 900.0) -> None:
     started = time.monotonic()
     while not path.is_file():
         if time.monotonic() - started > patience_s:
-            raise ResourceError("training clips are not arriving", where=str(path), expected=f"within {patience_s:.0f} s",
-                                remedy="look for an error of the generating processes above")  # fmt: skip
+            raise ResourceError("no training clips arrived", where=str(path), expected=f"within {patience_s:.0f} s",
+                                remedy="see the errors of the generating processes above")  # fmt: skip
         time.sleep(0.5)
 
 
@@ -113,7 +112,7 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
     names = config.data.cameras or tuple(scene.cameras)
     if names[0] not in scene.cameras:
         raise InputError("the scene has no such camera", where=f"--data.cameras, {scene.root}",
-                         expected=", ".join(scene.cameras), got=names[0])  # fmt: skip
+            expected=", ".join(scene.cameras), got=names[0])  # fmt: skip
     camera = scene.cameras[names[0]]
     width, height = sized_to_area(config.data.width * config.data.height, camera.width / camera.height, multiple)
     if points_alone:
@@ -149,7 +148,7 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
 def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) -> LearnConfig:
     """The configuration in terms of shards: clips of logs lie as those of cities do, one clip per shard."""
     if not scored:
-        log.warn("learn: nothing is held out; scores are of a clip that was trained on")
+        log.warn("learn: no clip is held out; the scored clip was also trained on")
     data = replace(
         config.data, cities=train, first_cities=train, clips_per_city=1, width=rules.width, height=rules.height,
         held_out=max(1, scored),
@@ -159,7 +158,7 @@ def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) 
 
 def scored_shards(config: LearnConfig) -> list[int]:
     """Numbers of the shards to score: the held-out ones, or the first one trained on where nothing was held out."""
-    return [0] if config.data.scenes and not config.data.held_out_every else held_out(config)
+    return [0] if config.data.scenes and not config.data.held_out_every else held_out_cities(config)
 
 
 def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
@@ -197,9 +196,9 @@ def draw_clips(
         clip = clip_shards.read_clip(folder, *picks[place])
         if clip.rgb.shape[-2:] != (config.data.height, config.data.width):
             raise InputError(
-                "training clips are of another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
+                "the training clips have another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
                 expected=f"{config.data.width}x{config.data.height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
-                remedy="give another --data.clips",
+                remedy="choose another --data.clips",
             )  # fmt: skip
         if config.data.augment:
             clip = clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))

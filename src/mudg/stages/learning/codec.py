@@ -19,7 +19,7 @@ from mudg.stages.config import LearnConfig
 from mudg.stages.learning.clips import draw_clips
 from mudg.stages.learning.models import draw_weights
 from mudg.stages.learning.parallel import Ranks, agreed_terms
-from mudg.stages.learning.state import TrainingState, mean_of, newest, read_rows
+from mudg.stages.learning.state import TrainingState, mean_of, newest_checkpoint, read_rows
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 LEARNING_RATE = 2e-3
@@ -62,10 +62,10 @@ def train_codec(codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder:
 
 def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
     """The codec that the leader trained, in every process."""
-    saved = newest(out / "codec", ranks)
+    saved = newest_checkpoint(out / "codec", ranks)
     if saved is None:
-        raise ResourceError("the trained codec is not where the leader wrote it", where=str(out / "codec"),
-                            remedy="give an --out on a file system that all processes see")  # fmt: skip
+        raise ResourceError("the trained codec that rank 0 wrote is not visible here", where=str(out / "codec"),
+                            remedy="choose an --out on a file system that all processes share")  # fmt: skip
     read_rows(saved.path, "net", nn.ModuleDict({"codec": codec}).state_dict())
 
 

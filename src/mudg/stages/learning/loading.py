@@ -34,12 +34,12 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
     published = published_files.is_published(config.model)
     (PublishedMDM if published else MDM).check_request(request_of(config))
     if published and fitted:
-        raise UsageError("a published-type model takes points only", where="--fitted", remedy="leave it out")
+        raise UsageError("a published-type model does not use a fitted scene", where="--fitted", remedy="leave it out")
     if published:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
     if config.memory_budget_gb:
         raise UsageError(
-            "only the work of a published-type model is cut", where="--memory-budget-gb", remedy="leave it out"
+            "a memory budget applies to published-type models only", where="--memory-budget-gb", remedy="leave it out"
         )
     mdm_files.load(config.model)  # fails now rather than in every process
     return config
@@ -66,7 +66,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         return mdm_files.load(config.model)
     if config.steps < FEW_STEPS:
         log.warn(
-            f"synthesize: the published model was made for 50 denoising steps, --steps says {config.steps} (recommended: --steps 50)"
+            f"synthesize: the published model was trained for 50 denoising steps, but --steps is {config.steps} (recommended: --steps 50)"
         )
     on_gpu = torch.cuda.is_available()
     bf16 = (config.precision != "float32") if on_gpu else choose_bf16(config.precision)
@@ -74,18 +74,18 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     model = published_files.load(Path(config.model), device, dtype)
     model.split = WorkSplit(frames_at_once=1)
     if config.memory_budget_gb:
-        model.split = _fitting(model, config.memory_budget_gb, 2 if bf16 else 4, guided=config.guidance != 1)
+        model.split = _choose_split(model, config.memory_budget_gb, 2 if bf16 else 4, guided=config.guidance != 1)
     return model
 
 
-def _fitting(model: PublishedMDM, budget_gb: float, bytes_per_value: int, guided: bool) -> WorkSplit:
+def _choose_split(model: PublishedMDM, budget_gb: float, bytes_per_value: int, guided: bool) -> WorkSplit:
     """How the model's work is cut to fit a memory budget in GB."""
     split, peak_bytes = memory_plan.choose(
         memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=guided
     )
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(
-            "the model does not fit into the memory budget however its work is cut", where="--memory-budget-gb",
+            "the model does not fit into the memory budget, however its work is split", where="--memory-budget-gb",
             expected=f">= {peak_bytes / 1e9:.1f} GB", got=f"{budget_gb} GB", remedy="use the 320x512 model, or bfloat16",
         )  # fmt: skip
     log.info(

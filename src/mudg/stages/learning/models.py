@@ -61,7 +61,7 @@ def kind_of(model: nn.Module) -> ModelKind:
     """The row of a model; UsageError if it cannot be trained."""
     if type(model) not in KINDS:
         raise UsageError("this kind of model cannot be trained here", got=type(model).__name__,
-                         expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
+            expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
     return KINDS[type(model)]
 
 
@@ -82,17 +82,17 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         return MDM(wanted), {"codec", "refiner"}
     if is_published(config.start):
         if not _network_is_default(config):
-            raise UsageError("the network of a published-type model cannot be described", where="--start",
-                             remedy="leave out widths, blocks, attention, patch and refiner")  # fmt: skip
-        return learn_published.starting(config), set()
+            raise UsageError("the shape of a published-type network cannot be changed", where="--start",
+                             remedy="leave out the settings of the group network")  # fmt: skip
+        return learn_published.starting_model(config), set()
     before = mdm_files.load(config.start)
     if before.config.window != config.data.window:
-        log.info(f"learn: clips of {config.data.window} frames; the model to continue from had {before.config.window}")
+        log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")
     now = {"window": config.data.window, "area_px": wanted.area_px}
     resized = MDM(replace(before.config, **now))
     resized.load_state_dict(before.state_dict())
     if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
-        log.info("learn: the network is that of the model to continue from")
+        log.info("learn: the network has the shape of --start")
         wanted = resized.config
     if wanted == resized.config:
         return resized, set()
@@ -124,7 +124,7 @@ def freeze(model: Model, what: str) -> int:
     if what == "denoiser":
         names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
         if not isinstance(model, MDM) or model.refiner is None:
-            raise UsageError("without a refiner nothing would be left to train", where="--frozen", got=what)
+            raise UsageError("without a refiner nothing is left to train", where="--frozen", got=what)
     else:
         names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
     count = 0
@@ -136,7 +136,7 @@ def freeze(model: Model, what: str) -> int:
         raise UsageError(
             "there is nothing to freeze", where="--frozen", got=what, expected="a network with such layers"
         )
-    log.info(f"learn: {what.replace('_', ' ')} keep their weights ({count:,} parameters)")
+    log.info(f"learn: {what.replace('_', ' ')} are frozen ({count:,} parameters)")
     return count
 
 

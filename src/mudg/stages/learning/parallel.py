@@ -114,7 +114,7 @@ class Ranks:
             raise failure
         if failed:
             raise ResourceError("another process of this training failed", got=f"{failed:.0f} of {self.size}",
-                                remedy="see its own message above or in the launcher's logs")  # fmt: skip
+                                remedy="see its message above or in the launcher's logs")  # fmt: skip
 
     def share(self, clips: int, parts: int) -> list[slice]:
         """Which clips of a batch of `clips` this process takes, in `parts` portions one after another.
@@ -124,11 +124,10 @@ class Ranks:
         """
         size, rest = divmod(clips, self.size * parts)
         if rest or not size:
-            raise UsageError(
-                "a step's clips cannot be divided evenly", where="--optimizer.batch-frames, --compute.accumulate",
+            raise UsageError("a step's clips cannot be divided evenly",
+                where="--optimizer.batch-frames, --compute.accumulate",
                 expected=f"a multiple of {self.size} processes x {parts} portions", got=f"{clips} clips",
-                remedy="make --optimizer.batch-frames a multiple of window x processes x accumulate",
-            )  # fmt: skip
+                remedy="make --optimizer.batch-frames a multiple of window x processes x accumulate")  # fmt: skip
         first = self.rank * parts * size
         return [slice(first + n * size, first + (n + 1) * size) for n in range(parts)]
 
@@ -144,20 +143,19 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         UsageError: the launcher's variables are not numbers.
     """
     if device == "cuda" and not torch.cuda.is_available():
-        raise ResourceError("no CUDA device here", where="--compute.device cuda", remedy="leave the flag out")
+        raise ResourceError("no CUDA device was found", where="--compute.device cuda", remedy="leave the flag out")
     if dist.is_available() and dist.is_initialized():
-        yield _place(dist.get_rank(), dist.get_world_size(), device)
+        yield _ranks_on_device(dist.get_rank(), dist.get_world_size(), device)
         return
     try:
         size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     except ValueError as error:
-        raise UsageError(
-            "the launcher's variables are not numbers", where="WORLD_SIZE, RANK", got=str(error)
-        ) from error
+        raise UsageError("the launcher's variables are not numbers", where="WORLD_SIZE, RANK",
+            got=str(error)) from error  # fmt: skip
     if size == 1:
-        yield _place(0, 1, device)
+        yield _ranks_on_device(0, 1, device)
         return
-    place = _place(rank, size, device)
+    place = _ranks_on_device(rank, size, device)
     dist.init_process_group("nccl" if device == "cuda" else "gloo", timeout=PATIENCE)
     was_quiet = log.is_quiet()
     log.set_quiet(was_quiet or rank > 0)
@@ -169,7 +167,7 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         time.sleep(PARTING_S)
 
 
-def _place(rank: int, size: int, device: str) -> Ranks:
+def _ranks_on_device(rank: int, size: int, device: str) -> Ranks:
     if device == "cuda":
         chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(chosen)
@@ -273,7 +271,7 @@ def first_row(value: Tensor) -> int:
     (placement,) = value.placements  # type: ignore[attr-defined]
     if placement != Shard(0):
         raise ResourceError(
-            "a tensor is cut in a way that checkpoints do not know", expected="Shard(0)", got=str(placement)
+            "a tensor is sharded in a way that checkpoints do not support", expected="Shard(0)", got=str(placement)
         )
     per_rank = -(-value.shape[0] // value.device_mesh.size())  # type: ignore[attr-defined]
     return min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]
@@ -296,22 +294,16 @@ def agreed_terms(
     Raises:
         NumericsError: in every process, if a term is not finite in any; names the terms, the step and the processes.
     """
-    bad = [float(not all(map(_finite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)]
+    bad = [float(not all(map(math.isfinite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)]
     sums = ranks.total([*terms.values(), float(stop), *bad])
     mean = {name: value / (ranks.size * portions) for name, value in zip(terms, sums)}
     flags = sums[len(terms) + 1 :]
-    if any(flags) or not all(map(_finite, mean.values())):
-        names = [name for name, value in mean.items() if not _finite(value)] or list(terms)
+    if any(flags) or not all(map(math.isfinite, mean.values())):
+        names = [name for name, value in mean.items() if not math.isfinite(value)] or list(terms)
         where = f"learn, step {step}"
         if ranks.size > 1:
             where += f", process {', '.join(str(n) for n, flag in enumerate(flags) if flag)} of {ranks.size}"
-        raise NumericsError(
-            f"the {', '.join(names)} term of the {what} is not finite", where=where,
+        raise NumericsError(f"the {', '.join(names)} term of the {what} is not finite", where=where,
             got=", ".join(str(mean[n]) for n in names),
-            remedy="continue from the last checkpoint with a lower learning rate",
-        )  # fmt: skip
+            remedy="continue from the last checkpoint with a lower learning rate")  # fmt: skip
     return mean, sums[len(terms)] > 0
-
-
-def _finite(value: float) -> bool:
-    return math.isfinite(value)

@@ -18,11 +18,12 @@ from torch import Tensor
 from mudg.base.errors import UsageError
 from mudg.models.published import files as published_files
 from mudg.models.published.model import PublishedMDM, WorkSplit
+from mudg.report import html
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import score as learn_score
 
 
-def starting(config: LearnConfig) -> PublishedMDM:
+def starting_model(config: LearnConfig) -> PublishedMDM:
     """The model of `config.start` in float32, to be trained at the configured size; nothing of it is drawn anew.
 
     Raises:
@@ -33,11 +34,10 @@ def starting(config: LearnConfig) -> PublishedMDM:
     frames = model.config.window
     if config.data.window != frames or config.optimizer.full_window_share < 1:
         raise UsageError(
-            "a published-type model is trained on clips of exactly the length that its image tokens are made for",
+            "a published-type model needs clips of exactly the length of its image tokens",
             where="--data.window, --optimizer.full-window-share", expected=f"{frames} frames in all steps",
             got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
-            remedy=f"--data.window {frames} --optimizer.full-window-share 1",
-        )  # fmt: skip
+            remedy=f"--data.window {frames} --optimizer.full-window-share 1")  # fmt: skip
     model.check_size(config.data.height, config.data.width)
     with torch.no_grad():  # out of the mapped files: training writes in place
         for value in (*model.parameters(), *model.buffers()):
@@ -75,26 +75,5 @@ def save(model: PublishedMDM, folder: Path, text: str, facts: Mapping[str, Any])
 
 def card(model: PublishedMDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
     """Text of the model card; `data` says what it was trained on (empty = generated cities)."""
-    clips, rules = config.data, config.optimizer
-    data = data or (
-        f"generated cities (numbers 0 to {clips.cities - 1} of run seed {config.seed}), {clips.clips_per_city} clips of\n"
-        f"{clips.window} frames each, most of them beside the recorded path."
-    )
-    frozen = "all layers" if config.frozen == "nothing" else f"all layers but the {config.frozen.replace('_', ' ')}"
-    return f"""# Published-type multi-modal diffusion model, trained further
-
-Continued from {config.start}, which has training data of its own. {model.config.window} frames at
-{clips.width}x{clips.height} pixels.
-
-**Training data**: {data}
-
-**Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`: {config.steps} steps of
-{rules.batch_frames // clips.window} clips, {frozen} of the denoising network and the image-token resampler, AdamW, rate
-{rules.lr:g}, moving average {rules.average_decay}, v prediction, reference left out in {clips.reference_dropout:.0%} of the clips.
-
-**Held-out score** ({scores["clips"]} clips, {scores["steps"]} denoising steps):
-
-```
-{learn_score.table(scores)}
-```
-"""
+    return html.render_text("published_card.md.j2", data=data, window=model.config.window, config=config, clips=config.data,
+                            rules=config.optimizer, scores=scores, table=learn_score.table(scores))  # fmt: skip

@@ -17,12 +17,13 @@ from torch import Tensor
 from mudg.base import palette, store
 from mudg.base.types import Clip
 from mudg.core import metrics
-from mudg.core.flicker import flicker
+from mudg.core.flicker import TrueFrame, flicker
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.data.clips import shards as clip_shards
 from mudg.models.diffusion import GeneratedClip, SampleRequest
 from mudg.models.mdm.model import MDM
 from mudg.models.published.model import PublishedMDM
+from mudg.report import html
 from mudg.stages.config import LearnConfig
 
 SKY = palette.ID["sky"]
@@ -88,9 +89,7 @@ def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Ten
     depth = torch.where(clip.depth_valid, clip.depth, clip_shards.FAR_M)  # far depth does not count
     seen = given.valid if given.warped is None else given.valid | given.warped
     backdrop = given.color if given.backdrop is None else given.backdrop
-    poses = torch.from_numpy(np.stack([view.world_from_cam for view in given.views]))
-    cameras = [view.camera for view in given.views]
-    lens = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)
+    frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
@@ -112,7 +111,7 @@ def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Ten
         "delta1": error.delta1,
         "abs_rel_nearest": nearest.abs_rel,
         "delta1_nearest": nearest.delta1,
-        "flicker": flicker(sample.rgb, rgb, depth, ids, poses, lens),
+        "flicker": flicker(sample.rgb, rgb, frames),
         "sky_near": float((sample.depth[sky] < 80).float().mean()) if bool(sky.any()) else math.nan,
         "edges_agree": edges_agree(sample.depth, sample.semantics),
         "confidence_gap": _auc(sample.confidence.flatten(), wrong.flatten()),
@@ -188,8 +187,7 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
             gray(sample.confidence[t, 0].numpy()),
         ]  # fmt: skip
         rows.append(np.concatenate(cells, 1))
-    with store.atomic_path(path) as temporary:
-        Image.fromarray(np.concatenate(rows, 0)).save(temporary)
+    store.write_image(path, np.concatenate(rows, 0))
 
 
 def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420) -> None:
@@ -225,8 +223,7 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
         draw.line([place(s, v) for s, v in line], fill=color, width=2)
         draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=color)
     draw.text((50, height - 18), f"steps, logarithmic, 50 to {last}", fill="black")
-    with store.atomic_path(path) as temporary:
-        image.save(temporary)
+    store.write_image(path, image)
 
 
 # model card -----------------------------------------------------------------------------------------------------------
@@ -237,43 +234,6 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
 
     `data` says what it was trained on; empty = generated cities.
     """
-    clips, rules = config.data, config.optimizer
-    data = data or (
-        f"generated cities only (numbers 0 to {clips.cities - 1} of run seed {config.seed}), {clips.clips_per_city} clips of\n"
-        f"{clips.window} frames each, about three quarters of them beside the recorded path. No real image, and no weight of any\n"
-        "other model, was used."
-    )
-    confidence = (
-        "where measured or warped colour covers a pixel, times how settled the sample is; see `confidence_of`."
-        if model.refiner is None
-        else "falls with the error of the colour that the refiner expects, and where depth contradicts measurements nearby."
-    )
-    count = sum(p.numel() for p in model.parameters()) / 1e6
-    samples = config.steps * rules.batch_frames
-    continued = f", continued from an earlier model ({config.start})" if config.start else ""
-    return f"""# Small multi-modal diffusion model
-
-Turns a projected, coloured LiDAR cloud (with recorded images and, where there are any, classes warped along) into dense
-colour, depth and semantic frames, {clips.window} at a time, at {clips.width}x{clips.height} pixels. {count:.1f} million
-parameters, stored in float16. All three modalities come from one pass.
-
-**Training data**: {data}
-
-**Recipe**: `mudg learn` with the configuration stored in `model.json` under `facts.recipe`{continued}: {config.steps}
-steps of {rules.batch_frames} frames ({samples:,} frames in all), AdamW, moving average {rules.average_decay}, x0
-prediction with the loss weight 1 + SNR clipped to [1, 5].
-
-**Held-out score** ({scores["clips"]} clips of cities from number 1000000 on, {scores["steps"]} denoising steps, against exact
-truth):
-
-```
-{table(scores)}
-```
-
-**Confidence**: {confidence}
-
-**Limits**: colours and shapes far from any measured point are guesses; rare classes are weak; trained at one resolution
-and one kind of generated street, so real images outside the LiDAR band come out smeared. Not for use in vehicles.
-
-**Licence**: Apache-2.0, as the package.
-"""
+    parameters = sum(p.numel() for p in model.parameters())
+    return html.render_text("mdm_card.md.j2", data=data, refines=model.refiner is not None, parameters=parameters, config=config,
+                            clips=config.data, rules=config.optimizer, scores=scores, table=table(scores))  # fmt: skip

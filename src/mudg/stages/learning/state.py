@@ -98,7 +98,7 @@ class TrainingState:
 
     def resume(self, folder: Path, ranks: Ranks) -> bool:
         """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this together."""
-        saved = newest(folder, ranks)
+        saved = newest_checkpoint(folder, ranks)
         if saved is None:
             return False
         ranks.all_do(lambda: self.load(saved.path))
@@ -167,7 +167,7 @@ class RowFiles:
         piece, shape, start = local(value), tuple(value.shape), first_row(value)
         if self._shapes.get(name) != shape:
             raise IntegrityError("a checkpoint does not fit the model", where=f"{self._where}.{name}",
-                                 expected=str(shape), got=str(self._shapes.get(name, "no such tensor")))  # fmt: skip
+                expected=str(shape), got=str(self._shapes.get(name, "no such tensor")))  # fmt: skip
         if not shape:
             return self._open(self._index[name][0][1]).get_tensor(name)
         stop = start + len(piece)
@@ -178,7 +178,7 @@ class RowFiles:
             if a < b:
                 rows.append((a, part[a - first : b - first]))
         if sum(len(r) for _, r in rows) != len(piece):
-            raise IntegrityError("rows of a tensor are missing in a checkpoint", where=f"{self._where}.{name}",
+            raise IntegrityError("rows of a tensor are missing from a checkpoint", where=f"{self._where}.{name}",
                                  expected=f"{start} to {stop}", got=str([(a, len(r)) for a, r in rows]))  # fmt: skip
         return torch.cat([r for _, r in rows]) if rows else torch.empty_like(piece)
 
@@ -191,7 +191,7 @@ class RowFiles:
         return self._files[path]
 
 
-def newest(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
+def newest_checkpoint(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
     """The newest checkpoint that verifies, the same for all; only the leader hashes the files."""
 
     def find() -> dict[str, Any] | None:
