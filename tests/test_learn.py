@@ -87,6 +87,13 @@ def test_class_weights_lift_rare_classes(clips):
     assert float(weight[13]) > float(weight[0])
 
 
+def test_fewer_cities_than_training_begins_with_are_not_waited_for(clips, monkeypatch):
+    config = with_settings(tiny(clips), first_cities=40)
+    assert config.data.cities < config.data.first_cities
+    monkeypatch.setattr(learn, "class_weights", lambda folder, cities, balance: cities)
+    assert learn._class_weights(config, clips) == config.data.cities
+
+
 def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
     with pytest.raises(NumericsError, match=r"network(.|\n)*step \d"):
         learn.run(tiny(clips, lr=1e30, steps=20, checkpoint_every=1), tmp_path / "run")

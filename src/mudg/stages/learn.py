@@ -158,7 +158,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
 
 
 def _class_weights(config: LearnConfig, folder: Path) -> Tensor:
-    return class_weights(folder, min(config.data.first_cities, 20), config.loss.class_balance)
+    return class_weights(folder, min(config.data.first_cities, config.data.cities, 20), config.loss.class_balance)
 
 
 # network --------------------------------------------------------------------------------------------------------------
