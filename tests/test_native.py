@@ -273,9 +273,18 @@ def test_box_mean_keeps_constants_and_wants_odd_sizes() -> None:
         native_ops.box_mean(torch.zeros(1, 4, 4), 4)
 
 
-def adam(parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int) -> None:
+def adam(
+    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int, chosen: Tensor | None = None
+) -> None:  # fmt: skip
     """A step on one column."""
-    native_ops.adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step)
+    native_ops.adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, chosen)
+
+
+def twin(
+    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int, chosen: Tensor | None = None
+) -> None:  # fmt: skip
+    """The same in plain torch."""
+    torch_adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, chosen)
 
 
 def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -374,42 +383,70 @@ def test_class_loss_and_sky_refuse_what_does_not_fit() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1,), (1000,), (257, 3), (40, 16, 3), (0, 4)])
-def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("sparse", [False, True])
+def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: bool) -> None:
     generator = torch.Generator().manual_seed(0)
     parameter = torch.randn(shape, generator=generator)
+    visible = torch.rand(shape[:1], generator=generator) > 0.4 if sparse else None
     mine = [parameter.clone(), torch.zeros(shape), torch.zeros(shape)]
     exact = [t.double() for t in mine]
     for step in range(1, 6):
         gradient = torch.randn(shape, generator=generator)
-        adam(mine[0], gradient, mine[1], mine[2], 1e-2, step)
-        torch_adam_columns([AdamColumn(exact[0], gradient.double(), exact[1], exact[2], 1e-2)], step)
+        adam(mine[0], gradient, mine[1], mine[2], 1e-2, step, visible)
+        twin(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
     for got, want in zip(mine, exact):
         torch.testing.assert_close(got.double(), want, rtol=2e-6, atol=2e-6)
+    if visible is not None:
+        assert torch.equal(mine[0][~visible], parameter[~visible])
+        assert mine[1][~visible].abs().sum() == 0
+
+
+def test_sparse_adam_leaves_invisible_rows_and_their_moments_alone(isa: str) -> None:
+    generator = torch.Generator().manual_seed(1)
+    tensors = [torch.rand(300, 7, generator=generator) for _ in range(3)]
+    before, visible = [t.clone() for t in tensors], torch.rand(300, generator=generator) > 0.5
+    gradient = torch.randn(300, 7, generator=generator)
+    gradient[~visible] = float("nan")  # never looked at
+    exact = [t.double() for t in tensors]
+    adam(tensors[0], gradient, tensors[1], tensors[2], 1e-2, 7, visible)
+    twin(exact[0], gradient.double(), exact[1], exact[2], 1e-2, 7, visible)
+    for now, old, want in zip(tensors, before, exact):
+        assert torch.equal(now[~visible], old[~visible])
+        torch.testing.assert_close(now[visible].double(), want[visible], rtol=2e-6, atol=2e-6)
 
 
 @needs_native
 def test_adam_moves_every_element_alike_wherever_it_lies(pool: Any) -> None:
-    """Same history, same result: bit for bit, at any position, number of threads and shape."""
+    """Same history, same result: bit for bit, at any position, number of threads, dense or sparse."""
     native.set_threads(3)
     values = [torch.full((70_001,), x) for x in (0.3, 0.01, 0.02)]
     adam(values[0], torch.full((70_001,), 0.7), values[1], values[2], 1e-3, 4)
     assert all(len(torch.unique(value)) == 1 for value in values)
     rows = [torch.full((701, 5), x) for x in (0.3, 0.01, 0.02)]
-    adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4)
-    for long, wide in zip(values, rows):
-        assert (wide == long[0]).all()
+    visible = torch.arange(701) % 3 != 0
+    adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4, visible)
+    for dense, sparse in zip(values, rows):
+        assert (sparse[visible] == dense[0]).all()
 
 
-def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str) -> None:
-    """Bit for bit; narrow and wide columns."""
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 1.0])
+def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str, share: float) -> None:
+    """Bit for bit; narrow and wide columns; invisible rows are not looked at."""
     generator = torch.Generator().manual_seed(2)
-    shapes = [(1037,), (1037, 3), (1037, 4), (1037, 15, 3), (1037, 16), (1037, 17)]
+    rows, visible = 1037, torch.rand(1037, generator=generator) < share
+    shapes = [(rows,), (rows, 3), (rows, 4), (rows, 15, 3), (rows, 16), (rows, 17)]
     together = [[torch.rand(shape, generator=generator) for _ in range(4)] for shape in shapes]
-    alone = [[t.clone() for t in values] for values in together]
-    native_ops.adam_columns([AdamColumn(*values, rate=0.1 * i) for i, values in enumerate(together, 1)], 3)
-    for i, (values, expected) in enumerate(zip(together, alone), 1):
-        adam(*expected, 0.1 * i, 3)
-        assert all(torch.equal(values[k], expected[k]) for k in (0, 2, 3))
+    for values in together:
+        values[1][~visible] = float("nan")
+    alone = [[t[visible].clone() for t in values] for values in together]
+    before = [[t.clone() for t in values] for values in together]
+    native_ops.adam_columns([AdamColumn(*values, rate=0.1 * i) for i, values in enumerate(together, 1)], 3, visible)
+    for i, values in enumerate(alone, 1):
+        adam(values[0], values[1], values[2], values[3], 0.1 * i, 3)
+    for values, expected, old in zip(together, alone, before):
+        for k in (0, 2, 3):
+            assert torch.equal(values[k][visible], expected[k])
+            assert torch.equal(values[k][~visible], old[k][~visible])
 
 
 @needs_native
@@ -434,5 +471,7 @@ def test_adam_refuses_what_does_not_fit() -> None:
     a, b = torch.zeros(4, 2), torch.zeros(4, 3)
     with pytest.raises(InputError, match="one shape"):
         adam(a, b, a, a, 0.1, 1)
+    with pytest.raises(InputError, match="chosen rows"):
+        adam(a, a, a, a, 0.1, 1, torch.ones(3, dtype=torch.bool))
     with pytest.raises(UsageError, match="from 1"):
         adam(a, a, a, a, 0.1, 0)

@@ -363,6 +363,19 @@ def test_adam_kernel_equals_torch_optim():
     assert torch.allclose(table["x"], reference, atol=1e-6)
 
 
+def test_sparse_adam_leaves_other_rows_alone():
+    table = tagged_table(4)
+    before = {name: value.clone() for name, value in table.state().items()}
+    for value in table.columns.values():
+        value.grad = torch.ones_like(value)
+    table.adam_step(1, {"a": 0.1, "b": 0.1}, torch_adam_columns, torch.tensor([True, False, True, False]))
+    for name, value in table.state().items():
+        same = (value == before[name]).reshape(4, -1).all(1).tolist()
+        assert same[1], name
+        assert same[3], name
+        assert not same[2] or name.startswith("label"), name
+
+
 # ---- starting values -------------------------------------------------------------------------------------------------
 
 

@@ -144,16 +144,17 @@ def torch_box_mean(values: Tensor, size: int) -> Tensor:
     return functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False).reshape(values.shape)
 
 
-def adam_columns(columns: Sequence[AdamColumn], step: int) -> None:
+def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None = None) -> None:
     """One Adam step in place on several columns with the same rows (the kernel of ``Table.adam_step``).
 
     Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
 
     Args:
         columns: any number, N rows each; contiguous for the native path.
+        chosen: bool[N]: only these rows move, parameters and moments; None = all.
 
     Raises:
-        InputError: shapes differ.
+        InputError: shapes differ, or ``chosen`` is not bool[N].
         UsageError: ``step`` below 1.
     """
     if step < 1:
@@ -161,13 +162,13 @@ def adam_columns(columns: Sequence[AdamColumn], step: int) -> None:
     if not columns:
         return
     for one in columns:
-        _check_column(one, columns[0].parameter)
+        _check_column(one, columns[0].parameter, chosen)
     tensors = tuple(t for one in columns for t in (one.parameter, one.gradient, one.moment1, one.moment2))
     in_place = tuple(t for one in columns for t in (one.parameter, one.moment1, one.moment2))
     library = _library_for(tensors)
     if library is None or not all(t.is_contiguous() for t in in_place):
         with torch.no_grad():
-            torch_adam_columns(columns, step)
+            torch_adam_columns(columns, step, chosen)
         return
     rows = columns[0].parameter.shape[0]
     gradients = [one.gradient.detach().contiguous() for one in columns]
@@ -176,9 +177,10 @@ def adam_columns(columns: Sequence[AdamColumn], step: int) -> None:
                 one.parameter.numel() // rows if rows else 0, one.rate)
         for one, gradient in zip(columns, gradients, strict=True)
     ))  # fmt: skip
+    mask = None if chosen is None else chosen.contiguous()
     real, integer = ctypes.c_double, ctypes.c_int64
     library.mudg_adam(
-        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None),
+        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None if mask is None else mask.data_ptr()),
         real(BETA1), real(BETA2), real(EPSILON), integer(step),
     )  # fmt: skip
     # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
@@ -194,12 +196,15 @@ class _Column(ctypes.Structure):
     ]  # fmt: skip
 
 
-def _check_column(column: AdamColumn, first: Tensor) -> None:
+def _check_column(column: AdamColumn, first: Tensor, chosen: Tensor | None) -> None:
     parameter = column.parameter
     tensors = (parameter, column.gradient, column.moment1, column.moment2)
     if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0 or parameter.shape[0] != first.shape[0]:
         raise InputError("adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
             got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
+    if chosen is not None and (chosen.shape != parameter.shape[:1] or chosen.dtype != torch.bool):
+        raise InputError("adam: the chosen rows must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
+            got=f"{chosen.dtype}{list(chosen.shape)}")  # fmt: skip
 
 
 class _WithGradient(torch.autograd.Function):

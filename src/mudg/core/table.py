@@ -26,8 +26,8 @@ class AdamColumn:
     rate: float
 
 
-AdamKernel = Callable[[Sequence[AdamColumn], int], None]
-"""(columns with the same rows, step from 1): update in place."""
+AdamKernel = Callable[[Sequence[AdamColumn], int, Tensor | None], None]
+"""(columns with the same rows, step from 1, rows bool[N] to update or None = all): update in place."""
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -104,18 +104,19 @@ class Table:
         for value in self.columns.values():
             value.grad = None
 
-    def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel) -> None:
+    def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel, rows: Tensor | None = None) -> None:
         """One Adam step on every column that has a gradient and a rate above 0.
 
         Args:
             step: number of this step, from 1 (bias correction).
             rates: learning rate per column; a column that is not named stays as it is.
             kernel: ``torch_adam_columns`` or ``native_ops.adam_columns``.
+            rows: bool[N]: update these rows only, parameters and moments (the others wait); None = all.
         """
         kernel(
             [AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
              for name, value in self.columns.items() if value.grad is not None and rates.get(name, 0.0) > 0],
-            step,
+            step, rows,
         )  # fmt: skip
 
     # -- state ------------------------------------------------------------------------------------------------------
@@ -148,13 +149,19 @@ class Table:
         return table
 
 
-def torch_adam_columns(columns: Sequence[AdamColumn], step: int) -> None:
+def torch_adam_columns(columns: Sequence[AdamColumn], step: int, rows: Tensor | None = None) -> None:
     """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place: the plain-torch kernel of ``Table.adam_step``."""
     for one in columns:
-        one.moment1.mul_(BETA1).add_(one.gradient, alpha=1 - BETA1)
-        one.moment2.mul_(BETA2).addcmul_(one.gradient, one.gradient, value=1 - BETA2)
-        denominator = (one.moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
-        one.parameter.addcdiv_(one.moment1, denominator, value=-one.rate / (1 - BETA1**step))
+        whole = (one.parameter, one.moment1, one.moment2)
+        parameter, moment1, moment2 = whole if rows is None else (values[rows] for values in whole)
+        gradient = one.gradient if rows is None else one.gradient[rows]
+        moment1.mul_(BETA1).add_(gradient, alpha=1 - BETA1)
+        moment2.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+        denominator = (moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
+        parameter.addcdiv_(moment1, denominator, value=-one.rate / (1 - BETA1**step))
+        if rows is not None:
+            for values, updated in zip(whole, (parameter, moment1, moment2)):
+                values[rows] = updated
 
 
 def _leaf(value: Tensor) -> Tensor:
