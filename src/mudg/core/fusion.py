@@ -5,7 +5,7 @@ beside them, one sweep in memory at a time, and is what both the ``fuse`` stage 
 
 The rules, stated once:
 
-* **Movers.** A tracked box moves if its centre gets far from where it started, or travels a path (both measured with a
+* **Dynamic objects.** A tracked box moves if its centre gets far from where it started, or travels a path (both measured with a
   dead band, so that annotation jitter does not count; going out and coming back does), or if a long box turns.
   Everything else, parked cars included, belongs to the static world.
 * **Separation.** At a sweep's time the points inside a moving box (slightly grown, and only above a margin over its
@@ -16,7 +16,7 @@ The rules, stated once:
 * **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects included,
   the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
 * **Semantics.** The cameras that see a point vote, weighted by the cosine to their axes; in a voxel the samples vote.
-* **Small objects.** A mover with too few coloured points over the whole log is left out, and so are its points: they would
+* **Small objects.** A dynamic object with too few coloured points over the whole log is left out, and so are its points: they would
   smear the static world.
 """
 
@@ -55,7 +55,7 @@ class FusionRules:
         floor_margin_m: points this close above the box's floor stay static.
         moving_distance_m: dead-banded displacement or path length from which a track moves.
         moving_turn_deg: turn from which a long box moves (half turns, a habit of annotators, do not count).
-        min_object_points: movers with fewer coloured points are left out.
+        min_object_points: dynamic objects with fewer coloured points are left out.
         point_times: take the object's motion during the sweep (``dt_s``) into account.
     """
 
@@ -110,7 +110,7 @@ class FusionReport:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-# --- movers ---------------------------------------------------------------------------------------------------------
+# --- dynamic objects ------------------------------------------------------------------------------------------------
 
 
 def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
@@ -166,12 +166,12 @@ def points_in_box(
 
 
 def separate(
-    sweep: SweepShots, movers: Sequence[Track], rules: FusionRules
+    sweep: SweepShots, dynamic: Sequence[Track], rules: FusionRules
 ) -> tuple[NDArray[np.int32], dict[int, NDArray[np.float32]]]:
-    """Assign each point of a sweep to a mover or to the static world.
+    """Assign each point of a sweep to a dynamic object or to the static world.
 
     Returns:
-        ``owner`` i32[N], index into ``movers`` or STATIC; and for each mover present the points it owns in its own
+        ``owner`` i32[N], index into ``dynamic`` or STATIC; and for each of them present the points it owns in its own
         frame, f32[n, 3], in the order of ``np.flatnonzero(owner == index)``.
     """
     xyz = sweep.points.xyz
@@ -181,8 +181,8 @@ def separate(
         return owner, owned
     dt_s = sweep.points.dt_s if rules.point_times and np.any(sweep.points.dt_s) else None
     reach_s = float(np.abs(dt_s).max()) if dt_s is not None else 0.0
-    for index in sorted(range(len(movers)), key=lambda i: float(np.prod(movers[i].size_m))):
-        track = movers[index]
+    for index in sorted(range(len(dynamic)), key=lambda i: float(np.prod(dynamic[i].size_m))):
+        track = dynamic[index]
         pose = track.pose_at(sweep.time_s)
         if pose is None:
             continue
@@ -237,7 +237,7 @@ def color_points(
     sweep: SweepShots,
     owner: NDArray[np.int32],
     owned: dict[int, NDArray[np.float32]],
-    movers: Sequence[Track],
+    dynamic: Sequence[Track],
     rules: FusionRules,
 ) -> Colors:
     """Colours (and semantics) of a sweep's points from the images beside it; see the module text for the rules."""
@@ -251,7 +251,7 @@ def color_points(
     gap_deg = rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz)
     stands = standing_points(_apply(_turn_only(sweep.world_from_lidar), sweep.points.xyz))
     for shot in sweep.shots:
-        xyz_cam, known = _points_in_camera(sweep, shot.view, members, owned, movers)
+        xyz_cam, known = _points_in_camera(sweep, shot.view, members, owned, dynamic)
         ids, column, row, z = _pixels(xyz_cam, known, shot.view, rules)
         in_image[ids] = True
         if rules.occlusion_test and len(ids):
@@ -274,15 +274,15 @@ def _points_in_camera(
     view: View,
     members: dict[int, NDArray[np.intp]],
     owned: dict[int, NDArray[np.float32]],
-    movers: Sequence[Track],
+    dynamic: Sequence[Track],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """All points in camera coordinates at the image's time f32[N, 3]; movers whose pose then is not known are flagged."""
+    """All points in camera coordinates at the image's time f32[N, 3]; dynamic objects whose pose then is not known are flagged."""
     xyz_cam = _apply(view.cam_from_world @ sweep.world_from_lidar, sweep.points.xyz)
     known = np.ones(len(xyz_cam), bool)
     for index, ids in members.items():
-        pose = movers[index].pose_at(view.time_s)
+        pose = dynamic[index].pose_at(view.time_s)
         if pose is None:
-            pose = movers[index].pose_at(sweep.time_s) if abs(view.time_s - sweep.time_s) < 0.02 else None
+            pose = dynamic[index].pose_at(sweep.time_s) if abs(view.time_s - sweep.time_s) < 0.02 else None
         if pose is None:
             known[ids] = False
         else:
@@ -509,14 +509,14 @@ def fuse_sweeps(
     """
     report = FusionReport()
     report.verdicts = {track.id: judge_track(track, rules) for track in tracks}
-    movers = [track for track in tracks if report.verdicts[track.id].moving]
+    dynamic = [track for track in tracks if report.verdicts[track.id].moving]
     static = CloudAccumulator(rules.voxel_m)
-    objects = [CloudAccumulator(rules.voxel_m) for _ in movers]
+    objects = [CloudAccumulator(rules.voxel_m) for _ in dynamic]
     labelled = False
     for sweep in sweeps:
         labelled |= any(shot.semantics is not None for shot in sweep.shots)
-        owner, owned = separate(sweep, movers, rules)
-        colors = color_points(sweep, owner, owned, movers, rules)
+        owner, owned = separate(sweep, dynamic, rules)
+        colors = color_points(sweep, owner, owned, dynamic, rules)
         keep = colors.seen & (owner == STATIC)
         static.add(
             _apply(sweep.world_from_lidar, sweep.points.xyz[keep]),
@@ -539,7 +539,7 @@ def fuse_sweeps(
     static_cloud = static.cloud("world", labelled)
     report.points_static = len(static_cloud)
     clouds: dict[str, PointCloud] = {}
-    for track, accumulator in zip(movers, objects, strict=True):
+    for track, accumulator in zip(dynamic, objects, strict=True):
         cloud = accumulator.cloud("object", labelled)
         report.object_points[track.id] = len(cloud)
         if len(cloud) < max(rules.min_object_points, 1):

@@ -96,7 +96,7 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path
 
 
 def _alignment(scene: Scene) -> dict[str, Any]:
-    """How the images fit the LiDAR, for the summary; a doubtful camera is said aloud."""
+    """How the images fit the LiDAR, for the summary; a warning for a doubtful camera."""
     found = alignment.camera_alignment(scene)
     for name, one in found.items():
         (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.describe(name, one)}")

@@ -1,6 +1,6 @@
 """KITTI importer: raw drives, odometry and tracking sequences, single object frames.
 
-What is read (the parts that are there are found by looking, and each choice is said aloud):
+What is read (the parts that are there are found by looking, and each choice is logged):
 
 =========== =============================================================================================
 images      ``image_02/data``, ``image_02``, ``image_2``, or ``image_02/<sequence>``

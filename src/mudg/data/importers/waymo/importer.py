@@ -51,7 +51,7 @@ from mudg.data.importers.waymo.tracks import Moment, TimedBoxes
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
-"""Our projections of points differ from the recorded ones by a few pixels; a median above this is said aloud."""
+"""Our projections of points differ from the recorded ones by a few pixels; a median above this gives a warning."""
 
 _SAME_POSE: Final = 1e-6
 _CLOCK_FRAMES: Final = 3
