@@ -81,5 +81,5 @@ def test_the_command_measures_a_model(tmp_path):
     assert {"psnr", "psnr_points", "psnr_reference", "flicker", "miou"} <= set(average)
     assert content["seam"]["seams"] == [7, 13, 19]
     assert "Seam" in (out / "bench.md").read_text()
-    with pytest.raises(UsageError, match="measurement"):
+    with pytest.raises(UsageError, match="no such benchmark"):
         bench.run("nothing", config, tmp_path / "other")
