@@ -16,7 +16,7 @@ import pytest
 
 from mudg.base import log
 from mudg.base.errors import NumericsError, ResourceError
-from mudg.base.processes import Task, run_side_by_side
+from mudg.base.processes import Task, process_alive, run_side_by_side
 
 PATIENCE_S = 60.0
 
@@ -148,3 +148,32 @@ def test_children_of_a_parent_that_is_killed_stop_too(tmp_path: Path) -> None:
     parent.kill()
     parent.wait()
     wait_for(folder / "stopped")
+
+
+def sleep_long(folder: Path) -> None:
+    """Says which process it is, and works for longer than any test waits."""
+    (folder / "started").write_text(str(os.getpid()))
+    time.sleep(600)
+
+
+def test_workers_of_a_parent_that_is_killed_end(tmp_path: Path) -> None:
+    (folder,) = folders(tmp_path, "a")
+    script = (
+        "import sys; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\nimport test_processes as t\n"
+        "from mudg.base.processes import run_in_processes\n"
+        "if __name__ == '__main__': list(run_in_processes(t.sleep_long, [(Path(sys.argv[1]),)] * 2, 2))"
+    )
+    (tmp_path / "parent.py").write_text(script)
+    places = [str(Path(__file__).parent), *(path for path in sys.path if path)]
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py"), str(folder), *places])
+    wait_for(folder / "started")
+    time.sleep(0.2)
+    worker = int((folder / "started").read_text())
+    parent.kill()
+    parent.wait()
+    for _ in range(200):
+        if not process_alive(worker):
+            return
+        time.sleep(0.1)
+    os.kill(worker, 9)
+    raise AssertionError("the worker outlived its parent")

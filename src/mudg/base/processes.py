@@ -205,6 +205,15 @@ def _prepare_child() -> None:
 
     log.set_quiet(True)
     torch.set_num_threads(1)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+
+
+def _exit_with_parent() -> None:
+    """End this process when its parent is gone: a worker whose parent was killed would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Iterator[Result]:
