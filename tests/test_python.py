@@ -16,7 +16,7 @@ from mudg.base.geometry import yaw_matrix
 
 
 @pytest.fixture(scope="module")
-def session(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def notebook(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Names that the page's code leaves behind, run from top to bottom in an empty folder."""
     blocks = re.findall(r"```python\n(.*?)```", (repository / "docs" / "python.md").read_text(), re.DOTALL)
     assert len(blocks) == 4
@@ -29,29 +29,29 @@ def session(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return {**names, "folder": folder}
 
 
-def test_the_page_runs_and_renders_what_it_says(session: dict[str, Any]) -> None:
-    picture, view = session["picture"], session["view"]
+def test_the_page_runs_and_renders_what_it_says(notebook: dict[str, Any]) -> None:
+    picture, view = notebook["picture"], notebook["view"]
     assert picture.rgb.shape == (80, 120, 3)
     assert picture.rgb.dtype == np.uint8
     assert picture.depth_m.shape == picture.classes.shape == picture.coverage.shape == (80, 120)
     assert 0 < np.nanmedian(picture.depth_m) < 100
-    same = session["fitted"].render(view.camera, view.world_from_cam, view.time_s)
+    same = notebook["fitted"].render(view.camera, view.world_from_cam, view.time_s)
     assert (same.rgb != picture.rgb).mean() > 0.2  # two metres aside looks different
-    assert session["depth_m"].shape == (1, 80, 120)
+    assert notebook["depth_m"].shape == (1, 80, 120)
 
 
-def test_a_render_in_memory_is_the_render_of_the_command(session: dict[str, Any]) -> None:
-    stored = mudg.read_observations(session["folder"] / "views" / "front_shift+2.0")
+def test_a_render_in_memory_is_the_render_of_the_command(notebook: dict[str, Any]) -> None:
+    stored = mudg.read_observations(notebook["folder"] / "views" / "front_shift+2.0")
     view = stored[0].view
-    picture = session["fitted"].render(view.camera, view.world_from_cam, view.time_s)
+    picture = notebook["fitted"].render(view.camera, view.world_from_cam, view.time_s)
     assert np.abs(picture.rgb / 255 - stored[0].rgb.permute(1, 2, 0).numpy()).max() <= 1 / 255
     both = np.isfinite(picture.depth_m) & np.isfinite(stored[0].depth[0].numpy())
     assert both.any()
     assert np.allclose(picture.depth_m[both], stored[0].depth[0].numpy()[both], rtol=1e-3)
 
 
-def test_objects_can_be_removed_and_moved(session: dict[str, Any]) -> None:
-    fitted, view = session["fitted"], session["view"]
+def test_objects_can_be_removed_and_moved(notebook: dict[str, Any]) -> None:
+    fitted, view = notebook["fitted"], notebook["view"]
     assert fitted.method == "street_gaussians"
     name = fitted.object_ids[0]
     gone = fitted.without(name)
@@ -70,8 +70,8 @@ def test_objects_can_be_removed_and_moved(session: dict[str, Any]) -> None:
         fitted.render(view.camera, np.zeros((4, 4)), view.time_s)
 
 
-def test_verbs_check_settings_as_the_command_does(session: dict[str, Any], tmp_path: Path) -> None:
-    folder = session["folder"]
+def test_verbs_check_settings_as_the_command_does(notebook: dict[str, Any], tmp_path: Path) -> None:
+    folder = notebook["folder"]
     with pytest.raises(UsageError, match="unknown configuration key voxel"):
         verbs.fuse(folder / "scene", tmp_path / "x", voxel=0.1)
     with pytest.raises(UsageError, match="not valid"):
@@ -84,8 +84,8 @@ def test_verbs_check_settings_as_the_command_does(session: dict[str, Any], tmp_p
     assert mudg.read_scene(folder / "scene").frames
 
 
-def test_what_a_notebook_gets_wrong_is_refused_in_words(session: dict[str, Any], tmp_path: Path) -> None:
-    scene, view = session["folder"] / "scene", session["view"]
+def test_what_a_notebook_gets_wrong_is_refused_in_words(notebook: dict[str, Any], tmp_path: Path) -> None:
+    scene, view = notebook["folder"] / "scene", notebook["view"]
     for said, wrong in (
         ("views are names with their folders", lambda: verbs.score(scene, ["views"], tmp_path / "a")),  # type: ignore[arg-type]
         ("shifts_m", lambda: verbs.run("city", tmp_path / "a", shifts_m=2.0)),
@@ -95,14 +95,14 @@ def test_what_a_notebook_gets_wrong_is_refused_in_words(session: dict[str, Any],
             r"loss: \{ssim_weight: \.\.\.\}",
             lambda: verbs.fit(scene, scene, tmp_path / "a", **{"loss.ssim_weight": 0.1}),
         ),
-        (r"not a mudg\.Camera", lambda: session["fitted"].render("front", view.world_from_cam, view.time_s)),
+        (r"not a mudg\.Camera", lambda: notebook["fitted"].render("front", view.world_from_cam, view.time_s)),
     ):
         with pytest.raises(UsageError, match=said):
             wrong()
     assert not (tmp_path / "a").exists()
 
 
-def test_settings_take_path_objects(session: dict[str, Any], tmp_path: Path) -> None:
-    folder = session["folder"]
+def test_settings_take_path_objects(notebook: dict[str, Any], tmp_path: Path) -> None:
+    folder = notebook["folder"]
     with pytest.raises(InputError, match="no diffusion model here"):
         verbs.synthesize(folder / "scene", folder / "fused", tmp_path / "a", model=tmp_path / "none")
