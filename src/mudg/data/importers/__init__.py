@@ -1,8 +1,8 @@
 """Importers: dataset logs in their own formats -> scene directories. This is the only place that lists them.
 
-A format is one module, or a folder with ``importer.py``, that has ``import_<format>(source, out, options) -> Scene``, ``looks_like_<format>(source) -> bool``
-and, where folders hold many logs, ``files_of_<format>(source, options) -> LogFiles``; its name in ``FORMATS`` and a case in
-``_functions``. Modules are loaded when they are asked.
+A format is one module, or a folder with ``importer.py``. It has ``import_<format>(source, out, options) -> Scene``,
+``looks_like_<format>(source) -> bool`` and, where folders hold many logs, ``files_of_<format>(source, options) -> LogFiles``; its name
+in ``FORMATS`` and a case in ``_functions``. Modules are loaded when their format is first asked for.
 """
 
 from __future__ import annotations
