@@ -7,7 +7,7 @@ module imports no torch, so that facts can be read without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
@@ -391,6 +391,38 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RenderPlanes:
+    """What a fitted scene shows at T views (or at one view, without the leading dimension).
+
+    Args:
+        color: f32[T, 3, H, W] in [0, 1], sky included.
+        depth: f32[T, 1, H, W] metres; meaningless where ``alpha`` is small.
+        alpha: f32[T, 1, H, W] in [0, 1]: coverage by Gaussians.
+        certainty: f32[T, 1, H, W] in [0, 1]: how far the photographs determined what is shown; never above ``alpha``.
+        semantics: u8[T, 1, H, W] class ids; 255 = unknown.
+    """
+
+    color: Tensor
+    depth: Tensor
+    alpha: Tensor
+    certainty: Tensor
+    semantics: Tensor
+
+    def __post_init__(self) -> None:
+        lead, (h, w) = tuple(self.color.shape[:-3]), tuple(self.color.shape[-2:])
+        one = (*lead, 1, h, w)
+        checks.check_tensors(self, color=(*lead, 3, h, w), depth=one, alpha=one, certainty=one, semantics=one)
+
+    def to(self, device: torch.device) -> RenderPlanes:
+        """The same planes on a device."""
+        return replace(self, **_moved(self, device))
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> RenderPlanes:
+        """The planes with ``change`` applied to each, for example a crop or a mirror image."""
+        return RenderPlanes(*(change(getattr(self, f.name)) for f in fields(self)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Condition:
     """What the diffusion model is given for T views.
 
@@ -404,6 +436,7 @@ class Condition:
         backdrop: f32[T, 3, H, W] in [0, 1] or None: a recorded image carried over as if all of it were far away.
         semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 = unknown.
         backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
+        renders: what a fitted scene shows at the views, or None.
     """
 
     views: tuple[View, ...]
@@ -415,16 +448,40 @@ class Condition:
     backdrop: Tensor | None = None
     semantics: Tensor | None = None
     backdrop_semantics: Tensor | None = None
+    renders: RenderPlanes | None = None
 
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
         one = (t, 1, h, w)
         checks.check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
         checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one)
+        if self.renders is not None:
+            checks.check_tensors(self.renders, color=(t, 3, h, w))
 
     def to(self, device: torch.device) -> Condition:
         """The same condition with its tensors on a device."""
-        return replace(self, **_moved(self, device))
+        renders = None if self.renders is None else self.renders.to(device)
+        return replace(self, **_moved(self, device), renders=renders)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinePatch:
+    """A rectangle of a training clip at a higher resolution.
+
+    Args:
+        clip: condition and truth of the rectangle; its sides are ``scale`` times those of the part that it covers.
+        row, column: the upper left pixel of that part in the clip.
+        scale: pixels of the patch per pixel of the clip.
+    """
+
+    clip: Clip
+    row: int
+    column: int
+    scale: int
+
+    def to(self, device: torch.device) -> FinePatch:
+        """The same patch with its tensors on a device."""
+        return replace(self, clip=self.clip.to(device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -437,6 +494,7 @@ class Clip:
         semantics: i64[T, H, W] train ids, 255 = unlabelled.
         shift_m: lateral shift from the recorded path, metres, positive to the left.
         point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring only.
+        fine: a rectangle at a higher resolution, or None.
     """
 
     condition: Condition
@@ -446,6 +504,7 @@ class Clip:
     semantics: Tensor
     shift_m: float = 0.0
     point_color: Tensor | None = None
+    fine: FinePatch | None = None
 
     def __post_init__(self) -> None:
         t, _, h, w = self.condition.color.shape
@@ -455,7 +514,8 @@ class Clip:
 
     def to(self, device: torch.device) -> Clip:
         """The same clip with its tensors on a device."""
-        return replace(self, condition=self.condition.to(device), **_moved(self, device))
+        fine = None if self.fine is None else self.fine.to(device)
+        return replace(self, condition=self.condition.to(device), **_moved(self, device), fine=fine)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

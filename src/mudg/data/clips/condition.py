@@ -8,9 +8,11 @@
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
    falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
 5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
-6. the classes of labelled points and images travel with their colours.
+6. the classes of labelled points and images travel with their colours;
+7. renders of a scene fitted to the recorded images, if there is one, are given too, and in steps 3 to 5 tell the depth of what no
+   point was measured on.
 
-Steps 2 to 6 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
+Steps 2 to 7 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
 only, zero where nothing is known, the reference image in frame 0 being put in by the model.
 
 Training clips are made of these in `from_city.py` and `from_log.py`.
@@ -19,7 +21,7 @@ Training clips are made of these in `from_city.py` and `from_log.py`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -30,7 +32,7 @@ from torch.nn import functional
 
 from mudg.base import geometry, palette
 from mudg.base.errors import InputError
-from mudg.base.types import Condition, FusedCloud, Photo, Track, View
+from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, Track, View
 from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
@@ -63,7 +65,9 @@ class ConditionRules:
     occluder_m: float = 0.2
     """Side of the square with which points hide what lies behind them."""
     measured_reach_px: int = 4
-    """A pixel this near to a measured one is left to it; farther ones may be filled `beyond` what was measured."""
+    """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where there is one."""
+    solid_alpha: float = 0.5
+    """Coverage from which on a render has a surface; what it covers less is taken to be far away."""
     published: bool = False
     """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
 
@@ -84,34 +88,46 @@ class ProjectedPoints:
     semantics: Tensor
 
 
-Beyond = Callable[[View], ProjectedPoints]
-"""What is known of a view from elsewhere than its points; `valid` where anything is."""
+RenderAt = Callable[[View], RenderPlanes]
+"""What a fitted scene shows at a view, without the leading dimension."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnCloud:
-    """A fused cloud ready to be drawn, and what is known `beyond` it."""
+    """A fused cloud ready to be drawn, and the renders of a fitted scene, if there is one."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
     rules: ConditionRules
-    beyond: Beyond | None
+    render_at: RenderAt | None
 
-    def project(self, view: View) -> ProjectedPoints:
-        """The points seen at a view, and what is known beyond them."""
+    def look(self, view: View) -> Surfaces:
+        """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured pixel."""
         sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
-        return sparse if self.beyond is None else fill_beyond(sparse, self.beyond(view), self.rules.measured_reach_px)
+        color, depth, moving, ids = _filled(sparse, self.rules)
+        if self.render_at is None:
+            return Surfaces(sparse.valid, color, depth, moving, ids, None)
+        render = self.render_at(view)
+        near = torch.from_numpy(ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1)))
+        solid = render.alpha[0] >= self.rules.solid_alpha
+        shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(max=self.rules.far_m)
+        pick = lambda mine, theirs: torch.where(near, mine, theirs)  # noqa: E731
+        return Surfaces(
+            sparse.valid, pick(color, render.color), pick(depth, shown), moving & near, pick(ids, render.semantics[0]), render
+        )
 
 
-def fill_beyond(measured: ProjectedPoints, other: ProjectedPoints, reach_px: int) -> ProjectedPoints:
-    """`measured`, and `other` where it is valid and nothing was measured within `reach_px` (steps to the four sides)."""
-    near = torch.from_numpy(ndimage.binary_dilation(measured.valid.numpy(), iterations=max(reach_px, 1)))
-    taken = other.valid & ~near
-    pick = lambda mine, theirs: torch.where(taken, theirs, mine)  # noqa: E731
-    return ProjectedPoints(
-        pick(measured.rgb, other.rgb), pick(measured.depth, other.depth), measured.valid | taken, pick(measured.moving, other.moving),
-        pick(measured.semantics, other.semantics),
-    )  # fmt: skip
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfaces:
+    """What is known of a view before images are warped in: measured bool[H,W]; color f32[3,H,W], depth f32[H,W] m, moving bool[H,W]
+    and ids u8[H,W] of every pixel; the render, if there is one."""
+
+    measured: Tensor
+    color: Tensor
+    depth: Tensor
+    moving: Tensor
+    ids: Tensor
+    render: RenderPlanes | None
 
 
 def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -190,7 +206,7 @@ def build_conditions(
     recorded: Sequence[Photo],
     rules: ConditionRules,
     sources: dict[int, WarpSource] | None = None,
-    beyond: Beyond | None = None,
+    render_at: RenderAt | None = None,
 ) -> tuple[Condition, Condition]:
     """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
 
@@ -198,8 +214,8 @@ def build_conditions(
         cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
         recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
         sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views.
-        beyond: what is known of a view from elsewhere, for example from a fitted scene; used where no point was measured
-            within `rules.measured_reach_px` as if it were points (not with `published`).
+        render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was measured on
+            (not with `published`). Recorded images that `sources` holds must have been prepared with the same renders.
 
     Returns:
         Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
@@ -219,43 +235,65 @@ def build_conditions(
     sources = {} if sources is None else sources
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
-    points = DrawnCloud(cloud, tracks, rules, beyond)
-    parts = [_condition_of_view(points, view, recorded, rules, sources) for view in fine_views]
+    points = DrawnCloud(cloud, tracks, rules, render_at)
+    parts, shown = zip(*(_condition_of_view(points, view, recorded, rules, sources) for view in fine_views))
     color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*parts))
+    renders = None if render_at is None else _stacked_renders(shown)
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
-                     warped, backdrop, ids, far_ids)  # fmt: skip
+                     warped, backdrop, ids, far_ids, renders)  # fmt: skip
     if size == (rules.width, rules.height):
         return fine, fine
 
     def reduced(x: Tensor) -> Tensor:
         return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
 
-    own = [points.project(view) for view in small]
-    own_depth = torch.stack([_filled(sparse, rules)[1] for sparse in own])[:, None]
-    own_valid = torch.stack([sparse.valid for sparse in own])[:, None]
     small_size = (rules.height, rules.width)
-    own_ids, own_far_ids = (functional.interpolate(x, size=small_size, mode="nearest-exact") for x in (ids, far_ids))
+    picked = lambda x: functional.interpolate(x, size=small_size, mode="nearest-exact")  # noqa: E731
+    small_renders = None
+    if renders is not None:
+        small_renders = RenderPlanes(
+            reduced(renders.color), picked(renders.depth), reduced(renders.alpha), reduced(renders.certainty), picked(renders.semantics)
+        )
+    own = [DrawnCloud(cloud, tracks, rules, _in_order(small_renders)).look(view) for view in small]
+    own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
     condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
-                          reduced(backdrop), own_ids, own_far_ids)  # fmt: skip
+                          reduced(backdrop), picked(ids), picked(far_ids), small_renders)  # fmt: skip
     return condition, fine
+
+
+def _stacked_renders(shown: Sequence[RenderPlanes]) -> RenderPlanes:
+    return RenderPlanes(*(torch.stack([getattr(r, f.name) for r in shown]) for f in fields(RenderPlanes)))
+
+
+def _in_order(renders: RenderPlanes | None) -> RenderAt | None:
+    """Renders [T,..] that are at hand, handed out one view after another."""
+    if renders is None:
+        return None
+    numbers = iter(range(len(renders.color)))
+
+    def next_one(view: View) -> RenderPlanes:
+        del view
+        number = next(numbers)
+        return renders.map(lambda x: x[number])
+
+    return next_one
 
 
 def _condition_of_view(
     points: DrawnCloud, view: View, recorded: Sequence[Photo], rules: ConditionRules, sources: dict[int, WarpSource]
-) -> tuple[Tensor, ...]:
+) -> tuple[tuple[Tensor, ...], RenderPlanes | None]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
-    the backdrop u8[1,H,W] of one view, at its size."""
+    the backdrop u8[1,H,W] of one view, at its size; and its render."""
 
     def source(number: int) -> WarpSource:
         if number not in sources:
             sources[number] = _prepare_source(points, recorded[number], view, rules)
         return sources[number]
 
-    sparse = points.project(view)
-    color, depth, moving, ids = _filled(sparse, rules)
-    found = torch.zeros_like(sparse.valid)
+    here = points.look(view)
+    color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     if not (rules.warp and recorded):
-        return color, depth[None], sparse.valid[None], found[None], color, ids[None], ids[None]
+        return (color, depth[None], here.measured[None], found[None], color, ids[None], ids[None]), here.render
     order = _order_of_images(view, recorded, rules)
     nearest = source(order[0])
     x, y, _ = carry(view, torch.full((1, *depth.shape), rules.backdrop_m), nearest.view)
@@ -265,11 +303,11 @@ def _condition_of_view(
         fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
         rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
-        new = new & ~found if fresh else new & ~found & ~moving
+        new = new & ~found if fresh else new & ~found & ~here.moving
         color = torch.where(new, rgb, color)
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
         found = found | new
-    return color, depth[None], sparse.valid[None], found[None], backdrop, ids[None], far_ids
+    return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
 
 
 def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -331,9 +369,9 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
-    _, depth, moving, _ = _filled(points.project(view), rules)
+    here = points.look(view)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
-    return WarpSource(view, rgb, depth, moving, _ids_at(recorded, width, height))
+    return WarpSource(view, rgb, here.depth, here.moving, _ids_at(recorded, width, height))
 
 
 def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:

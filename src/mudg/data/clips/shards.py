@@ -9,13 +9,21 @@ A shard is a safetensors file with, for K clips of T frames,
     ids, backdrop_ids u8[K,T,H,W]: classes that came with color and backdrop, 255 = unknown
     world_from_cam f64[K,T,4,4]  intrinsics f64[K,T,4] (fx, fy, cx, cy)
     point_color u8[K,T,3,H,W], cities for scoring only: colour of the nearest point, no image warped in
+
+and, where a fitted scene was rendered,
+
+    render u8[K,T,3,H,W]  render_depth f16[K,T,H,W]  alpha, certainty u8[K,T,H,W] (of 255)  render_ids u8[K,T,H,W]
+    rendered bool[K]: false = this clip has no renders
+
+and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column, scale).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,11 +31,13 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mudg.base import store
+from mudg.base import seeds, store
 from mudg.base.errors import InputError
-from mudg.base.types import Camera, Clip, Condition, View
+from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, View
 
 FAR_M = 1000.0
+FINE = "fine_"
+"""What the names of a patch's arrays begin with."""
 FLAG_VALID, FLAG_WARPED, FLAG_DEPTH_UNKNOWN = 1, 2, 4
 
 
@@ -65,8 +75,7 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
         return np.array([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in c.views], np.float64)
 
     conditions = [clip.condition for clip in clips]
-    points = [u8(c.point_color) for c in clips if c.point_color is not None]
-    return ({"point_color": np.stack(points)} if points else {}) | {
+    arrays = {
         "rgb": np.stack([u8(c.rgb) for c in clips]),
         "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
         "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
@@ -81,6 +90,28 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
         "intrinsics": np.stack([intrinsics(c) for c in conditions]),
         "shift_m": np.asarray([c.shift_m for c in clips], np.float32),
     }
+    points = [u8(c.point_color) for c in clips if c.point_color is not None]
+    if points:
+        arrays["point_color"] = np.stack(points)
+    if any(c.renders is not None for c in conditions):
+        shown = [_empty_renders(c) if c.renders is None else c.renders for c in conditions]
+        arrays |= {
+            "render": np.stack([u8(r.color) for r in shown]), "render_depth": np.stack([f16(r.depth) for r in shown]),
+            "alpha": np.stack([u8(r.alpha)[:, 0] for r in shown]), "certainty": np.stack([u8(r.certainty)[:, 0] for r in shown]),
+            "render_ids": np.stack([r.semantics[:, 0].numpy() for r in shown]),
+            "rendered": np.array([c.renders is not None for c in conditions]),
+        }  # fmt: skip
+    patches = [clip.fine for clip in clips if clip.fine is not None]
+    if patches and len(patches) == len(clips):
+        fine = pack_clips([patch.clip for patch in patches], gaps=gaps)
+        arrays |= {f"{FINE}{name}": values for name, values in fine.items()}
+        arrays[f"{FINE}place"] = np.array([[p.row, p.column, p.scale] for p in patches], np.int32)
+    return arrays
+
+
+def _empty_renders(condition: Condition) -> RenderPlanes:
+    nothing = torch.zeros_like(condition.depth)
+    return RenderPlanes(condition.color, nothing, nothing, nothing, torch.full_like(condition.valid, 255, dtype=torch.uint8))
 
 
 def write_shard(folder: Path, city: int, arrays: Mapping[str, NDArray[np.generic]]) -> None:
@@ -106,27 +137,48 @@ _PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "ba
               "intrinsics")  # fmt: skip
 
 
+_RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
+
+
 def read_clip(folder: Path, city: int, clip: int, frames: Sequence[int]) -> Clip:
     """Some frames of one clip of a shard, as a `Clip`. Shards hold no times: frame numbers stand for seconds."""
     with _open(shard_path(folder, city)) as shard:
-        names = [*_PER_FRAME, *(("point_color",) if "point_color" in shard.keys() else ())]
-        found = {name: torch.from_numpy(shard.get_slice(name)[clip][np.asarray(frames)]) for name in names}
-        reference = torch.from_numpy(shard.get_slice("reference")[clip])
-        shift_m = float(shard.get_tensor("shift_m")[clip])
+        made = _read_part(shard, "", clip, frames)
+        if f"{FINE}place" not in shard.keys():
+            return made
+        row, column, scale = shard.get_slice(f"{FINE}place")[clip].tolist()
+        return replace(made, fine=FinePatch(_read_part(shard, FINE, clip, frames), row, column, scale))
+
+
+def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Clip:
+    """A clip, or its patch, from the arrays whose names begin with `prefix`."""
+    there = set(shard.keys())
+    rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
+    names = [*_PER_FRAME, *(("point_color",) if f"{prefix}point_color" in there else ()), *(_RENDERS if rendered else ())]
+    found = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in names}
+    reference = torch.from_numpy(shard.get_slice(f"{prefix}reference")[clip])
+    shift_m = float(shard.get_tensor(f"{prefix}shift_m")[clip])
     image = lambda x: x.float() / 255  # noqa: E731
+    plane = lambda x: x.float().unsqueeze(1)  # noqa: E731
     flags, (height, width) = found["flags"].unsqueeze(1), found["rgb"].shape[-2:]
     views = tuple(
         View(Camera("clip", width, height, *lens.tolist()), pose.numpy(), float(frame))
         for frame, lens, pose in zip(frames, found["intrinsics"], found["world_from_cam"])
     )
+    renders = None
+    if rendered:
+        renders = RenderPlanes(
+            image(found["render"]), plane(found["render_depth"]), plane(found["alpha"]) / 255, plane(found["certainty"]) / 255,
+            found["render_ids"].unsqueeze(1),
+        )  # fmt: skip
     condition = Condition(
-        views, image(found["color"]), found["sparse_depth"].float().unsqueeze(1), (flags & FLAG_VALID) > 0, image(reference),
+        views, image(found["color"]), plane(found["sparse_depth"]), (flags & FLAG_VALID) > 0, image(reference),
         warped=(flags & FLAG_WARPED) > 0, backdrop=image(found["backdrop"]), semantics=found["ids"].unsqueeze(1),
-        backdrop_semantics=found["backdrop_ids"].unsqueeze(1),
+        backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders,
     )  # fmt: skip
     return Clip(
-        condition, image(found["rgb"]), found["depth"].float().unsqueeze(1), (flags & FLAG_DEPTH_UNKNOWN) == 0,
-        found["semantics"].long(), shift_m, image(found["point_color"]) if "point_color" in found else None,
+        condition, image(found["rgb"]), plane(found["depth"]), (flags & FLAG_DEPTH_UNKNOWN) == 0, found["semantics"].long(), shift_m,
+        image(found["point_color"]) if "point_color" in found else None,
     )  # fmt: skip
 
 
@@ -134,13 +186,12 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
-    +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `_worse_ids`. A mirrored clip keeps its
+    +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `ClassMistakes`. A mirrored clip keeps its
     poses and intrinsics: they then describe the mirror image of the place.
 
     Args:
-        clip: as read from a shard, with warped colours, backdrop and classes.
+        clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way.
     """
-    given = clip.condition
     gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
     gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
     middle = float(clip.rgb.mean())
@@ -153,38 +204,81 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
         x = grey + saturation * (x - grey)
         return (middle + contrast * (x - middle)).clamp(0, 1)
 
-    rgb = curve(clip.rgb, 1.0)
-    varied: dict[str, Tensor] = {n: curve(getattr(given, n), error) for n in ("color", "backdrop", "reference")}
-    varied["semantics"], varied["backdrop_semantics"] = _worse_ids(given.semantics, given.backdrop_semantics, rng)
-    if rng.random() >= 0.5:
-        return replace(clip, rgb=rgb, condition=replace(given, **varied))
-    varied |= {name: getattr(given, name) for name in ("depth", "valid", "warped")}
-    turned = replace(given, **{name: x.flip(-1) for name, x in varied.items()})
-    flipped = {name: getattr(clip, name).flip(-1) for name in ("depth", "depth_valid", "semantics")}
-    return replace(clip, condition=turned, rgb=rgb.flip(-1), **flipped, shift_m=-clip.shift_m)
+    classes = ClassMistakes.drawn(rng)
+    mirrored = rng.random() < 0.5
+    without_renders = rng.random() < NO_RENDERS
+
+    def varied(one: Clip) -> Clip:
+        given = one.condition
+        colors = {n: curve(getattr(given, n), error) for n in ("color", "backdrop", "reference")}
+        ids = {n: classes.on(getattr(given, n)) for n in ("semantics", "backdrop_semantics")}
+        renders = None
+        if given.renders is not None and not without_renders:
+            shown = given.renders
+            renders = replace(shown, color=curve(shown.color, error), semantics=classes.on(shown.semantics))
+        made = replace(one, rgb=curve(one.rgb, 1.0), condition=replace(given, **colors, **ids, renders=renders))
+        return _mirrored(made) if mirrored else made
+
+    made = varied(clip)
+    if clip.fine is None:
+        return made
+    column = clip.fine.column
+    if mirrored:
+        column = clip.rgb.shape[-1] - column - clip.fine.clip.rgb.shape[-1] // clip.fine.scale
+    return replace(made, fine=replace(clip.fine, clip=varied(clip.fine.clip), column=column))
+
+
+def _mirrored(clip: Clip) -> Clip:
+    """The mirror image of a clip without its patch; the poses stay."""
+    flip = lambda x: x.flip(-1)  # noqa: E731
+    given = clip.condition
+    names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
+    turned = {name: flip(getattr(given, name)) for name in names}
+    renders = None if given.renders is None else given.renders.map(flip)
+    own = {name: flip(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
+    return replace(clip, condition=replace(given, **turned, renders=renders), **own, shift_m=-clip.shift_m)
 
 
 NO_IDS, WORSE_IDS = 0.35, 0.25
 """Shares of the training clips that get no classes, and classes with mistakes."""
+NO_RENDERS = 0.1
+"""Share of the training clips with renders that are used without."""
 
 
-def _worse_ids(ids: Tensor, far_ids: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Given classes u8[T,1,H,W] as a labeller might have made them: exact, none at all, or with mistakes.
+@dataclass(frozen=True, eq=False)
+class ClassMistakes:
+    """Given classes as a labeller might have made them: exact, none at all, or with mistakes.
 
-    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout, and blocks of 8x8 pixels are unknown.
+    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout (`table` u8[256], None = none are given), and blocks
+    of 8x8 pixels are unknown (`holes`: the share of the blocks, and the seed of the draw).
     """
-    draw = rng.random()
-    if draw < NO_IDS:
-        return torch.full_like(ids, 255), torch.full_like(far_ids, 255)
-    if draw >= NO_IDS + WORSE_IDS:
-        return ids, far_ids
-    table = np.arange(256)
-    for number in range(19):
-        chance = rng.random()
-        table[number] = 255 if chance < 0.15 else int(rng.integers(19)) if chance < 0.23 else number
-    height, width = ids.shape[-2:]
-    holes = torch.from_numpy(rng.random((1, 1, -(-height // 8), -(-width // 8))) < rng.uniform(0, 0.25))
-    holes = holes.repeat_interleave(8, -2).repeat_interleave(8, -1)[..., :height, :width]
-    lookup = torch.from_numpy(table.astype(np.uint8))
-    worse = lambda x: torch.where(holes, torch.full_like(x, 255), lookup[x.long()])  # noqa: E731
-    return worse(ids), worse(far_ids)
+
+    table: NDArray[np.uint8] | None
+    holes: tuple[float, int]
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> ClassMistakes:
+        """One way to be wrong."""
+        draw = rng.random()
+        if draw < NO_IDS:
+            return cls(None, (0.0, 0))
+        table = np.arange(256)
+        if draw >= NO_IDS + WORSE_IDS:
+            return cls(table.astype(np.uint8), (0.0, 0))
+        for number in range(19):
+            chance = rng.random()
+            table[number] = 255 if chance < 0.15 else int(rng.integers(19)) if chance < 0.23 else number
+        return cls(table.astype(np.uint8), (float(rng.uniform(0, 0.25)), int(rng.integers(2**31))))
+
+    def on(self, ids: Tensor) -> Tensor:
+        """Classes u8[T,1,H,W] with the mistakes."""
+        if self.table is None:
+            return torch.full_like(ids, 255)
+        worse = torch.from_numpy(self.table)[ids.long()]
+        share, seed = self.holes
+        if not share:
+            return worse
+        height, width = ids.shape[-2:]
+        blocks = seeds.numpy_rng(seed, 0, "holes").random((1, 1, -(-height // 8), -(-width // 8))) < share
+        holes = torch.from_numpy(blocks).repeat_interleave(8, -2).repeat_interleave(8, -1)[..., :height, :width]
+        return torch.where(holes, torch.full_like(worse, 255), worse)

@@ -40,15 +40,11 @@ class CodecConfig:
 
 @dataclass(frozen=True)
 class Decoded:
-    """Pixels again: rgb f32[..,3,H,W] in [0,1], depth f32[..,1,H,W] m, semantics i64[..,H,W], margin f32[..,1,H,W].
-
-    `margin` in [0,1] is how clearly the winning class won.
-    """
+    """Pixels again: rgb f32[..,3,H,W] in [0,1], depth f32[..,1,H,W] m, semantics i64[..,H,W]."""
 
     rgb: Tensor
     depth: Tensor
     semantics: Tensor
-    margin: Tensor
 
 
 def depth_to_code(depth_m: Tensor, config: CodecConfig) -> Tensor:
@@ -212,9 +208,7 @@ class PatchCodec(nn.Module):
         """Pixels of latents [..,C,h,w] of all modalities, with the same leading axes."""
         lead = latents["rgb"].shape[:-3]
         rgb, depth, scores = self.decode_raw({m: z.reshape(-1, *z.shape[-3:]) for m, z in latents.items()})
-        best = scores.softmax(1).topk(2, dim=1)
-        made = (((rgb + 1) / 2).clamp(0, 1), code_to_depth(depth, self.config), best.indices[:, 0],
-                best.values[:, :1] - best.values[:, 1:])  # fmt: skip
+        made = (((rgb + 1) / 2).clamp(0, 1), code_to_depth(depth, self.config), scores.argmax(1))
         return Decoded(*(x.reshape(*lead, *x.shape[1:]) for x in made))
 
 

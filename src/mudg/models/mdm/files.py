@@ -33,6 +33,9 @@ FORMER_FIELDS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 """Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is still built."""
 
+LATER_FIELDS: dict[str, Any] = {"renders": False, "finish_widths": [], "finish_blocks": []}
+"""Fields that earlier model files lack, with what their models are."""
+
 
 def folder_of(path: Path | str) -> Path:
     """The folder that a name of `EMBEDDED` stands for; any other text is a folder itself."""
@@ -75,7 +78,7 @@ def config_from_dict(values: Any, where: str = "model configuration") -> MDMConf
 
     top = _without_former(values, "top", where)
     if isinstance(top, Mapping):
-        top = {**top, "codec": _without_former(top.get("codec"), "codec", f"{where}: codec")}
+        top = {**LATER_FIELDS, **top, "codec": _without_former(top.get("codec"), "codec", f"{where}: codec")}
     return records.parse_dataclass(MDMConfig, top, f"{where}: ")
 
 

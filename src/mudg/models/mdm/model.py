@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 import torch
@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from mudg.base import palette, seeds
 from mudg.base.errors import UsageError
-from mudg.base.types import Clip, Condition
+from mudg.base.types import Clip, Condition, RenderPlanes
 from mudg.core import losses, noise
 from mudg.core.align import align_depth
 from mudg.core.noise import Schedule
@@ -49,6 +49,7 @@ from mudg.models.mdm.codec import (
     code_to_depth,
     semantic_shares,
 )  # fmt: skip
+from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles
 from mudg.models.mdm.network import (
     ConditionPixels,
     MDMConfig,
@@ -72,7 +73,8 @@ class ConditionLatents:
 
     planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
     [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
-    trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..].
+    trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of models that use
+    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
     """
 
     planes: Tensor
@@ -80,6 +82,8 @@ class ConditionLatents:
     backdrop: Tensor
     seen: dict[Modality, Tensor]
     pixels: ConditionPixels
+    render: dict[Modality, Tensor] = field(default_factory=dict)
+    certainty: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -138,6 +142,16 @@ CONDITION_PLANES = 3 * 4 + 2 * PatchCodec.factor**2 + CLASSES + 1
 GATES = 4
 """Outputs that say how much of the condition is copied: its colour, its depth, the backdrop's colour, its classes."""
 
+RENDER_PLANES = 2 * 4 + 2 + CLASSES + 1
+"""Further planes of models that use renders: latents of their colour and depth, coverage and certainty, class shares and their
+sum."""
+
+RENDER_GATES = 2
+"""Their further outputs: how much of the render's colour and of its depth is copied."""
+
+NO_RENDER = -1.0
+"""Coverage that stands for: there is no render."""
+
 LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
 """Weights of the modalities in the joint loss."""
 
@@ -154,11 +168,17 @@ class MDM(nn.Module):
         self.codec = PatchCodec(config.codec)
         self.schedule = Schedule(config.schedule)
         noisy = sum(self.codec.channels.values())
-        self.net = UNet(config, noisy + CONDITION_PLANES, noisy + GATES).to(memory_format=torch.channels_last)
+        further = (RENDER_PLANES, RENDER_GATES) if config.renders else (0, 0)
+        self.net = UNet(config, noisy + CONDITION_PLANES + further[0], noisy + GATES + further[1])
+        self.net.to(memory_format=torch.channels_last)
         self.refiner: Refiner | None = None
         if config.refine_widths:
             (fine, coarse), (outer, inner) = config.refine_widths, config.refine_blocks
-            self.refiner = Refiner(noisy, (fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
+            self.refiner = Refiner(noisy, (fine, coarse), (outer, inner), config.renders).to(memory_format=torch.channels_last)
+        self.finisher: Finisher | None = None
+        if config.finish_widths:
+            (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
+            self.finisher = Finisher((fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
 
     # inputs -----------------------------------------------------------------------------------------------------------
 
@@ -177,30 +197,40 @@ class MDM(nn.Module):
         A condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop, and
         unknown classes.
         """
-        batch = [condition] if isinstance(condition, Condition) else list(condition)
-        color, depth, valid = (torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth", "valid"))
-        warped = torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch])
-        backdrop = torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch])
-        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
-        ids = torch.stack([unknown if c.semantics is None else c.semantics for c in batch])
-        backdrop_ids = torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch])
+        given = _Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
+        color, depth, valid, warped, ids = given.color, given.depth, given.valid, given.warped, given.ids
         self.check_size(*color.shape[-2:])
-        valid, warped = valid.float(), warped.float()
         factor = self.codec.factor
-        pool = lambda m: functional.avg_pool2d(m.flatten(0, 1), factor).unflatten(0, m.shape[:2])  # noqa: E731
         copy: dict[Modality, Tensor] = {
-            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth),
-            "semantics": shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2]),
+            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth), "semantics": _cell_shares(ids),
         }  # fmt: skip
         seen: dict[Modality, Tensor] = {
-            "rgb": pool(torch.maximum(valid, warped)), "depth": pool(valid), "semantics": copy["semantics"].sum(2, keepdim=True)
+            "rgb": _cell_means(torch.maximum(valid, warped), factor), "depth": _cell_means(valid, factor),
+            "semantics": copy["semantics"].sum(2, keepdim=True),
         }  # fmt: skip
-        far = self.codec.encode_rgb(backdrop)
+        far = self.codec.encode_rgb(given.backdrop)
         masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
         planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
-        depth_code = self.codec.linear_depth_code(depth)
-        pixels = (color * 2 - 1, backdrop * 2 - 1, depth_code, valid, warped, ids, backdrop_ids)
-        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, ConditionPixels(*(x.flatten(0, 1) for x in pixels)))
+        pixels = self._pixels_of(given)
+        if not self.config.renders:
+            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels)
+        shown = given.renders
+        render: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(shown.color), "depth": self.codec.encode_depth(shown.depth)}
+        classes, certainty = _cell_shares(shown.semantics), _cell_means(shown.certainty, factor)
+        alpha = _cell_means(shown.alpha, factor)
+        planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
+        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty)
+
+    def _pixels_of(self, given: _Stacked) -> ConditionPixels:
+        """What the refiner sees of a batch of conditions, [B*T,..]."""
+        code = self.codec.linear_depth_code
+        pixels = [
+            given.color * 2 - 1, given.backdrop * 2 - 1, code(given.depth), given.valid, given.warped, given.ids, given.backdrop_ids
+        ]  # fmt: skip
+        if self.config.renders:
+            shown = given.renders
+            pixels += [shown.color * 2 - 1, code(shown.depth), shown.alpha, shown.certainty, shown.semantics]
+        return ConditionPixels(*(x.flatten(0, 1) for x in pixels))
 
     # network ----------------------------------------------------------------------------------------------------------
 
@@ -212,9 +242,15 @@ class MDM(nn.Module):
         Returns the clean latents it states, and the log-shares of the classes [B,T,19,h,w].
         """
         sizes = [x[m].shape[2] for m in MODALITIES]
-        out, gates = self.net(torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), t).split([sum(sizes), GATES], 2)
-        copy_rgb, copy_depth, copy_far, copy_classes = gates.split(1, 2)
+        out, gates = self.net(torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), t).split(
+            [sum(sizes), GATES + (RENDER_GATES if encoded.render else 0)], 2
+        )
+        copy_rgb, copy_depth, copy_far, copy_classes, *copy_render = gates.split(1, 2)
         rgb, depth, classes = out.split(sizes, 2)
+        if encoded.certainty is not None:
+            opening = COPY_BIAS * (2 * encoded.certainty - 2)
+            rgb = rgb + (copy_render[0] + opening).sigmoid() * encoded.render["rgb"]
+            depth = depth + (copy_render[1] + opening).sigmoid() * encoded.render["depth"]
         rgb = rgb + (copy_rgb + COPY_BIAS * encoded.seen["rgb"]).sigmoid() * encoded.copy["rgb"]
         depth = depth + (copy_depth + COPY_BIAS * encoded.seen["depth"]).sigmoid() * encoded.copy["depth"]
         rgb = rgb + (copy_far - COPY_BIAS * encoded.seen["rgb"]).sigmoid() * encoded.backdrop
@@ -249,6 +285,7 @@ class MDM(nn.Module):
         total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
         if self.refiner is not None:
             errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings)
+            errors |= self._finisher_terms(stated, encoded, clips, settings)
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
         return Losses(total, terms)  # type: ignore[arg-type]
@@ -261,15 +298,20 @@ class MDM(nn.Module):
         rgb, depth, valid, ids = (
             torch.stack([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
         )
-        known = valid.float().flatten(0, 1)
+        pixels = self.pixel_truth(clips)
         latents: dict[Modality, Tensor] = {
             "rgb": self.codec.encode_rgb(rgb), "depth": self.codec.encode_depth(depth),
             "semantics": self.codec.encode_semantics(ids),
         }  # fmt: skip
-        code = self.codec.linear_depth_code(depth)
-        pixels = PixelTruth((rgb * 2 - 1).flatten(0, 1), code.flatten(0, 1), ids.flatten(0, 1), known)
-        cells = functional.avg_pool2d(known, self.codec.factor).unflatten(0, valid.shape[:2])
+        cells = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, valid.shape[:2])
         return EncodedTruth(latents, semantic_shares(ids), cells, pixels)
+
+    def pixel_truth(self, clips: Sequence[Clip]) -> PixelTruth:
+        """What the refiner should give for clips or patches of one size."""
+        rgb, depth, valid, ids = (
+            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+        )
+        return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, valid.float())
 
     def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
         """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""
@@ -283,21 +325,58 @@ class MDM(nn.Module):
     def _refiner_terms(
         self, stated: dict[Modality, Tensor], encoded: ConditionLatents, truth: PixelTruth, part: BatchPart, settings: LossSettings
     ) -> dict[str, Tensor]:
-        """Weighted terms of the pixel loss in a rectangle of the image; depth in the sky counts threefold."""
+        """Weighted terms of the refiner in a rectangle of the image, at the denoiser's resolution."""
         frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
         cells = self._refined_window(part, settings.refined_share, h, w)
         latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
-        factor, codec = self.codec.factor, self.config.codec
+        factor = self.codec.factor
         tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
-        made, truth = self.refine(latents, encoded.pixels.crop(tall, wide), frames), truth.crop(tall, wide)
+        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
+        return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
+
+    def _finisher_terms(
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip], settings: LossSettings
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the finisher on the patches that the clips have; denoiser and refiner learn nothing from them."""
+        patches = [(number, clip.fine) for number, clip in enumerate(clips) if clip.fine is not None]
+        if self.finisher is None or not patches:
+            return {}
+        frames = stated["rgb"].shape[1]
+        latents = {m: z.flatten(0, 1).detach() for m, z in stated.items()}
+        with torch.no_grad():
+            small = self._made(self.refine(latents, encoded.pixels, frames))
+            enlarged = []
+            for number, patch in patches:
+                (h, w), (height, width) = stated["rgb"].shape[-2:], patch.clip.rgb.shape[-2:]
+                size = h * self.codec.factor * patch.scale, w * self.codec.factor * patch.scale
+                top, left = patch.row * patch.scale, patch.column * patch.scale
+                own = slice(number * frames, (number + 1) * frames)
+                clip = Made(*(getattr(small, f.name)[own] for f in fields(small)))
+                enlarged.append(clip.enlarged(size, (top, top + height), (left, left + width)))
+            made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
+            given = self._pixels_of(_Stacked.of([patch.clip.condition for _, patch in patches]))
+            truth = self.pixel_truth([patch.clip for _, patch in patches])
+            scale = torch.tensor([float(patch.scale) for _, patch in patches], device=made.rgb.device).repeat_interleave(frames)
+        done = self.finisher(made, given, frames, scale)
+        found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
+        return self._pixel_terms(found, truth, settings, "fine")
+
+    def _made(self, refined: Refined) -> Made:
+        """What the finisher starts from."""
+        ids = refined.scores.argmax(1, keepdim=True).to(torch.uint8)
+        return Made(refined.rgb, refined.depth_code, ids, refined.log_error)
+
+    def _pixel_terms(self, made: Refined, truth: PixelTruth, settings: LossSettings, name: str) -> dict[str, Tensor]:
+        """Weighted terms of refined pixels; depth in the sky counts threefold."""
+        codec = self.config.codec
         log_per_code = math.log(codec.far_m / codec.near_m) / 2
         counted = (1.0 + 2.0 * (truth.ids == SKY).unsqueeze(1)) * truth.depth_known
         error = made.rgb - truth.rgb
         return {
-            "pixel_rgb": losses.image_error(error, square=2.0, gradient=0.5),
-            "pixel_depth": losses.depth_code_error(made.depth_code, truth.depth_code, counted, log_per_code),
-            "pixel_semantics": 0.2 * losses.class_error(made.scores, truth.ids, settings.class_weights),
-            "pixel_error": 0.05 * losses.stated_error(made.log_error, error),
+            f"{name}_rgb": losses.image_error(error, square=2.0, gradient=0.5),
+            f"{name}_depth": losses.depth_code_error(made.depth_code, truth.depth_code, counted, log_per_code),
+            f"{name}_semantics": 0.2 * losses.class_error(made.scores, truth.ids, settings.class_weights),
+            f"{name}_error": 0.05 * losses.stated_error(made.log_error, error),
         }
 
     @staticmethod
@@ -318,8 +397,9 @@ class MDM(nn.Module):
         return self.refiner(self.codec, latents, given, frames)
 
     def trained_part(self) -> nn.ModuleDict:
-        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there is one, the refiner."""
-        return nn.ModuleDict({"net": self.net} | ({} if self.refiner is None else {"refiner": self.refiner}))
+        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner and finisher."""
+        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher}
+        return nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
         """Names in `trained_part` of the parameters that mix frames: of the temporal attentions, or of `all` temporal layers.
@@ -371,8 +451,8 @@ class MDM(nn.Module):
                 decoded = self.codec.decode(latents)
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
-                decoded, error = self._decode_refined(latents, encoded.pixels)
-                confidence = torch.exp(-error / TRUSTED_ERROR)
+                made = self._made(self.refine(latents, encoded.pixels, len(condition.views)))
+                decoded, confidence = self._decoded(made), torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR)
                 if request.n_samples > 1:
                     confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
         depth, fits = decoded.depth, []
@@ -382,14 +462,31 @@ class MDM(nn.Module):
         depth = settle_depth(depth, condition, self.config.codec.far_m)
         return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits))
 
-    def _decode_refined(self, latents: dict[Modality, Tensor], given: ConditionPixels) -> tuple[Decoded, Tensor]:
-        """Pixels of one clip through the refiner, and the expected error of the colour f32[T,1,H,W] in [0,1]."""
-        made = self.refine(latents, given, next(iter(latents.values())).shape[0])
-        best = made.scores.softmax(1).topk(2, dim=1)
-        margin = best.values[:, :1] - best.values[:, 1:]
-        depth = code_to_depth(made.depth_code, self.config.codec)
-        rgb = ((made.rgb + 1) / 2).clamp(0, 1)
-        return Decoded(rgb, depth, best.indices[:, 0], margin), made.log_error.clamp(-6, 1).exp() / 2
+    @torch.no_grad()
+    def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip:
+        """A generated clip at the size of `fine`, the same views' condition at the camera's resolution (any size).
+
+        Measured depth replaces generated depth, as in `sample`; latents and depth fits stay those of the clip.
+
+        Raises:
+            UsageError: the model has no finisher.
+        """
+        if self.finisher is None:
+            raise UsageError("this model has no finisher", where="MDM.finish")
+        given = self._pixels_of(_Stacked.of([fine]))
+        log_error = (-clip.confidence.clamp(min=1e-3).log() * TRUSTED_ERROR * 2).clamp(min=1e-4).log()
+        code = self.codec.linear_depth_code(clip.depth)
+        made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), log_error)
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            made = finish_in_tiles(self.finisher, made, given)
+        decoded = self._decoded(made)
+        confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
+        depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
+        return replace(clip, rgb=decoded.rgb, depth=depth, semantics=decoded.semantics, confidence=confidence)
+
+    def _decoded(self, made: Made) -> Decoded:
+        """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made."""
+        return Decoded(((made.rgb + 1) / 2).clamp(0, 1), code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
 
     def _denoise(self, encoded: ConditionLatents, request: SampleRequest, number: int) -> tuple[dict[Modality, Tensor], Tensor]:
         """Draw sample `number` of a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
@@ -410,26 +507,93 @@ class MDM(nn.Module):
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
 
 
+def _expected_error(log_error: Tensor) -> Tensor:
+    """Expected absolute error of colour in [0, 1] from the logarithm of that of codes in [-1, 1]."""
+    return log_error.clamp(-6, 1).exp() / 2
+
+
+@dataclass(frozen=True)
+class _Stacked:
+    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour as backdrop,
+    unknown classes, no render. Masks are f32."""
+
+    color: Tensor
+    depth: Tensor
+    valid: Tensor
+    warped: Tensor
+    backdrop: Tensor
+    ids: Tensor
+    backdrop_ids: Tensor
+    renders: RenderPlanes
+
+    @classmethod
+    def of(cls, batch: Sequence[Condition]) -> _Stacked:
+        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
+        renders = [_no_render(c) if c.renders is None else c.renders for c in batch]
+        return cls(
+            *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),
+            torch.stack([c.valid for c in batch]).float(),
+            torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch]).float(),
+            torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch]),
+            torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
+            torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
+            RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
+        )
+
+
+def _cell_means(mask: Tensor, factor: int) -> Tensor:
+    """Mean over the pixels of each cell, f32[B,T,1,H,W] -> f32[B,T,1,h,w]."""
+    return functional.avg_pool2d(mask.flatten(0, 1), factor).unflatten(0, mask.shape[:2])
+
+
+def _cell_shares(ids: Tensor) -> Tensor:
+    """Share of each class in each cell, u8[B,T,1,H,W] -> f32[B,T,19,h,w]."""
+    return shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2])
+
+
+def _no_render(condition: Condition) -> RenderPlanes:
+    """The planes that stand for: there is no render."""
+    nothing = torch.zeros_like(condition.depth)
+    unknown = torch.full_like(condition.valid, palette.UNLABELLED, dtype=torch.uint8)
+    return RenderPlanes(condition.color, condition.depth, nothing + NO_RENDER, nothing, unknown)
+
+
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in their refiners, and in the size they were trained at."""
-    without = lambda config: replace(config, refine_widths=(), refine_blocks=(), area_px=0)  # noqa: E731
+    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size they were trained at."""
+    plain = {"refine_widths": (), "refine_blocks": (), "finish_widths": (), "finish_blocks": (), "renders": False, "area_px": 0}
+    without = lambda config: replace(config, **plain)  # noqa: E731
     return without(one) == without(other)
 
 
 def extended(before: MDM, config: MDMConfig) -> MDM:
     """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape. For
-    continuing the training of an earlier, plainer model.
+    continuing the training of an earlier, plainer model. What new inputs weigh is 0, so they change nothing at first.
 
     Raises:
-        UsageError: the two differ in more than the refiner and the size trained at.
+        UsageError: the two differ in more than the refiner, the use of renders and the size trained at.
     """
-    if not same_denoiser(before.config, config):
+    if not same_denoiser(before.config, config) or (before.config.renders and not config.renders):
         raise UsageError(
             "the model to continue from is of another kind", expected=str(config), got=str(before.config),
-            remedy="give its widths, blocks, attention, patch and window",
+            remedy="give its widths, blocks, attention, patch, window and renders",
         )  # fmt: skip
     model = MDM(config)
     state = model.state_dict()
-    kept = {name: old for name, old in before.state_dict().items() if name in state and state[name].shape == old.shape}
-    model.load_state_dict({**state, **kept})
+    for name, old in before.state_dict().items():
+        if name in state and state[name].shape == old.shape:
+            state[name] = old
+        elif name in state and name.removesuffix(".weight").removesuffix(".bias") in _WIDENED:
+            state[name] = _widened(old, state[name], zero=name.startswith(_WIDENED[:2]))
+    model.load_state_dict(state)
     return model
+
+
+_WIDENED = ("net.enter", "refiner.enter", "net.leave", "refiner.leave")
+"""Layers that have further inputs or outputs, behind the others, in a model that uses renders."""
+
+
+def _widened(old: Tensor, new: Tensor, zero: bool) -> Tensor:
+    """A larger tensor with `old` in its first places, and in the others those of `new`, or 0."""
+    made = torch.zeros_like(new) if zero else new.clone()
+    made[tuple(slice(size) for size in old.shape)] = old
+    return made

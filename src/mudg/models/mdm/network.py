@@ -16,7 +16,8 @@ the latent resolution, the 2x2 pixels of a cell as channels (`functional.pixel_u
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, nn
@@ -62,6 +63,11 @@ class MDMConfig:
     """Pixels per frame that the model was trained at."""
     shared_noise: float = 0.3
     """Share of the noise variance common to all frames, in training and sampling."""
+    renders: bool = False
+    """Whether the condition may hold renders of a fitted scene."""
+    finish_widths: tuple[int, ...] = ()
+    """Channels of the finisher (`models.mdm.finisher`) at half and at a quarter of the camera's resolution; empty = no finisher."""
+    finish_blocks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         levels = {len(self.widths), len(self.blocks), len(self.spatial_attention), len(self.temporal_attention)}
@@ -76,6 +82,10 @@ class MDMConfig:
             raise UsageError(
                 "refine_widths and refine_blocks have two entries each, or none", got=str(self.refine_widths)
             )
+        if (len(self.finish_widths), len(self.finish_blocks)) not in ((0, 0), (2, 2)):
+            raise UsageError("finish_widths and finish_blocks have two entries each, or none", got=str(self.finish_widths))
+        if self.finish_widths and not (self.refine_widths and self.renders):
+            raise UsageError("a finisher needs a refiner before it, and renders", got=f"renders {self.renders}, {self.refine_widths}")
 
     @property
     def pixel_multiple(self) -> int:
@@ -272,7 +282,9 @@ class UNet(nn.Module):
 @dataclass(frozen=True)
 class ConditionPixels:
     """The condition at pixel resolution: color, backdrop f32[N,3,H,W] in [-1,1]; depth_code f32[N,1,H,W]; valid, warped
-    f32[N,1,H,W]; ids, backdrop_ids u8[N,1,H,W], 255 = unknown. N = clips times frames."""
+    f32[N,1,H,W]; ids, backdrop_ids u8[N,1,H,W], 255 = unknown. N = clips times frames. For models that use renders also
+    render f32[N,3,H,W] in [-1,1], render_code f32[N,1,H,W] (depth), alpha, certainty f32[N,1,H,W] (alpha -1: no
+    renders), render_ids u8[N,1,H,W]."""
 
     color: Tensor
     backdrop: Tensor
@@ -281,14 +293,20 @@ class ConditionPixels:
     warped: Tensor
     ids: Tensor
     backdrop_ids: Tensor
+    render: Tensor | None = None
+    render_code: Tensor | None = None
+    alpha: Tensor | None = None
+    certainty: Tensor | None = None
+    render_ids: Tensor | None = None
 
     def crop(self, rows: slice, columns: slice) -> ConditionPixels:
         """A rectangle of pixels."""
-        return ConditionPixels(*(x[..., rows, columns] for x in self.parts()))
+        return self.map(lambda x: x[..., rows, columns])
 
-    def parts(self) -> tuple[Tensor, ...]:
-        """All tensors in the order of the fields."""
-        return (self.color, self.backdrop, self.depth_code, self.valid, self.warped, self.ids, self.backdrop_ids)
+    def map(self, change: Callable[[Tensor], Tensor]) -> ConditionPixels:
+        """The same with ``change`` applied to every tensor."""
+        parts = (getattr(self, f.name) for f in fields(self))
+        return ConditionPixels(*(None if x is None else change(x) for x in parts))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -314,18 +332,26 @@ def shares(ids: Tensor) -> Tensor:
 
 
 class Refiner(nn.Module):
-    """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks there."""
+    """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks there.
+
+    With `renders` it also reads what a fitted scene shows.
+    """
 
     SIZES = (12, 4, 4, 4, 4, 4 * CLASSES, 4, 4, 4)
     """Outputs: colour to add, gates of the condition's colour and backdrop, depth to add, gate of depth, scores to add,
     gates of the condition's classes and the backdrop's, logarithm of the error."""
     STARTS = (0.0, -1.0, -4.0, 0.0, -1.0, 0.0, 0.0, -4.0, -2.5)
     """Their values before training."""
+    RENDER_SIZES, RENDER_STARTS = (4, 4, 4), (-4.0, -4.0, -4.0)
+    """Further outputs with `renders`: gates of its colour, depth and classes."""
+    RENDER_PLANES = 12 + 4 + 4 + 4 + CLASSES
 
-    def __init__(self, channels: int, widths: tuple[int, int], blocks: tuple[int, int]) -> None:
+    def __init__(self, channels: int, widths: tuple[int, int], blocks: tuple[int, int], renders: bool = False) -> None:
         super().__init__()
         fine, coarse = widths
-        inside = channels + 12 + 4 + 12 + 12 + 4 + 4 + 4 + 2 * CLASSES
+        self.renders = renders
+        self.sizes = self.SIZES + (self.RENDER_SIZES if renders else ())
+        inside = channels + 12 + 4 + 12 + 12 + 4 + 4 + 4 + 2 * CLASSES + (self.RENDER_PLANES if renders else 0)
         self.enter = nn.Conv2d(inside, fine, 3, padding=1)
         self.before = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
         self.shrink = nn.Conv2d(fine, coarse, 2, stride=2)
@@ -334,7 +360,7 @@ class Refiner(nn.Module):
         self.join = nn.Conv2d(2 * fine, fine, 1)
         self.after = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
         self.norm = ChannelNorm(fine)
-        self.leave = nn.Conv2d(fine, sum(self.SIZES), 1)
+        self.leave = nn.Conv2d(fine, sum(self.sizes), 1)
         self.reset()
 
     def take_back(self, class_weights: Tensor) -> None:
@@ -347,7 +373,8 @@ class Refiner(nn.Module):
         """Output that adds nothing and copies little, whatever the other weights are."""
         with torch.no_grad():
             self.leave.weight.zero_()
-            parts = [torch.full((size,), start) for size, start in zip(self.SIZES, self.STARTS)]
+            starts = self.STARTS + (self.RENDER_STARTS if self.renders else ())
+            parts = [torch.full((size,), start) for size, start in zip(self.sizes, starts)]
             self.leave.bias.copy_(torch.cat(parts))  # type: ignore[union-attr]
 
     def forward(
@@ -359,6 +386,8 @@ class Refiner(nn.Module):
         seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
         planes = [*(latents[m] for m in MODALITIES), fold(rgb), fold(depth), *(fold(x) for x in seen), shares(given.ids),
                   shares(given.backdrop_ids)]  # fmt: skip
+        if self.renders:
+            planes += [*(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)), shares(given.render_ids)]
         x = self.enter(torch.cat([p.to(rgb.dtype) for p in planes], 1).contiguous(memory_format=torch.channels_last))
         for block in self.before:
             x = block(x, frames)
@@ -370,9 +399,13 @@ class Refiner(nn.Module):
         for block in self.after:
             x = block(x, frames)
         out = functional.pixel_shuffle(self.leave(functional.silu(self.norm(x))).float(), 2)
-        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = out.split(
-            [size // 4 for size in self.SIZES], 1
-        )
+        parts = out.split([size // 4 for size in self.sizes], 1)
+        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[: len(self.SIZES)]
+        if self.renders:
+            take_render, take_code, take_render_ids = (gate.sigmoid() for gate in parts[len(self.SIZES) :])
+            rgb = rgb + take_render * (given.render - rgb)
+            depth = depth + take_code * given.alpha.clamp(min=0) * (given.render_code - depth)
+            scores = scores + COPY_SCORE * take_render_ids * one_hot(given.render_ids)
         rgb = rgb + take.sigmoid() * (given.color - rgb)
         rgb = rgb + take_far.sigmoid() * (given.backdrop - rgb) + 0.2 * more
         depth = depth + take_depth.sigmoid() * (given.depth_code - depth) + 0.05 * deeper
