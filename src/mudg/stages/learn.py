@@ -128,6 +128,8 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         about_data = learn_clips.describe_logs(config, rules)
     elif ranks.leads:
         making = learn_clips.MakingClips(config, folder, model.points_alone)
+    if model.points_alone:
+        config = learn_clips.of_one_size(config)
     with making:
         if "codec" in fresh and isinstance(model, MDM):
             ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16))

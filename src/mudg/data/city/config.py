@@ -55,6 +55,11 @@ class CityConfig:
     """Whether a street crosses ahead; auto picks by seed."""
     traffic: Annotated[float, Field(ge=0, le=2)] = 1.0
     """Density of moving and parked vehicles and of people, 0 = none, 1 = standard, 2 = busy."""
+    overhead: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Amount of what stands above the LiDAR, 0 = as little as ever, 1 = much: wide tree crowns, bare trees, bridges, gantries, wires,
+    arms with lamps and signals, tall vehicles, taller buildings."""
+    skies: Literal["plain", "varied"] = "plain"
+    """varied = more kinds of sky: white and near saturation, hazy, deep blue, scattered clouds, sunset, before a storm."""
     shift_margin_m: Annotated[float, Field(ge=0, le=5)] = 4.0
     """Free space beside the recorded path, metres: a camera shifted laterally by up to this distance never enters an object."""
     supersample: Annotated[int, Field(ge=1, le=4)] = 2

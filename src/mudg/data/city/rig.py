@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +54,33 @@ def ego_from_lidar() -> NDArray[np.float64]:
     return pose
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarScan:
+    """How one sweep is taken, other than by the configuration's own LiDAR.
+
+    Args:
+        ego_from_lidar: mounting pose f64[4, 4].
+        elevations_rad: of every beam.
+        delay_s: the sweep is taken this much later than the frame's time; its points are given as if it were not.
+        name: tells the random numbers of several LiDARs apart.
+    """
+
+    ego_from_lidar: NDArray[np.float64]
+    elevations_rad: NDArray[np.float64]
+    delay_s: float = 0.0
+    name: str = ""
+
+
 def lidar_elevations(config: CityConfig) -> NDArray[np.float64]:
     """Elevation of every beam in radians, denser around the horizon as in common 64-beam sensors."""
-    u = np.linspace(-1.0, 1.0, config.lidar_beams)
-    middle = 0.5 * (config.lidar_lower_deg + config.lidar_upper_deg)
-    half = 0.5 * (config.lidar_upper_deg - config.lidar_lower_deg)
+    return beam_elevations(config.lidar_beams, config.lidar_lower_deg, config.lidar_upper_deg)
+
+
+def beam_elevations(beams: int, lower_deg: float, upper_deg: float) -> NDArray[np.float64]:
+    """Elevations f64[beams] in radians from the lowest to the highest beam, denser in the middle."""
+    u = np.linspace(-1.0, 1.0, beams)
+    middle = 0.5 * (lower_deg + upper_deg)
+    half = 0.5 * (upper_deg - lower_deg)
     return np.deg2rad(middle + half * (0.75 * u + 0.25 * u**3))
 
 

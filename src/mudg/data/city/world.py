@@ -180,6 +180,10 @@ class CityWorld:
             views.append(View(self._cameras[camera], self._world_from_ego(time_s) @ self._mounts[camera], time_s))
         return tuple(views)
 
+    def frame_pose(self, time_s: float) -> NDArray[np.float64]:
+        """world_from_ego f64[4, 4] of the recording vehicle; UsageError outside the log."""
+        return self._world_from_ego(time_s)
+
     def _world_from_ego(self, time_s: float) -> NDArray[np.float64]:
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
@@ -220,7 +224,6 @@ class CityWorld:
         camera = view.camera
         if camera.readout_s != 0 or any(camera.distortion):
             raise UsageError("the city renders undistorted global-shutter cameras", where=f"camera {camera.name!r}")
-        poses = self._object_keys_at(np.array([view.time_s]))[0]
         noise_key = 0
         if sensor_noise:
             noise_key = seeds.key(self.config.seed, round(view.time_s * 1e4), f"city noise {camera.name}") | 1
@@ -228,6 +231,7 @@ class CityWorld:
         per_axis = self.config.supersample if supersample is None else supersample
         if not 1 <= per_axis <= 8:
             raise UsageError("supersample must lie in 1..8", got=str(per_axis))
+        poses = self._object_keys_at(np.array([view.time_s]))[0]
         return CityTruth(*self._handle.render(poses, self._phases(view.time_s), intrinsics, camera.width, camera.height,
                                               view.world_from_cam, per_axis, noise_key))  # fmt: skip
 
@@ -243,9 +247,30 @@ class CityWorld:
         ones = torch.ones((1, *semantics.shape))
         return Observation(view, rgb, depth, semantics, ones, ones.bool(), "recorded", "city truth")
 
-    def lidar_sweep(self, index: int) -> CitySweep:
+    def render_rolling(self, view: View, readout_s: float, strips: int = 8) -> CityTruth:
+        """The image of a rolling shutter: vehicle and objects move while the rows are read, the middle row at the view's time.
+
+        Rows are taken in strips of one time each. Times beyond the log's span keep the pose of its end.
+        """
+        camera, parts = view.camera, []
+        mount = geometry.invert(self._world_from_ego(view.time_s)) @ view.world_from_cam
+        edges = np.linspace(0, camera.height, min(strips, camera.height) + 1).round().astype(int)
+        first, last = max(self.span_s[0], float(self._ego_times[0])), min(self.span_s[1], float(self._ego_times[-1]))
+        for top, bottom in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            at = view.time_s + readout_s * ((top + bottom) / 2 / camera.height - 0.5)
+            at = min(max(at, first), last)
+            intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy - top)
+            parts.append(self._handle.render(
+                self._object_keys_at(np.array([at]))[0], self._phases(at), intrinsics, camera.width, bottom - top,
+                self._world_from_ego(at) @ mount, self.config.supersample, 0,
+            ))  # fmt: skip
+        rgb, depth, semantics, instance = zip(*parts, strict=True)
+        return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
+
+    def lidar_sweep(self, index: int, scan: rig.LidarScan | None = None) -> CitySweep:
         """The sweep around the time of frame ``index``: it starts and ends half a turn away from it, looking backwards.
-        Vehicle and objects move during the turn; the limbs of people keep their pose of the middle."""
+        Vehicle and objects move during the turn; the limbs of people keep their pose of the middle. ``scan``: another LiDAR than the
+        configuration's; with a delay, points and pose are what a log has whose clock is wrong by it."""
         config = self.config
         if not 0 <= index < config.n_frames:
             raise UsageError("there is no such sweep", expected=f"0..{config.n_frames - 1}", got=str(index))
@@ -254,13 +279,16 @@ class CityWorld:
         azimuths = rig.lidar_azimuths(config)
         offsets = (np.arange(len(azimuths)) + 0.5) / len(azimuths) * period - period / 2
         knots = np.array([time_s - period / 2, time_s, time_s + period / 2])
-        mount = rig.ego_from_lidar()
+        scan = scan or rig.LidarScan(rig.ego_from_lidar(), rig.lidar_elevations(config))
+        mount = scan.ego_from_lidar
+        time_s += scan.delay_s
+        knots = np.clip(knots + scan.delay_s, *self.span_s)
         world_from_lidar = self._world_from_ego(time_s) @ mount
         columns = _interpolated_poses(self._ego_times, self._ego_poses, time_s + offsets) @ mount
         settings = (config.lidar_range_m, config.lidar_noise_m, config.lidar_dropout, 0.55)
         xyz, intensity, semantics, instance = self._handle.sweep(
-            self._object_keys_at(knots), self._phases(time_s), rig.lidar_elevations(config), azimuths, columns[:, :3],
-            (offsets + period / 2) / period, settings, seeds.key(config.seed, index, "city lidar"),
+            self._object_keys_at(knots), self._phases(time_s), scan.elevations_rad, azimuths, columns[:, :3],
+            (offsets + period / 2) / period, settings, seeds.key(config.seed, index, f"city lidar{scan.name}"),
         )  # fmt: skip
         hit = intensity >= 0
         lidar_from_world = geometry.invert(world_from_lidar)
@@ -268,6 +296,9 @@ class CityWorld:
         local = np.einsum("ij,nj->ni", lidar_from_world[:3, :3], world) + lidar_from_world[:3, 3]
         dt_s = np.broadcast_to(offsets[:, None], hit.shape)[hit]
         points = SweepPoints(local.astype(np.float32), intensity[hit], dt_s.astype(np.float32))
+        if scan.delay_s:
+            time_s -= scan.delay_s
+            world_from_lidar = self._world_from_ego(time_s) @ mount
         return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
 
     def kerb_distance(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:

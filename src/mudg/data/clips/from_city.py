@@ -6,7 +6,8 @@ views of the clip. Most clips lie beside the recorded path; one per city follows
 given, as for frames that a log lacks.
 
 What varies from city to city besides the city itself: field of view, mounting height and pitch, number and elevation range
-of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of the LiDAR poses.
+of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of the LiDAR poses. With ``realism="varied"`` much more does: see
+`varied.py` for the distribution and `city_log.py` for how faulty sensors and exact truth go together.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,10 +23,13 @@ import torch
 from mudg import native
 from mudg.base import geometry, seeds
 from mudg.base.log import progress
-from mudg.base.types import Clip, Condition, FusedCloud, Photo, View
+from mudg.base.types import Clip, Condition, Photo, View
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
+from mudg.data.city.sensors import SensorFaults
+from mudg.data.clips import varied
+from mudg.data.clips.city_log import CityLog, record_with_faults
 from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 
@@ -39,7 +44,11 @@ REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
 
+Realism = Literal["plain", "varied"]
+
 FRAMES = 12
+SIZES = len(varied.ASPECTS)
+"""Varied cities n and n + SIZES have clips of one size."""
 FIRST = 2
 """Clips start at this frame of the log, so that it reaches a little beyond them at both ends."""
 
@@ -60,6 +69,8 @@ class CityClipRules:
     published: bool = False
     """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at the time of
     the first view, from where it was recorded."""
+    realism: Realism = "plain"
+    """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of `size_of`."""
 
     @property
     def frames(self) -> int:
@@ -67,13 +78,21 @@ class CityClipRules:
         return max(FRAMES, FIRST + self.window)
 
 
-@dataclass(frozen=True)
-class CityLog:
-    """A generated log as its training clips need it: world, fused cloud, recorded images of all frames and cameras."""
+def is_varied(rules: CityClipRules, city: int) -> bool:
+    """Whether a city is drawn from the varied distribution; cities for scoring never are."""
+    return rules.realism == "varied" and city < HELD_OUT
 
-    world: CityWorld
-    cloud: FusedCloud
-    recorded: tuple[Photo, ...]
+
+def size_of(rules: CityClipRules, city: int) -> tuple[int, int]:
+    """Width and height of a city's clips. Varied cities differ in aspect, except for the published system's fixed size."""
+    if is_varied(rules, city) and not rules.published:
+        return varied.sized(rules.width, rules.height, city)
+    return rules.width, rules.height
+
+
+def sensors_of(rules: CityClipRules, city: int) -> SensorFaults:
+    """What the sensors of a city get wrong."""
+    return varied.draw_sensors(rules.seed, city, city_config(rules, city)) if is_varied(rules, city) else SensorFaults()
 
 
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
@@ -82,6 +101,10 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
     plain = CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
     if city >= HELD_OUT:
         return plain
+    if is_varied(rules, city):
+        width, height = size_of(rules, city)
+        plain = replace(plain, width=width * rules.fine, height=height * rules.fine)
+        return varied.draw_city(rules.seed, city, plain)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < 0.4
     return replace(
@@ -115,6 +138,10 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     """Generate, record and fuse one city; `frames` long."""
     config = replace(city_config(rules, city), n_frames=frames)
     rng = seeds.numpy_rng(rules.seed, city, "log")
+    if is_varied(rules, city):
+        used = range(frames) if rng.random() < 0.6 else np.flatnonzero(rng.random(frames) < rng.uniform(0.3, 0.9)).tolist()
+        key = seeds.key(rules.seed, city, "log with faults")
+        return record_with_faults(config, sensors_of(rules, city), used or [frames // 2], key)
     world = CityWorld(config)
     photos: dict[str, list[Photo]] = {}
     for name in config.cameras:
@@ -141,11 +168,11 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> l
     """All clips of one city; `log` is the city's own from `make_log`, made here if not given."""
     log = log or make_log(rules, city, rules.frames)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
-    size = (rules.width, rules.height)
+    size = size_of(rules, city)
     recorded_views = log.world.frame_views("front")[FIRST : FIRST + rules.window]
-    fine = (rules.width * rules.fine, rules.height * rules.fine)
+    fine = (size[0] * rules.fine, size[1] * rules.fine)
     conditions = ConditionRules(*size, *fine, published=rules.published)
-    tracks = log.world.tracks()
+    tracks = log.tracks()
     clips = []
     sources: dict[int, WarpSource] = {}
     known = log.recorded
@@ -157,8 +184,9 @@ def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> l
         if shift_m == 0.0:
             given, cache = _split_moments(log.recorded, int(rng.integers(2, 5)), rng)[0], {}
         given = log.recorded if rules.published else given  # for the reference only
-        condition = build_conditions(log.cloud, tracks, views, given, conditions, cache)[0]
-        truths = [log.world.render(view.resized(*size)) for view in views]
+        claimed = [log.claimed(view) for view in views]
+        condition = build_conditions(log.cloud, tracks, claimed, given, conditions, cache)[0]
+        truths = [log.truth(view.resized(*size)) for view in views]
         clips.append(replace(clip_from_truth(condition, truths), shift_m=shift_m))
     return clips
 
@@ -204,8 +232,8 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     log = make_log(rules, city, rules.frames)
     clips = make_clips(rules, city, log)
     if city >= HELD_OUT or rules.point_colors:
-        plain = ConditionRules(rules.width, rules.height, warp=False)
-        tracks = log.world.tracks()
+        plain = ConditionRules(*size_of(rules, city), warp=False)
+        tracks = log.tracks()
         points = [build_conditions(log.cloud, tracks, c.condition.views, (), plain)[0].color for c in clips]
         clips = [replace(clip, point_color=color) for clip, color in zip(clips, points)]
     write_shard(folder, city, pack_clips(clips))

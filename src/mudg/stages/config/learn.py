@@ -38,6 +38,9 @@ class LearnData:
     """Share of the steps after which all cities are in use, 0 to 1."""
     clips_per_city: int = Field(default=4, ge=1)
     """Clips taken from each generated city."""
+    realism: Literal["plain", "varied"] = "plain"
+    """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). The small model then
+    also learns five aspect ratios, all of about the area width x height. Cities for scoring stay plain."""
     held_out: int = Field(default=6, ge=1)
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()

@@ -47,7 +47,8 @@ def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.Cit
     """Rules for the generator; `points_alone`: the published system's condition."""
     data = config.data
     return from_city.CityClipRules(
-        data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone
+        data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone,
+        realism=data.realism,
     )
 
 
@@ -175,18 +176,39 @@ def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
 # a step's clips -------------------------------------------------------------------------------------------------------
 
 
+def of_one_size(config: LearnConfig) -> LearnConfig:
+    """The configuration for clips that were made of one size, as the published system needs them, however varied the cities are."""
+    return replace(config, data=replace(config.data, realism="plain"))
+
+
+def sizes_of_cities(config: LearnConfig) -> list[tuple[int, int]]:
+    """Sizes of the clips to train on: shard number n has the n-th, counted round."""
+    if config.data.realism == "plain" or config.data.scenes:
+        return [(config.data.width, config.data.height)]
+    rules = clip_rules(config)
+    return [from_city.size_of(rules, city) for city in range(from_city.SIZES)]
+
+
+def _of_same_size(city: int, first: int, sizes: list[tuple[int, int]], count: int) -> int:
+    """The city of the first one's size next to `city`, out of `count`."""
+    near = city - city % len(sizes) + first % len(sizes)
+    return near if near < count else near - len(sizes) if near >= len(sizes) else first
+
+
 def draw_clips(
     config: LearnConfig, folder: Path, step: int, count: int, frames: int, purpose: str, part: slice | None = None
 ) -> list[Clip]:
     """The clips of a step: random shards, clips and runs of consecutive frames, varied (see `clip_shards.vary`).
 
     What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of `count`, and not on which
-    `part` of that batch is drawn here.
+    `part` of that batch is drawn here. All clips of a step have one size: that of its first clip.
     """
     rng = seeds.numpy_rng(config.seed, step, purpose)
-    picks = []
+    picks: list[tuple[int, int, range]] = []
+    sizes = sizes_of_cities(config)
     for _ in range(count):
         city = int(rng.integers(cities_in_use(config, step)))
+        city = city if not picks else _of_same_size(city, picks[0][0], sizes, cities_in_use(config, step))
         await_shard(folder, city)
         number = int(rng.integers(clip_shards.clips_in(folder, city)))
         start = int(rng.integers(config.data.window - frames + 1))
@@ -194,10 +216,11 @@ def draw_clips(
     clips = []
     for place in range(count)[part or slice(None)]:
         clip = clip_shards.read_clip(folder, *picks[place])
-        if clip.rgb.shape[-2:] != (config.data.height, config.data.width):
+        width, height = sizes[picks[place][0] % len(sizes)]
+        if clip.rgb.shape[-2:] != (height, width):
             raise InputError(
                 "the training clips have another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
-                expected=f"{config.data.width}x{config.data.height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
+                expected=f"{width}x{height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
                 remedy="choose another --data.clips",
             )  # fmt: skip
         if config.data.augment:

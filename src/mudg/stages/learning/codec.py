@@ -34,8 +34,10 @@ def train_codec(codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder:
     if not state.resume(out, ALONE):
         draw_weights(codec, config.seed, "codec weights")
         batches = [draw_clips(config, folder, n, FIT_IMAGES, 1, "codec fit") for n in range(config.codec.fit_batches)]
-        codec.fit_color(torch.cat([clip.rgb for batch in batches for clip in batch]))
-        codec.fit_depth(torch.cat([clip.depth for batch in batches for clip in batch]))
+        images = [clip for batch in batches for clip in batch]
+        height, width = (min(clip.rgb.shape[axis] for clip in images) for axis in (-2, -1))  # steps may differ in size
+        codec.fit_color(torch.cat([clip.rgb[..., :height, :width] for clip in images]))
+        codec.fit_depth(torch.cat([clip.depth[..., :height, :width] for clip in images]))
     recent: list[dict[str, float]] = []
     with log.task("codec", steps, state.step) as bar:
         for step in range(state.step, steps):

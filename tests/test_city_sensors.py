@@ -1,0 +1,299 @@
+"""What real sensors add to a generated log: every effect has the stated size, and the default changes nothing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mudg import native
+from mudg.base.types import Camera, SweepPoints, Track
+from mudg.data.city import CityConfig, CityWorld
+from mudg.data.city.rig import LidarScan, ego_from_lidar, lidar_elevations
+from mudg.data.city.sensors import (
+    BoxFaults,
+    CameraFaults,
+    CameraLook,
+    LidarFaults,
+    PoseFaults,
+    SensorFaults,
+    kept_points,
+    noisy_tracks,
+    pose_errors,
+    recorded,
+    thinned,
+    to_display,
+    to_light,
+    with_look,
+)
+from mudg.data.clips import from_city, varied
+from mudg.data.clips.city_log import CityLog, record_with_faults
+
+needs_native = pytest.mark.skipif(native.library() is None, reason="the native library is not built")
+
+
+def picture(height: int = 40, width: int = 60) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return rng.uniform(0.1, 0.6, (height, width, 3)).astype(np.float32)
+
+
+def points(count: int = 4000) -> SweepPoints:
+    rng = np.random.default_rng(1)
+    xyz = rng.normal(0, 10, (count, 3)).astype(np.float32)
+    return SweepPoints(xyz, np.full(count, 0.5, np.float32), np.zeros(count, np.float32))
+
+
+def test_the_default_look_and_faults_change_nothing() -> None:
+    image = picture()
+    assert np.allclose(with_look(image, CameraLook(), 1.0), image, atol=2e-6)
+    assert np.array_equal(recorded(image, CameraFaults(), 5), (image * 255 + 0.5).astype(np.uint8))
+    assert thinned(points(), LidarFaults(), 1).xyz.shape == (4000, 3)
+    assert np.array_equal(pose_errors(PoseFaults(), 3, 1), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_exposure_and_white_balance_are_factors_of_linear_light() -> None:
+    image = picture()
+    shown = with_look(image, CameraLook(gain=1.5, white=(1.1, 1.0, 0.8)), 0.7)
+    assert np.allclose(to_light(shown) / to_light(image), 1.5 * np.array([1.1, 1.0, 0.8]), rtol=1e-3)
+
+
+def test_exposure_drifts_by_the_stated_stops() -> None:
+    look = CameraLook(drift_stops=0.5, drift_period_s=4.0)
+    gains = [look.gains(t)[1] for t in (0.0, 1.0, 2.0, 3.0)]
+    assert np.allclose(gains, [1, math.sqrt(2), 1, math.sqrt(0.5)])
+    balance = CameraLook(drift_white=0.05).gains(0.0)
+    assert balance[0] / balance[2] == pytest.approx(1.05 / 0.95)
+
+
+def test_vignetting_darkens_the_corners_and_not_the_middle() -> None:
+    flat = np.full((200, 300, 3), 0.5, np.float32)
+    light = to_light(with_look(flat, CameraLook(vignette=0.4), 0.0)) / to_light(flat)
+    assert light[100, 150, 0] == pytest.approx(1.0, abs=1e-3)
+    assert light[0, 0, 0] == pytest.approx(0.6, abs=0.01)
+
+
+def test_noise_has_the_stated_size_and_follows_the_key() -> None:
+    flat = np.full((200, 300, 3), 0.25, np.float32)
+    first, again, other = (recorded(flat, CameraFaults(noise=0.02, grain_px=0.7), key) for key in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert first.std() / 255 == pytest.approx(0.02, rel=0.1)  # 0.6 + 0.8 * sqrt(0.25) = 1
+
+
+def test_blur_and_bloom_and_compression_do_what_they_say() -> None:
+    edge = np.zeros((40, 60, 3), np.float32)
+    edge[:, 30:] = 0.6
+    width = lambda image: int(((image[20, :, 0] > 15) & (image[20, :, 0] < 140)).sum())  # noqa: E731
+    assert width(recorded(edge, CameraFaults(), 0)) == 0
+    assert width(recorded(edge, CameraFaults(defocus_px=1.5), 0)) >= 3
+    assert width(recorded(edge, CameraFaults(motion_px=5), 0)) >= 3
+    assert width(recorded(edge, CameraFaults(motion_px=5, motion_rad=math.pi / 2), 0)) == 0
+    spot = np.full((60, 60, 3), 0.2, np.float32)
+    spot[25:35, 25:35] = 1.0
+    assert recorded(spot, CameraFaults(bloom=0.3), 0)[40, 30, 0] > recorded(spot, CameraFaults(), 0)[40, 30, 0] + 5
+    assert recorded(spot, CameraFaults(veil=0.3), 0)[5, 5, 0] > recorded(spot, CameraFaults(), 0)[5, 5, 0]
+    image = np.repeat(picture()[..., :1], 3, -1)
+    coarse, fine = (recorded(image, CameraFaults(jpeg_quality=q), 0).astype(float) for q in (40, 95))
+    plain = recorded(image, CameraFaults(), 0)
+    assert np.abs(coarse - plain).mean() > 2 * np.abs(fine - plain).mean() > 0
+
+
+def test_display_values_are_srgb() -> None:
+    values = np.linspace(0, 1, 11, dtype=np.float32)
+    assert np.allclose(to_display(to_light(values)), values, atol=1e-6)
+    assert to_light(np.float32([0.5]))[0] == pytest.approx(0.2140, abs=1e-4)
+
+
+def test_points_are_lost_where_and_as_often_as_stated() -> None:
+    cloud = points(20000)
+    azimuth = np.degrees(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0]))
+    keep = kept_points(cloud, LidarFaults(cut_deg=60), 1)
+    assert np.array_equal(keep, np.abs(azimuth) <= 60)
+    lost = ~kept_points(cloud, LidarFaults(hole_share=0.25), 1)
+    assert lost.mean() == pytest.approx(0.25, abs=0.02)
+    assert not np.array_equal(lost, ~kept_points(cloud, LidarFaults(hole_share=0.25), 2))
+    assert kept_points(cloud, LidarFaults(dropout=0.4), 1).mean() == pytest.approx(0.6, abs=0.02)
+
+
+def test_misalignment_moves_projections_by_the_stated_angle() -> None:
+    error = LidarFaults(turn_deg=(0.0, 0.0, 0.5)).mounting_error()
+    camera = Camera("front", 1000, 500, 800.0, 800.0, 500.0, 250.0)
+    ahead = error[:3, :3] @ np.array([30.0, 0.0, 0.0])  # sensor axes: x forward, y left
+    u = camera.cx - camera.fx * ahead[1] / ahead[0]
+    assert u - camera.cx == pytest.approx(-800 * math.tan(math.radians(0.5)), rel=1e-6)
+    moved = LidarFaults(shift_m=(0.01, -0.02, 0.03)).mounting_error()
+    assert np.allclose(moved[:3, 3], [0.01, -0.02, 0.03])
+    assert np.allclose(moved[:3, :3], np.eye(3))
+
+
+def test_pose_errors_have_the_stated_size_and_drift_grows() -> None:
+    jitter = pose_errors(PoseFaults(jitter_m=0.03, jitter_deg=0.1), 2000, 4)
+    assert jitter[:, :3, 3].std() == pytest.approx(0.03, rel=0.06)
+    yaw = np.degrees(np.arctan2(jitter[:, 1, 0], jitter[:, 0, 0]))
+    assert yaw.std() == pytest.approx(0.1, rel=0.06)
+    drift = pose_errors(PoseFaults(drift_m=0.05), 11, 4)[:, :3, 3]
+    assert np.allclose(drift[0], 0)
+    assert np.allclose(drift[5], drift[10] / 2)
+    assert np.abs(drift[10]).max() > 0.01
+
+
+def test_boxes_err_as_stated_each_by_itself() -> None:
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    tracks = tuple(Track(f"car-{n:03d}", "car", np.array([4.0, 2.0, 1.5]), np.arange(5.0), poses) for n in range(300))
+    faults = BoxFaults(0.2, 3.0, 0.1)
+    noisy = noisy_tracks(tracks, faults, 9)
+    along = np.array([t.world_from_object[:, 0, 3].mean() for t in noisy])
+    size = np.log(np.array([t.size_m for t in noisy]) / [4.0, 2.0, 1.5])
+    yaw = np.degrees([np.arctan2(t.world_from_object[0, 1, 0], t.world_from_object[0, 0, 0]) for t in noisy])
+    assert along.std() == pytest.approx(0.2, rel=0.2)
+    assert size.std() == pytest.approx(0.1, rel=0.1)
+    assert yaw.std() == pytest.approx(3.0, rel=0.3)
+    alone = noisy_tracks(tracks[7:8], faults, 9)[0]  # whatever the other boxes are
+    assert np.array_equal(alone.world_from_object, noisy[7].world_from_object)
+    exact = noisy_tracks(tracks[:2], BoxFaults(), 9)
+    assert np.array_equal(exact[0].world_from_object, poses)
+
+
+# --- in a city --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small() -> CityConfig:
+    return CityConfig(seed=11, n_frames=4, width=64, height=48, cameras=("front",), lidar_beams=16, lidar_azimuth_step_deg=1.0,
+                      supersample=1)  # fmt: skip
+
+
+@needs_native
+def test_a_rolling_shutter_without_readout_is_the_plain_image_and_with_it_is_not(small: CityConfig) -> None:
+    world = CityWorld(small)
+    view = world.frame_views("front")[1]
+    plain, still, rolling = world.render(view), world.render_rolling(view, 0.0), world.render_rolling(view, 0.03)
+    assert np.array_equal(plain.depth, still.depth)
+    assert np.array_equal(plain.semantics, still.semantics)
+    assert rolling.depth.shape == plain.depth.shape
+    assert not np.array_equal(rolling.depth, plain.depth)
+
+
+@needs_native
+def test_a_wrong_clock_moves_the_points_by_the_way_driven(small: CityConfig) -> None:
+    world = CityWorld(small)
+    scan = LidarScan(ego_from_lidar(), lidar_elevations(small))
+    right, late = world.lidar_sweep(1), world.lidar_sweep(1, replace(scan, delay_s=0.02))
+    assert np.array_equal(right.points.xyz, world.lidar_sweep(1, scan).points.xyz)
+    assert late.time_s == right.time_s
+    assert np.array_equal(late.world_from_lidar, right.world_from_lidar)
+    driven = np.linalg.norm(world.frame_pose(0.12)[:3, 3] - world.frame_pose(0.1)[:3, 3])
+
+    def wall(sweep: object) -> float:  # distance of the nearest return ahead at the height of the sensor
+        xyz, ids = sweep.points.xyz, sweep.semantics  # type: ignore[attr-defined]
+        return float(np.median(np.linalg.norm(xyz[(ids == 2) & (xyz[:, 0] > 5) & (np.abs(xyz[:, 1]) < 25)], axis=1)))
+
+    assert 0.05 < driven < 0.4
+    assert abs(wall(late) - wall(right)) < 3 * driven
+
+
+@needs_native
+def test_the_image_of_a_view_fits_it_and_the_truth_is_exact(small: CityConfig) -> None:
+    """With faulty poses the image of a moment keeps its place relative to the views of that moment; the truth has its look only."""
+    looks = {"front": CameraLook(gain=1.4)}
+    sensors = SensorFaults(
+        looks, {}, LidarFaults((0.3, 0, 0)), PoseFaults(0.05, 0.2, 0.05, 0.2), BoxFaults(0.1, 2, 0.1)
+    )
+    log = record_with_faults(small, sensors, range(4), 77)
+    view = log.world.frame_views("front")[2]
+    claimed = log.claimed(view)
+    moved = np.linalg.norm(claimed.center_world - view.center_world)
+    assert 0.001 < moved < 0.5
+    assert np.allclose(log.recorded[2].view.world_from_cam, claimed.world_from_cam)
+    assert np.array_equal(log.truth(view).rgb_u8, log.recorded[2].rgb)  # no noise or blur was asked for
+    assert np.array_equal(log.truth(view).depth, log.world.render(view).depth)
+    sideways = from_city.shifted_view(log.world, view, 1.0)
+    step = log.claimed(sideways).center_world - claimed.center_world
+    assert np.linalg.norm(step) == pytest.approx(1.0, abs=1e-9)
+
+
+@needs_native
+def test_without_faults_the_log_is_the_exact_one(small: CityConfig) -> None:
+    log = record_with_faults(small, SensorFaults(), range(4), 77)
+    truth = CityLog(log.world, log.cloud, log.recorded)
+    for a, b in zip(log.tracks(), truth.tracks(), strict=True):
+        assert np.allclose(a.world_from_object, b.world_from_object)
+    view = log.world.frame_views("front")[1]
+    assert np.allclose(log.claimed(view).world_from_cam, view.world_from_cam)
+    assert np.array_equal(log.recorded[1].rgb, log.world.render(view).rgb_u8)
+
+
+# --- the distribution -------------------------------------------------------------------------------------------------
+
+
+def test_varied_cities_follow_from_seed_and_number_alone() -> None:
+    rules = from_city.CityClipRules(realism="varied")
+    late = [(from_city.city_config(rules, c), from_city.sensors_of(rules, c)) for c in (7, 3)]
+    early = [(from_city.city_config(rules, c), from_city.sensors_of(rules, c)) for c in (3, 7)]
+    assert late == early[::-1]
+    assert late[0] != late[1]
+    other = replace(rules, seed=1)
+    assert from_city.city_config(other, 3) != early[0][0]
+
+
+def test_the_distribution_covers_what_it_says() -> None:
+    rules = from_city.CityClipRules(realism="varied")
+    configs = [from_city.city_config(rules, city) for city in range(200)]
+    sensors = [from_city.sensors_of(rules, city) for city in range(200)]
+    lens = [2 * math.degrees(math.atan(c.width / 2 / _focal(c))) for c in configs]
+    assert 30 <= min(lens) < 42
+    assert 105 < max(lens) <= 120.01
+    aspects = {round(c.width / c.height, 1) for c in configs}
+    assert len(aspects) == 5
+    assert min(aspects) <= 1.4
+    assert max(aspects) > 3.2
+    assert {c.lidar_beams for c in configs} == {16, 32, 40, 64, 128}
+    assert 0.4 < np.mean([c.lidar_upper_deg < 5 for c in configs]) < 0.8
+    turns = [float(np.linalg.norm(s.lidar.turn_deg)) for s in sensors]
+    assert max(turns) <= 0.5
+    assert 0.2 < np.mean(np.array(turns) == 0) < 0.5
+    assert max(float(np.linalg.norm(s.lidar.shift_m)) for s in sensors) <= 0.03
+    assert 0.1 < np.mean([s.second_lidar is not None for s in sensors]) < 0.3
+    assert 0.1 < np.mean([s.lidar.cut_deg < 180 for s in sensors]) < 0.3
+
+
+def _focal(config: CityConfig) -> float:
+    from mudg.data.city.rig import cameras
+
+    return cameras(config)["front"].fx
+
+
+def test_sizes_have_one_area_and_go_round() -> None:
+    rules = from_city.CityClipRules(realism="varied")
+    sizes = [from_city.size_of(rules, city) for city in range(10)]
+    assert sizes[:5] == sizes[5:]
+    assert sizes[0] == (192, 128)
+    for width, height in sizes:
+        assert width % 16 == 0
+        assert height % 16 == 0
+        assert 0.85 < width * height / (192 * 128) < 1.1
+    assert varied.sized(192, 128, 4) == (272, 80)
+    assert from_city.size_of(replace(rules, published=True), 4) == (192, 128)
+    assert from_city.size_of(rules, from_city.HELD_OUT + 4) == (192, 128)
+
+
+def test_cities_for_scoring_and_plain_cities_know_nothing_of_it() -> None:
+    plain, rules = from_city.CityClipRules(), from_city.CityClipRules(realism="varied")
+    for city in (from_city.HELD_OUT, from_city.HELD_OUT + 101):
+        assert from_city.city_config(plain, city) == from_city.city_config(rules, city)
+        assert from_city.sensors_of(rules, city) == SensorFaults()
+    config = from_city.city_config(plain, 3)
+    assert config.overhead == 0
+    assert config.skies == "plain"
+
+
+@needs_native
+def test_varied_clips_are_reproducible() -> None:
+    rules = from_city.CityClipRules(width=48, height=32, window=2, clips=2, realism="varied", fine=1)
+    first, again = (from_city.make_clips(rules, 4) for _ in range(2))
+    assert first[0].rgb.shape[-2:] == from_city.size_of(rules, 4)[::-1]
+    for a, b in zip(first, again, strict=True):
+        assert np.array_equal(a.rgb.numpy(), b.rgb.numpy())
+        assert np.array_equal(a.condition.color.numpy(), b.condition.color.numpy())
