@@ -135,9 +135,11 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
             ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16))
             learn_codec.load_trained_codec(model.codec, out, ranks)
             draw_weights(model.net, config.seed, "weights")
-        if "refiner" in fresh and isinstance(model, MDM) and model.refiner is not None:
-            draw_weights(model.refiner, config.seed, "refiner weights")
-            model.refiner.reset()
+        for name in ("refiner", "finisher"):
+            part = getattr(model, name, None)
+            if name in fresh and part is not None:
+                draw_weights(part, config.seed, f"{name} weights")
+                part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
         weights = _train_network(model, config, directory, folder, bf16, ranks)

@@ -15,7 +15,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,17 +33,16 @@ from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
-from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.clips.condition import ConditionRules, ProjectedPoints, WarpSource, build_conditions
+from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip
 from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of
-from mudg.models.scene.model import SceneModel
 from mudg.stages.config import SynthesizeConfig
-from mudg.stages.fit import NEAR_M, load_model, render_view
+from mudg.stages.fit import load_model
+from mudg.stages.fitting.planes import render_planes
 from mudg.stages.learning import loading
 from mudg.stages.learning.precision import choose_bf16
 
@@ -63,8 +62,7 @@ def run(
         config: see `SynthesizeConfig`.
         scene: scene directory or stored zip. fused: output of fuse for this scene.
         out: a finished result of the same configuration and inputs is verified and reused.
-        fitted: output of fit for this scene, whose renders tell what stands where no point was measured (above the LiDAR's
-            beams, beyond its range). Not used by published-type models.
+        fitted: output of fit for this scene, whose renders become part of the condition. For models that were trained with renders.
 
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
@@ -156,8 +154,8 @@ def make_trajectory(
     fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     recorded = recorded_images(scene, config)
-    beyond = None if fitted is None else functools.partial(rendered_points, load_model(fitted))
-    maker = ViewMaker(model, scene, cloud, recorded, rules, config, beyond)
+    render_at = None if fitted is None else functools.partial(render_planes, load_model(fitted))
+    maker = ViewMaker(model, scene, cloud, recorded, rules, config, render_at)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -203,27 +201,18 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
 
 
-def rendered_points(model: SceneModel, view: View) -> ProjectedPoints:
-    """What a fitted scene shows at a view, in the form that conditions are made of: everything that is covered and not sky."""
-    seen = render_view(model, view, RasterConfig(near_m=NEAR_M))
-    depth = torch.full(seen.rgb.shape[-2:], torch.nan) if seen.depth is None else seen.depth[0]
-    ids = torch.full(depth.shape, palette.UNLABELLED) if seen.semantics is None else seen.semantics
-    valid = torch.isfinite(depth)
-    return ProjectedPoints(seen.rgb, depth.nan_to_num(0.0), valid, torch.zeros_like(valid), ids.to(torch.uint8))
-
-
 class ViewMaker:
     """Conditions, samples and observations of one scene at one size."""
 
     def __init__(
         self, model: loading.DiffusionModel, scene: Scene, cloud: FusedCloud, recorded: Sequence[Photo], rules: ConditionRules,
-        config: SynthesizeConfig, beyond: Callable[[View], ProjectedPoints] | None,
+        config: SynthesizeConfig, render_at: RenderAt | None,
     ) -> None:  # fmt: skip
         if not recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
         self._rules, self._full_size = rules, config.full_size
-        self._beyond = beyond
+        self._render_at = render_at
         self._sources: dict[int, WarpSource] = {}
         self._request = loading.request_of(config, choose_bf16(config.precision))
 
@@ -236,15 +225,10 @@ class ViewMaker:
     ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
         condition, fine = build_conditions(
-            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources, self._beyond
+            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources, self._render_at
         )
         sample = self._model.sample(condition, replace(self._request, index=number, known=known))
-        sky = (sample.semantics == SKY).unsqueeze(1) & ~condition.valid
-        made, made_views = replace(sample, depth=torch.where(sky, torch.nan, sample.depth)), condition.views
-        if self._full_size:
-            size = views[0].camera.height, views[0].camera.width
-            made = enlarge(made, size, None if self._model.points_alone else (condition, fine))
-            made_views = tuple(views)
+        made, made_views = self._finished(sample, condition, fine, views)
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
         if self._model.points_alone and not recorded_at_pose(views[0], self._recorded):
             usable[0] = False
@@ -254,6 +238,24 @@ class ViewMaker:
             for i, view in enumerate(made_views)
         ]
         return sample, condition, observations
+
+    def _finished(
+        self, sample: GeneratedClip, condition: Condition, fine: Condition, views: Sequence[View]
+    ) -> tuple[GeneratedClip, tuple[View, ...]]:
+        """The clip and its views at the size that is written, without depth in the sky."""
+        if not self._full_size:
+            return without_sky_depth(sample, condition), condition.views
+        if not self._model.points_alone and self._model.config.finish_widths:
+            return without_sky_depth(self._model.finish(sample, fine, bf16=self._request.bf16), fine), tuple(views)
+        size = views[0].camera.height, views[0].camera.width
+        conditions = None if self._model.points_alone else (condition, fine)
+        return enlarge(without_sky_depth(sample, condition), size, conditions), tuple(views)
+
+
+def without_sky_depth(clip: GeneratedClip, condition: Condition) -> GeneratedClip:
+    """The clip with NaN for the depth of what is classed as sky and was not measured."""
+    sky = (clip.semantics == SKY).unsqueeze(1) & ~condition.valid
+    return replace(clip, depth=torch.where(sky, torch.nan, clip.depth))
 
 
 def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:

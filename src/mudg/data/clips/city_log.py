@@ -27,12 +27,13 @@ from mudg.data.city.sensors import SensorFaults, noisy_tracks, pose_errors, reco
 class CityLog:
     """A generated log as its training clips need it: world, fused cloud, recorded images of all frames and cameras.
 
-    ``boxes``: the annotated tracks (None = the exact ones); ``errors`` f64[frames, 4, 4]: recorded pose = true pose @ error.
+    ``sweeps``: what was fused. ``boxes``: the annotated tracks (None = the exact ones); ``errors`` f64[frames, 4, 4]: recorded pose = true pose @ error.
     """
 
     world: CityWorld
     cloud: FusedCloud
     recorded: tuple[Photo, ...]
+    sweeps: tuple[SweepShots, ...] = ()
     sensors: SensorFaults = field(default_factory=SensorFaults)
     boxes: tuple[Track, ...] | None = None
     errors: NDArray[np.float64] | None = None
@@ -82,8 +83,10 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
             sweep = world.lidar_sweep(index, scan)
             points = thinned(sweep.points, sensors.lidar, seeds.key(key, index, f"points{scan.name}"))
             sweeps.append(SweepShots(sweep.time_s, wrong @ sweep.world_from_lidar @ mounting, points, shots))
-    cloud, _ = fuse_sweeps([s for s in sweeps if _usable(s.points)], boxes, FusionRules(min_object_points=40))
-    return CityLog(world, cloud, tuple(p for name in config.cameras for p in photos[name]), sensors, boxes, errors)
+    sweeps = [s for s in sweeps if _usable(s.points)]
+    cloud, _ = fuse_sweeps(sweeps, boxes, FusionRules(min_object_points=40))
+    images = tuple(p for name in config.cameras for p in photos[name])
+    return CityLog(world, cloud, images, tuple(sweeps), sensors, boxes, errors)
 
 
 def _usable(points: SweepPoints) -> bool:

@@ -12,7 +12,7 @@ of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -23,14 +23,14 @@ import torch
 from mudg import native
 from mudg.base import geometry, seeds
 from mudg.base.log import progress
-from mudg.base.types import Clip, Condition, Photo, View
+from mudg.base.types import Clip, Condition, FinePatch, Photo, View
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.data.city import CityConfig, CityTruth, CityWorld
 from mudg.data.city.sensors import SensorFaults
 from mudg.data.clips import varied
 from mudg.data.clips.city_log import CityLog, record_with_faults
-from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
+from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 
 HELD_OUT = 1_000_000
@@ -49,6 +49,8 @@ Realism = Literal["plain", "varied"]
 FRAMES = 12
 SIZES = len(varied.ASPECTS)
 """Varied cities n and n + SIZES have clips of one size."""
+PATCH_PX = 96
+"""Side of the patches at a higher resolution."""
 FIRST = 2
 """Clips start at this frame of the log, so that it reaches a little beyond them at both ends."""
 
@@ -71,6 +73,9 @@ class CityClipRules:
     the first view, from where it was recorded."""
     realism: Realism = "plain"
     """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of `size_of`."""
+    fitted: bool = False
+    """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch at a higher
+    resolution; recorded images are 2 to 4 times larger than the clips."""
 
     @property
     def frames(self) -> int:
@@ -90,6 +95,13 @@ def size_of(rules: CityClipRules, city: int) -> tuple[int, int]:
     return rules.width, rules.height
 
 
+def fine_of(rules: CityClipRules, city: int) -> int:
+    """How many times larger than the clips the recorded images of a city are."""
+    if not rules.fitted or city >= HELD_OUT:
+        return rules.fine
+    return int(seeds.numpy_rng(rules.seed, city, "image size").choice([2, 3, 4], p=[0.55, 0.3, 0.15]))
+
+
 def sensors_of(rules: CityClipRules, city: int) -> SensorFaults:
     """What the sensors of a city get wrong."""
     return varied.draw_sensors(rules.seed, city, city_config(rules, city)) if is_varied(rules, city) else SensorFaults()
@@ -98,12 +110,13 @@ def sensors_of(rules: CityClipRules, city: int) -> SensorFaults:
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
     """The city's configuration."""
     seed = seeds.key(0 if city >= HELD_OUT else rules.seed, city, "city") & 0x7FFFFFFF
-    plain = CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * rules.fine, height=rules.height * rules.fine)
+    fine = fine_of(rules, city)
+    plain = CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * fine, height=rules.height * fine)
     if city >= HELD_OUT:
         return plain
     if is_varied(rules, city):
         width, height = size_of(rules, city)
-        plain = replace(plain, width=width * rules.fine, height=height * rules.fine)
+        plain = replace(plain, width=width * fine, height=height * fine)
         return varied.draw_city(rules.seed, city, plain)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < 0.4
@@ -161,33 +174,53 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
         shots = [photos[name][index] for name in config.cameras]
         sweeps.append(SweepShots(sweep.time_s, sweep.world_from_lidar @ error, sweep.points, shots))
     cloud, _ = fuse_sweeps(sweeps, world.tracks(), FusionRules(min_object_points=40))
-    return CityLog(world, cloud, tuple(photo for name in config.cameras for photo in photos[name]))
+    return CityLog(world, cloud, tuple(photo for name in config.cameras for photo in photos[name]), tuple(sweeps))
 
 
-def make_clips(rules: CityClipRules, city: int, log: CityLog | None = None) -> list[Clip]:
-    """All clips of one city; `log` is the city's own from `make_log`, made here if not given."""
+def given_images(rules: CityClipRules, city: int, log: CityLog) -> tuple[Photo, ...]:
+    """The recorded images that the clips of a city may know: all, or as in a log whose every fourth moment is held out."""
+    rng = seeds.numpy_rng(rules.seed, city, "clips")
+    if city >= HELD_OUT and rules.fitted:
+        times = sorted({photo.view.time_s for photo in log.recorded})
+        return tuple(photo for photo in log.recorded if photo.view.time_s not in times[4::4])
+    return _split_moments(log.recorded, 4, rng)[1] if city < HELD_OUT and rng.random() < 0.5 else log.recorded
+
+
+def make_clips(
+    rules: CityClipRules, city: int, log: CityLog | None = None, render_at: RenderAt | None = None
+) -> list[Clip]:
+    """All clips of one city.
+
+    Args:
+        log: the city's own from `make_log`; made here if not given.
+        render_at: renders of a scene that was fitted to `given_images`; with `rules.fitted`.
+    """
     log = log or make_log(rules, city, rules.frames)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
-    size = size_of(rules, city)
+    size, scale = size_of(rules, city), fine_of(rules, city)
     recorded_views = log.world.frame_views("front")[FIRST : FIRST + rules.window]
-    fine = (size[0] * rules.fine, size[1] * rules.fine)
-    conditions = ConditionRules(*size, *fine, published=rules.published)
+    conditions = ConditionRules(*size, size[0] * scale, size[1] * scale, published=rules.published)
     tracks = log.tracks()
     clips = []
     sources: dict[int, WarpSource] = {}
-    known = log.recorded
-    if city < HELD_OUT and rng.random() < 0.5:  # as in a log whose every fourth moment is held out
-        known = _split_moments(log.recorded, 4, rng)[1]
-    for shift_m in shifts_of(rules, city):
+    known = given_images(rules, city, log)
+    if city < HELD_OUT and rng.random() < 0.5:  # the draws of given_images
+        rng.integers(4)
+    for number, shift_m in enumerate(shifts_of(rules, city)):
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
         given, cache = known, sources
-        if shift_m == 0.0:
+        if shift_m == 0.0 and not rules.fitted:
             given, cache = _split_moments(log.recorded, int(rng.integers(2, 5)), rng)[0], {}
         given = log.recorded if rules.published else given  # for the reference only
         claimed = [log.claimed(view) for view in views]
-        condition = build_conditions(log.cloud, tracks, claimed, given, conditions, cache)[0]
+        condition, fine = build_conditions(log.cloud, tracks, claimed, given, conditions, cache, render_at)
         truths = [log.truth(view.resized(*size)) for view in views]
-        clips.append(replace(clip_from_truth(condition, truths), shift_m=shift_m))
+        clip = replace(clip_from_truth(condition, truths), shift_m=shift_m)
+        if rules.fitted:
+            place = seeds.numpy_rng(rules.seed, city * 16 + number, "patch")
+            full = clip_from_truth(fine, [log.truth(view) for view in views])
+            clip = replace(clip, fine=cut_patch(full, scale, PATCH_PX, place))
+        clips.append(clip)
     return clips
 
 
@@ -199,6 +232,38 @@ def _split_moments(
     chosen = set(times[int(rng.integers(gap)) :: gap])
     kept = tuple(photo for photo in recorded if photo.view.time_s in chosen)
     return kept, tuple(photo for photo in recorded if photo.view.time_s not in chosen)
+
+
+def cut_patch(full: Clip, scale: int, side_px: int, rng: np.random.Generator) -> FinePatch:
+    """A square of a clip that is `scale` times finer than the one it belongs to, anywhere in it.
+
+    Args:
+        side_px: its side in fine pixels; a multiple of `scale`.
+    """
+    height, width = (size // scale for size in full.rgb.shape[-2:])
+    side = min(side_px // scale, height, width)
+    row, column = int(rng.integers(height - side + 1)), int(rng.integers(width - side + 1))
+    rows, columns = (slice(start * scale, (start + side) * scale) for start in (row, column))
+    return FinePatch(cropped(full, rows, columns), row, column, scale)
+
+
+def cropped(clip: Clip, rows: slice, columns: slice) -> Clip:
+    """A rectangle of a clip and of its condition. Its cameras only say how large it is: they look straight ahead."""
+    cut = lambda x: x[..., rows, columns].contiguous()  # noqa: E731
+    given = clip.condition
+
+    width, height = columns.stop - columns.start, rows.stop - rows.start
+
+    def part(view: View) -> View:
+        camera = replace(view.camera, width=width, height=height, cx=width / 2, cy=height / 2)
+        return View(camera, view.world_from_cam, view.time_s)
+
+    names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
+    found = {name: cut(tensor) for name in names if (tensor := getattr(given, name)) is not None}
+    renders = None if given.renders is None else given.renders.map(cut)
+    condition = replace(given, views=tuple(part(view) for view in given.views), **found, renders=renders)
+    own = {name: cut(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
+    return replace(clip, condition=condition, **own, fine=None, point_color=None)
 
 
 def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
@@ -225,12 +290,20 @@ def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path) -> 
         write_city(rules, city, folder)
 
 
-def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
-    """Make one city's clips and write its shard; returns the number of clips. Runs in a process of its own."""
+FitCity = Callable[[CityClipRules, int, CityLog], RenderAt]
+"""Fits a scene to the images of a log that its clips may know (`given_images`)."""
+
+
+def write_city(rules: CityClipRules, city: int, folder: Path, fit: FitCity | None = None) -> int:
+    """Make one city's clips and write its shard; returns the number of clips. Runs in a process of its own.
+
+    Args:
+        fit: with `rules.fitted`.
+    """
     torch.set_num_threads(1)
     native.set_threads(1)
     log = make_log(rules, city, rules.frames)
-    clips = make_clips(rules, city, log)
+    clips = make_clips(rules, city, log, None if fit is None else fit(rules, city, log))
     if city >= HELD_OUT or rules.point_colors:
         plain = ConditionRules(*size_of(rules, city), warp=False)
         tracks = log.tracks()

@@ -41,6 +41,9 @@ class LearnData:
     realism: Literal["plain", "varied"] = "plain"
     """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). The small model then
     also learns five aspect ratios, all of about the area width x height. Cities for scoring stay plain."""
+    renders: bool = True
+    """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the condition, with patches
+    at the camera's resolution. Takes about half a minute per city."""
     held_out: int = Field(default=6, ge=1)
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()
@@ -75,6 +78,12 @@ class LearnNetwork:
     """Channels of the refiner at the latent resolution and at half of it (empty = no refiner)."""
     refine_blocks: tuple[int, ...] = (2, 3)
     """Residual blocks of the refiner at each level."""
+    renders: bool = True
+    """Let the condition hold renders of a fitted scene."""
+    finish_widths: tuple[int, ...] = (32, 64)
+    """Channels of the finisher, which brings clips to the camera's size, at half and at a quarter of that size (empty = no finisher)."""
+    finish_blocks: tuple[int, ...] = (2, 2)
+    """Residual blocks of the finisher at each level."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -22,6 +22,7 @@ from mudg.data.scene import read_scene
 from mudg.models.diffusion import sized_to_area
 from mudg.models.mdm.codec import CLASSES
 from mudg.stages.config import LearnConfig
+from mudg.stages.learning import city_fits
 
 
 def held_out_cities(config: LearnConfig) -> list[int]:
@@ -69,7 +70,8 @@ class MakingClips:
         log.info(f"learn: {len(self._missing)} cities to generate into {self._folder}, {self._workers} processes")
         self._pool = process_pool(self._workers)
         with child_environment(1):
-            self._futures = [self._pool.submit(from_city.write_city, self._rules, n, self._folder) for n in self._missing]
+            make = city_fits.write_fitted_city if self._rules.fitted else from_city.write_city
+            self._futures = [self._pool.submit(make, self._rules, n, self._folder) for n in self._missing]
         for future in self._futures:
             future.add_done_callback(_stop_all_on_error(self._futures))
 

@@ -41,7 +41,10 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
         raise UsageError(
             "a memory budget applies to published-type models only", where="--memory-budget-gb", remedy="leave it out"
         )
-    mdm_files.load(config.model)  # fails now rather than in every process
+    model = mdm_files.load(config.model)  # fails now rather than in every process
+    if fitted and not model.config.renders:
+        raise UsageError("this model was not trained with renders of a fitted scene", where="--fitted", got=config.model,
+                         remedy="leave it out, or choose another --model")  # fmt: skip
     return config
 
 

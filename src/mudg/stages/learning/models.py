@@ -69,9 +69,9 @@ def kind_of(model: nn.Module) -> ModelKind:
 
 
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
-    """The model to train, and which of its parts ("codec", "refiner") have no weights yet.
+    """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
 
-    With `start` the network is that of the earlier model, extended by a refiner where the settings ask for one. If the settings do
+    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings ask for them. If the settings do
     not describe that network but are the defaults, it is taken as it is. Clips may be of another size and length than before.
 
     Raises:
@@ -79,7 +79,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     """
     wanted = model_config(config)
     if not config.start:
-        return MDM(wanted), {"codec", "refiner"}
+        return MDM(wanted), {"codec", "refiner", "finisher"}
     if is_published(config.start):
         if not _network_is_default(config):
             raise UsageError("the shape of a published-type network cannot be changed", where="--start",
@@ -96,8 +96,8 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         wanted = resized.config
     if wanted == resized.config:
         return resized, set()
-    grows_refiner = bool(wanted.refine_widths) and before.refiner is None
-    return extended(resized, wanted), {"refiner"} if grows_refiner else set()
+    grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
+    return extended(resized, wanted), grown
 
 
 def _network_is_default(config: LearnConfig) -> bool:
@@ -110,6 +110,8 @@ def model_config(config: LearnConfig) -> MDMConfig:
     """The network that a learn configuration asks for."""
     shape = asdict(config.network)
     shape["refine_blocks"] = shape["refine_blocks"] if shape["refine_widths"] else ()
+    if not (shape["finish_widths"] and shape["refine_widths"] and shape["renders"]):
+        shape["finish_widths"] = shape["finish_blocks"] = ()
     return MDMConfig(**shape, window=config.data.window, area_px=config.data.width * config.data.height)
 
 

