@@ -94,8 +94,8 @@ struct World {
 // Row layout of the records handed over by Python (data/city/records.py keeps the same list).
 enum RecordKind {
   kRecBuilding = 1, kRecTree, kRecHedge, kRecLamp, kRecSign, kRecSignal, kRecWall, kRecFence, kRecPole, kRecBin, kRecBench,
-  kRecShelter, kRecHill, kRecBush, kRecBridge, kRecBollard, kRecMotorbike, kRecPlanter,
-  kRecCar = 50, kRecVan, kRecTruck, kRecBus, kRecPedestrian, kRecCyclist
+  kRecShelter, kRecHill, kRecBush, kRecBridge, kRecBollard, kRecMotorbike, kRecPlanter, kRecPart,
+  kRecCar = 50, kRecVan, kRecTruck, kRecBus, kRecPedestrian, kRecCyclist, kRecTanker
 };
 constexpr int kRecordColumns = 28;
 // 0 kind, 1-3 position (m), 4 yaw, 5 length, 6 width, 7 height, 8 seed, 9-11 rgb, 12-14 rgb2, 15-26 parameters, 27 public id
