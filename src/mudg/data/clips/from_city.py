@@ -71,6 +71,8 @@ class CityClipRules:
     the first view, from where it was recorded."""
     realism: Realism = "plain"
     """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of `size_of`."""
+    textures: str = ""
+    """Varied cities: folder of photographic textures and skies, used by most cities (empty = none)."""
 
     @property
     def frames(self) -> int:
@@ -104,7 +106,7 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
     if is_varied(rules, city):
         width, height = size_of(rules, city)
         plain = replace(plain, width=width * rules.fine, height=height * rules.fine)
-        return varied.draw_city(rules.seed, city, plain)
+        return varied.draw_city(rules.seed, city, plain, rules.textures)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < 0.4
     return replace(

@@ -41,6 +41,9 @@ class LearnData:
     realism: Literal["plain", "varied"] = "plain"
     """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). The small model then
     also learns five aspect ratios, all of about the area width x height. Cities for scoring stay plain."""
+    textures: str = ""
+    """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use (empty =
+    none)."""
     held_out: int = Field(default=6, ge=1)
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()
