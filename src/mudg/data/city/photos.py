@@ -22,7 +22,7 @@ from mudg.base.errors import InputError
 Pixels = NDArray[np.float32]
 
 SURFACES: Final[tuple[tuple[str, ...], ...]] = (
-    ("asphalt", "kies"),
+    ("asphalt",),
     ("footway", "tile0", "concrete", "cobblestone"),
     ("gras", "ground0"),
     ("plaster", "concrete", "marble", "woodsiding", "composite"),
