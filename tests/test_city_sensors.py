@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import replace
 
@@ -297,3 +298,58 @@ def test_varied_clips_are_reproducible() -> None:
     for a, b in zip(first, again, strict=True):
         assert np.array_equal(a.rgb.numpy(), b.rgb.numpy())
         assert np.array_equal(a.condition.color.numpy(), b.condition.color.numpy())
+
+
+# --- above the LiDAR --------------------------------------------------------------------------------------------------
+
+
+def _golden(config: CityConfig) -> str:
+    """Digest of what a configuration draws, up to the last digits of a machine's sines."""
+    from mudg.data.city.furnish import furnish
+    from mudg.data.city.layout import plan_streets
+    from mudg.data.city.light import light_numbers
+    from mudg.data.city.traffic import ego_keys, plan_traffic
+
+    plan = plan_streets(config)
+    ego = ego_keys(config, plan)
+    objects = plan_traffic(config, plan, *ego)
+    rows = np.array(furnish(config, plan) + [m.row for m in objects])
+    numbers = [rows, light_numbers(config)[1], ego[1], *(m.keys for m in objects)]
+    digest = hashlib.sha256()
+    for part in numbers:
+        digest.update((np.round(part, 5) + 0.0).tobytes())
+    return digest.hexdigest()[:16]
+
+
+@pytest.mark.parametrize(
+    ("seed", "digest"), [(7, "e455847fb5e099da"), (2100000, "4e2b2611be399a77"), (2100103, "ae150abf9186cbf9")]
+)
+def test_default_cities_are_what_they_always_were(seed: int, digest: str) -> None:
+    assert _golden(CityConfig(seed=seed, n_frames=12)) == digest
+
+
+def test_overhead_and_skies_change_the_city_and_their_defaults_do_not() -> None:
+    plain = CityConfig(seed=7, n_frames=12)
+    assert _golden(replace(plain, overhead=0.0, skies="plain")) == _golden(plain)
+    assert _golden(replace(plain, overhead=0.8)) != _golden(plain)
+    assert _golden(replace(plain, overhead=0.8)) == _golden(replace(plain, overhead=0.8))
+    assert _golden(replace(plain, skies="varied")) != _golden(plain)
+
+
+@needs_native
+def test_cities_with_overhead_have_more_above_and_nothing_in_the_way() -> None:
+    less, more, brightest = [], [], []
+    for seed in range(30, 38):
+        base = CityConfig(seed=seed, n_frames=6, width=96, height=64, supersample=1, cameras=("front",))
+        for amount, shares in ((0.0, less), (1.0, more)):
+            world = CityWorld(replace(base, overhead=amount, skies="varied" if amount else "plain"))
+            for view in world.frame_views("front")[::5]:
+                truth = world.render(view)
+                shares.append(1 - truth.sky[:21].mean())
+                if amount and truth.sky.any():
+                    brightest.append(truth.rgb[truth.sky].mean())
+                for shift_m in (-4.0, 4.0):
+                    assert world.render(from_city.shifted_view(world, view, shift_m)).depth.min() > 0.5
+    assert np.mean(more) > np.mean(less) + 0.1
+    assert max(brightest) > 0.9
+    assert max(brightest) - min(brightest) > 0.2

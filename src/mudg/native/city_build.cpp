@@ -343,6 +343,27 @@ void add_fence(World& world, const Record& r) {
   s.contact(hx, 0.05f, 0.3f, 0.3f);
 }
 
+// One shape of something that Python puts together. Parameters: 0 shape (0 box, 1 cylinder, 2 leaves), 1 class, 2 material,
+// 3-5 end of the cylinder relative to its beginning (radius = half the width) or cell and density of the leaves,
+// 6-7 half extents, 8 strength of the shade on the ground below.
+void add_part(World& world, const Record& r) {
+  Sink s(world, r.x, r.y, r.z, r.yaw);
+  Look look = look_of(static_cast<Class>(static_cast<int>(r.p[1])), static_cast<Material>(static_cast<int>(r.p[2])), r.rgb, r.seed, r.rgb2);
+  if (look.material == kMatSign) {
+    look.p1 = 0.5f * r.height;
+    look.p2 = 8;
+    look.p3 = 0.5f * r.width;
+    s.card({0, 0, 0}, 0.5f * r.width, 0.5f * r.height, 0, kMaskFull, 0, 0, look);
+  } else if (r.p[0] > 1.5f) {
+    s.leaves({0, 0, 0}, {0.5f * r.length, 0.5f * r.width, 0.5f * r.height}, r.p[3], r.p[4], look);
+  } else if (r.p[0] > 0.5f) {
+    s.cylinder({0, 0, 0}, {r.p[3], r.p[4], r.p[5]}, 0.5f * r.width, look);
+  } else {
+    s.box({0, 0, 0}, {0.5f * r.length, 0.5f * r.width, 0.5f * r.height}, look);
+  }
+  if (r.p[8] > 0) s.contact(r.p[6], r.p[7], 2.5f, r.p[8]);
+}
+
 void add_furniture(World& world, const Record& r) {
   Sink s(world, r.x, r.y, r.z, r.yaw);
   const float hx = 0.5f * r.length, hy = 0.5f * r.width, h = r.height;
@@ -486,7 +507,8 @@ void add_van(World& world, const Record& r) {
   for (const float side : {-1.0f, 1.0f}) s.box({0.66f * hl, side * (hw + 0.1f), screen + 0.2f}, {0.05f, 0.09f, 0.16f}, look_of(kCar, kMatMetal, {0.03f, 0.03f, 0.03f}));
 }
 
-void add_truck(World& world, const Record& r) {
+// A lorry; with `tank` a round tank instead of the box.
+void add_truck(World& world, const Record& r, bool tank) {
   Sink s(world, 0, 0, 0, 0);
   const float hl = 0.5f * r.length, hw = 0.5f * r.width, h = r.height;
   const float cab = 1.9f, cab_h = std::min(h - 0.3f, 2.7f);
@@ -502,7 +524,14 @@ void add_truck(World& world, const Record& r) {
   cargo.p0 = hl;
   cargo.p1 = h;
   const float cargo_from = -hl, cargo_to = hl - cab - 0.15f, mid = 0.5f * (cargo_from + cargo_to);
-  s.box({mid, 0, 0.5f * (h + 0.95f)}, {0.5f * (cargo_to - cargo_from), hw, 0.5f * (h - 0.95f)}, cargo);
+  if (tank) {
+    const float radius = std::min(hw - 0.05f, 0.5f * (h - 1.0f));
+    Look steel = look_of(kTruck, kMatMetal, r.rgb2, r.seed);
+    s.cylinder({cargo_from, 0, 1.0f + radius}, {cargo_to, 0, 1.0f + radius}, radius, steel);
+    s.box({mid, 0, 1.0f + 2 * radius}, {0.45f * (cargo_to - cargo_from), 0.25f, 0.06f}, steel);
+  } else {
+    s.box({mid, 0, 0.5f * (h + 0.95f)}, {0.5f * (cargo_to - cargo_from), hw, 0.5f * (h - 0.95f)}, cargo);
+  }
   const Look dark = look_of(kTruck, kMatPlain, {0.02f, 0.02f, 0.022f}, r.seed);
   s.box({0, 0, 0.78f}, {hl - 0.3f, 0.42f, 0.16f}, dark);
   s.box({-hl + 0.08f, 0, 0.62f}, {0.06f, hw - 0.1f, 0.1f}, dark);
@@ -604,7 +633,8 @@ void add_posed(World& world, const Record& r) {
   switch (r.kind) {
     case kRecCar: add_car(world, r); break;
     case kRecVan: add_van(world, r); break;
-    case kRecTruck: add_truck(world, r); break;
+    case kRecTruck: add_truck(world, r, false); break;
+    case kRecTanker: add_truck(world, r, true); break;
     case kRecBus: add_bus(world, r); break;
     case kRecPedestrian: add_pedestrian(world, r, posed); break;
     case kRecCyclist: add_cyclist(world, r, posed); break;
@@ -727,6 +757,7 @@ void build_world(World& world, const double* records, int64_t count) {
       case kRecSignal: add_signal(world, r); break;
       case kRecWall: add_wall(world, r); break;
       case kRecFence: add_fence(world, r); break;
+      case kRecPart: add_part(world, r); break;
       default:
         if (r.kind < kRecCar) add_furniture(world, r);
     }

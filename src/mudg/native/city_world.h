@@ -72,6 +72,21 @@ struct SunGrid {
 };
 constexpr float kSunReach = 160.0f;  // longest shadow ray, metres
 
+// A photographic surface: albedo relative to its mean, repeated every `metres`, with halved copies for what is far away; or the sky.
+enum TextureSlot { kTexRoad, kTexWalk, kTexTerrain, kTexPlaster, kTexBrick, kTexConcrete, kTexBark, kTexRoof, kTexCargo, kTexSky, kTexSlots };
+struct Texture {
+  struct Level {
+    int width = 0, height = 0;
+    std::vector<Vec3> texels;
+  };
+  std::vector<Level> levels;
+  float metres = 1;
+  bool empty() const { return levels.empty(); }
+  Vec3 at(float u, float v, float footprint_m) const;  // u, v in metres
+  Vec3 toward(Vec3 direction) const;                   // of a panorama; v = 0 at the zenith, 1 at the horizon
+};
+void fill_texture(Texture& texture, const float* rgb, int width, int height, float metres);
+
 struct World {
   ShapePools pools;
   std::vector<Shape> shapes;
@@ -88,14 +103,16 @@ struct World {
   std::vector<std::vector<int>> contact_cells;
   Road road;
   Light light;
+  Texture textures[kTexSlots];
   int seed = 0;
 };
+Vec3 textured(const World& world, TextureSlot slot, Vec3 point, Vec3 normal, float footprint_m);
 
 // Row layout of the records handed over by Python (data/city/records.py keeps the same list).
 enum RecordKind {
   kRecBuilding = 1, kRecTree, kRecHedge, kRecLamp, kRecSign, kRecSignal, kRecWall, kRecFence, kRecPole, kRecBin, kRecBench,
-  kRecShelter, kRecHill, kRecBush, kRecBridge, kRecBollard, kRecMotorbike, kRecPlanter,
-  kRecCar = 50, kRecVan, kRecTruck, kRecBus, kRecPedestrian, kRecCyclist
+  kRecShelter, kRecHill, kRecBush, kRecBridge, kRecBollard, kRecMotorbike, kRecPlanter, kRecPart,
+  kRecCar = 50, kRecVan, kRecTruck, kRecBus, kRecPedestrian, kRecCyclist, kRecTanker
 };
 constexpr int kRecordColumns = 28;
 // 0 kind, 1-3 position (m), 4 yaw, 5 length, 6 width, 7 height, 8 seed, 9-11 rgb, 12-14 rgb2, 15-26 parameters, 27 public id

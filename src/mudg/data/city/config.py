@@ -60,6 +60,9 @@ class CityConfig:
     arms with lamps and signals, tall vehicles, taller buildings."""
     skies: Literal["plain", "varied"] = "plain"
     """varied = more kinds of sky: white and near saturation, hazy, deep blue, scattered clouds, sunset, before a storm."""
+    textures: str = ""
+    """Folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use; empty = none. A scene
+    made with it can only be rebuilt while the folder is there."""
     shift_margin_m: Annotated[float, Field(ge=0, le=5)] = 4.0
     """Free space beside the recorded path, metres: a camera shifted laterally by up to this distance never enters an object."""
     supersample: Annotated[int, Field(ge=1, le=4)] = 2

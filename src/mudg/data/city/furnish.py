@@ -10,6 +10,7 @@ from mudg.data.city import records as rec
 from mudg.data.city.config import CityConfig
 from mudg.data.city.furnisher import BRICK_COLORS, KERB_M, LEAF_COLORS, RENDER_COLORS, Furnisher, plant_tree
 from mudg.data.city.layout import AHEAD_M, StreetPlan
+from mudg.data.city.overhead import add_overhead
 from mudg.data.city.records import record
 from mudg.data.city.sidewalk import furnish_sidewalk
 
@@ -24,6 +25,8 @@ def furnish(config: CityConfig, plan: StreetPlan) -> list[list[float]]:
     if plan.crossing is not None:
         _crossing_surroundings(f)
     _background(f)
+    if config.overhead > 0:
+        add_overhead(f, config.overhead)
     return f.rows
 
 

@@ -2,11 +2,63 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import seeds
 from mudg.data.city.config import CityConfig
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sky:
+    """Radiances f64[3] of sun, zenith, horizon, ambient light and clouds; share of clouds; elevation of the sun in radians."""
+
+    sun: Numbers
+    zenith: Numbers
+    horizon: Numbers
+    ambient: Numbers
+    cloud: Numbers
+    cloudiness: float
+    elevation: float
+
+
+def _other_sky(rng: np.random.Generator, plain: Sky) -> Sky:
+    """The sky of a photograph: often so bright that the camera saturates. Ground and sky are exposed independently."""
+    kind = int(rng.choice(7, p=[0.14, 0.22, 0.16, 0.16, 0.16, 0.10, 0.06]))
+    bright = rng.uniform(0.9, 2.6)
+    warm = 1 + rng.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
+    if kind == 0:  # as it was, only brighter or darker
+        k = rng.uniform(0.7, 1.8)
+        return replace(plain, zenith=plain.zenith * k, horizon=plain.horizon * k, cloud=plain.cloud * k)
+    if kind == 1:  # white all over, near saturation
+        white = np.array([0.97, 1.0, 1.03]) * warm * bright * rng.uniform(1.0, 1.8)
+        return replace(plain, sun=plain.sun * rng.uniform(0, 0.15), zenith=white * rng.uniform(0.75, 1.05),
+                       horizon=white, cloud=white * 0.95,
+                       ambient=np.array([0.95, 1.0, 1.06]) * rng.uniform(0.7, 1.3), cloudiness=rng.uniform(0.0, 1.0))  # fmt: skip
+    if kind == 2:  # graded blue, pale at the horizon
+        deep = np.array([rng.uniform(0.08, 0.4), rng.uniform(0.3, 0.62), rng.uniform(0.75, 1.2)])
+        return replace(plain, zenith=deep * rng.uniform(0.6, 1.3), horizon=np.array([0.85, 0.95, 1.05]) * warm * rng.uniform(0.8, 1.8),
+                       cloudiness=rng.uniform(0, 0.25))  # fmt: skip
+    if kind == 3:  # scattered bright clouds
+        deep = np.array([rng.uniform(0.15, 0.35), rng.uniform(0.4, 0.55), rng.uniform(0.8, 1.1)])
+        return replace(plain, zenith=deep, horizon=np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1.5), cloudiness=rng.uniform(0.35, 1.1),
+                       cloud=np.array([1.0, 1.0, 1.02]) * warm * bright)  # fmt: skip
+    if kind == 4:  # haze: white below, bluish above
+        white = np.array([1.0, 1.0, 1.0]) * warm * bright
+        blue = np.array([0.55, 0.72, 0.95]) * bright
+        return replace(plain, horizon=white * 1.2, zenith=blue, cloud=white, cloudiness=rng.uniform(0.1, 0.6))
+    if kind == 5:  # low sun
+        glow = np.array([1.5, rng.uniform(0.7, 1.1), rng.uniform(0.35, 0.8)]) * rng.uniform(0.8, 1.6)
+        return Sky(np.array([2.8, 1.7, 0.9]) * rng.uniform(0.4, 1.0), np.array([0.25, 0.35, 0.6]) * rng.uniform(0.8, 1.5), glow,
+                   np.array([0.55, 0.52, 0.6]) * rng.uniform(0.9, 1.4), glow * rng.uniform(0.5, 0.9), rng.uniform(0.2, 0.9),
+                   float(np.deg2rad(rng.uniform(3, 12))))  # fmt: skip
+    dark = np.array([0.42, 0.46, 0.52]) * rng.uniform(0.6, 1.2)  # before a storm
+    return replace(plain, sun=plain.sun * 0.05, zenith=dark * 0.8, horizon=dark * rng.uniform(1.0, 1.8), cloud=dark * 0.7,
+                   ambient=np.array([0.75, 0.8, 0.9]) * rng.uniform(0.6, 1.0), cloudiness=rng.uniform(0.6, 1.1))  # fmt: skip
 
 
 def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
@@ -37,6 +89,10 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
         zenith, horizon = np.array([0.20, 0.27, 0.50]) * rng.uniform(0.8, 1.2), np.array([1.05, 0.68, 0.45])
         ambient, cloud = np.array([0.40, 0.42, 0.56]) * rng.uniform(0.85, 1.2), np.array([0.86, 0.58, 0.50])
         cloudiness, haze, night, exposure = rng.uniform(0.1, 0.8), rng.uniform(250, 900), 0.6, rng.uniform(0.85, 1.25)
+    if config.skies == "varied":
+        plain = Sky(sun, zenith, horizon, ambient, cloud, cloudiness, float(elevation))
+        sky = _other_sky(seeds.numpy_rng(config.seed, 0, "city sky"), plain)
+        sun, zenith, horizon, ambient, cloud, cloudiness, elevation = (getattr(sky, name) for name in Sky.__slots__)
     direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     numbers = [
         *direction, *sun, *zenith, *horizon, *ambient, *cloud, *tint, cloudiness, haze, night, exposure,

@@ -26,6 +26,8 @@ def library() -> ctypes.CDLL:
     lib.mudg_city_create.restype = _P
     lib.mudg_city_destroy.argtypes = [_P]
     lib.mudg_city_destroy.restype = None
+    lib.mudg_city_set_texture.argtypes = [_P, _I, _P, _I, _I, ctypes.c_float]
+    lib.mudg_city_set_texture.restype = _I
     lib.mudg_city_shape_count.argtypes = [_P]
     lib.mudg_city_shape_count.restype = _L
     lib.mudg_city_render.argtypes = [_P, _P, _P, _P, _I, _I, _P, _I, _U, _P, _P, _P, _P]
@@ -63,6 +65,12 @@ class CityHandle:
         if not self._handle:
             raise ResourceError("not enough memory to build the city")
         self.shape_count = int(self._lib.mudg_city_shape_count(self._handle))
+
+    def set_texture(self, slot: int, rgb: NDArray[np.float32], metres: float) -> None:
+        """Give a surface or the sky a photograph f32[H, W, 3]; before anything is rendered."""
+        pixels = np.ascontiguousarray(rgb, np.float32)
+        if self._lib.mudg_city_set_texture(self._handle, slot, pixels.ctypes.data, pixels.shape[1], pixels.shape[0], metres):
+            raise ResourceError("not enough memory for a texture of the city")
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None):

@@ -150,8 +150,10 @@ class TrafficPlanner(Draws):
         """Record of a random vehicle."""
         paint = PAINTS[int(self.rng.choice(len(PAINTS), p=PAINT_WEIGHTS / PAINT_WEIGHTS.sum()))]
         seed = self.seed()
-        draw = float(self.rng.random())
         origin = (0.0, 0.0, 0.0)
+        if self.config.overhead > 0 and self.chance((0.3 if allow_big else 0.08) * self.config.overhead):
+            return self.tall_vehicle(seed, paint)
+        draw = float(self.rng.random())
         if draw < 0.10:
             size = (self.uniform(5.0, 6.2), self.uniform(1.95, 2.1), self.uniform(2.1, 2.6))
             white = PAINTS[1] if self.chance(0.6) else paint
@@ -169,6 +171,20 @@ class TrafficPlanner(Draws):
         height = tuple(self.uniform(*span) for span in ((1.40, 1.48), (1.45, 1.55), (1.62, 1.78), (1.45, 1.53)))[style]
         size = (length, self.uniform(1.74, 1.88), height)
         return record(rec.CAR, origin, 0, size, seed, paint, parameters=(float(style),))
+
+    def tall_vehicle(self, seed: int, paint: Color) -> list[float]:
+        """Record of a lorry, tanker or bus of full height."""
+        kind, origin = float(self.rng.random()), (0.0, 0.0, 0.0)
+        box = PAINTS[1] if self.chance(0.5) else (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
+        if kind < 0.5:
+            return record(rec.TRUCK, origin, 0, (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0)), seed, paint, box)
+        if kind < 0.65:
+            steel = self.uniform(0.3, 0.6)
+            return record(rec.TANKER, origin, 0, (self.uniform(8.0, 13.0), 2.5, self.uniform(3.3, 3.7)), seed, paint,
+                          (steel, steel, steel) if self.chance(0.6) else box)  # fmt: skip
+        body = BUS_COLORS[int(self.rng.integers(5))]
+        height = self.uniform(4.1, 4.4) if self.chance(0.35) else self.uniform(3.1, 3.5)
+        return record(rec.BUS, origin, 0, (self.uniform(10.5, 12), 2.5, height), seed, body, (0.6, 0.6, 0.58))
 
     def cloth(self) -> Color:
         """A colour of clothing: mostly muted."""

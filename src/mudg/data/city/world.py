@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from mudg.data.city.furnish import furnish
 from mudg.data.city.layout import StreetPlan, plan_streets
 from mudg.data.city.light import light_numbers
 from mudg.data.city.native import CityHandle
+from mudg.data.city.photos import draw_photos
 from mudg.data.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
 DATASET = "mudg procedural city"
@@ -92,6 +94,8 @@ class CityWorld:
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
         records = np.array(rows, np.float64).reshape(-1, rec.COLUMNS)
         self._handle = CityHandle(records, self.plan, _road_numbers(config, self.plan), light, _seed31(config, "city surfaces"))
+        for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
+            self._handle.set_texture(slot, rgb, metres)
         self._cameras = rig.cameras(config)
         self._mounts = rig.ego_from_camera(config)
         self._ego_path = EgoPath(self._ego_times, self._ego_poses)

@@ -76,6 +76,8 @@ class CityClipRules:
     fitted: bool = False
     """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch at a higher
     resolution; recorded images are 2 to 4 times larger than the clips."""
+    textures: str = ""
+    """Varied cities: folder of photographic textures and skies, used by most cities (empty = none)."""
 
     @property
     def frames(self) -> int:
@@ -117,7 +119,7 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
     if is_varied(rules, city):
         width, height = size_of(rules, city)
         plain = replace(plain, width=width * fine, height=height * fine)
-        return varied.draw_city(rules.seed, city, plain)
+        return varied.draw_city(rules.seed, city, plain, rules.textures)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < 0.4
     return replace(

@@ -51,12 +51,13 @@ def sized(width: int, height: int, city: int, multiple: int = 16) -> tuple[int, 
     return columns * multiple, rows * multiple
 
 
-def draw_city(seed: int, city: int, plain: CityConfig) -> CityConfig:
+def draw_city(seed: int, city: int, plain: CityConfig, textures: str = "") -> CityConfig:
     """Configuration of a training city.
 
     Args:
         seed, city: fix everything.
         plain: seed, length and image size; the rest is drawn here.
+        textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it.
     """
     rng = seeds.numpy_rng(seed, city, "varied city")
     beams, lower, upper = LIDARS[int(rng.choice(len(LIDARS), p=LIDAR_SHARES))]
@@ -78,6 +79,7 @@ def draw_city(seed: int, city: int, plain: CityConfig) -> CityConfig:
         shift_margin_m=4.2,
         overhead=float(rng.choice([0.0, rng.uniform(0.25, 1.0)], p=[0.12, 0.88])),
         skies="varied" if rng.random() < 0.85 else "plain",
+        textures=textures if rng.random() < 0.8 else "",
     )
 
 

@@ -49,7 +49,7 @@ def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.Cit
     data = config.data
     return from_city.CityClipRules(
         data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone,
-        realism=data.realism,
+        realism=data.realism, textures=data.textures,
     )
 
 
