@@ -12,9 +12,8 @@ import pytest
 
 from mudg import cli
 from mudg.base import config as configuration
-from mudg.base import processes, store
+from mudg.base import store
 from mudg.base.errors import InputError, NumericsError, UsageError
-from mudg.base.processes import Task
 from mudg.report import run_report
 from mudg.stages import annotate, fit, fuse, ingest, render, run, score, synthesize
 from mudg.stages.config import RunConfig, run_preset, with_seed
@@ -46,7 +45,6 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         (render, "render"), (score, "score"),
     ):  # fmt: skip
         monkeypatch.setattr(module, "run", stand_in(name))
-    monkeypatch.setenv("MUDG_THREADS", "1")  # stand-ins are not known to child processes: one fit after the other
     monkeypatch.setattr(run, "_has_semantics", lambda _scene: seen["labelled"])
     monkeypatch.setattr(score, "summary_table", lambda _out: "table")
 
@@ -64,7 +62,7 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 CHAIN = [
-    "ingest", "fuse", "synthesize", "fit:street_gaussians", "fit:mudg_s", "render:street_gaussians", "render:mudg_s",
+    "ingest", "fuse", "fit:street_gaussians", "synthesize", "fit:mudg_s", "render:street_gaussians", "render:mudg_s",
     "score", "report",
 ]  # fmt: skip
 
@@ -78,41 +76,14 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     assert str(result["report"].resolve()) in result["text"]
     plain, guided = verbs["fit:street_gaussians"], verbs["fit:mudg_s"]
     assert plain[0][0].method == "street_gaussians"
-    assert plain[1]["observations"] is None
+    assert "observations" not in plain[1] and "start" not in plain[1]
     assert guided[0][0].method == "mudg_s"
     assert guided[1]["observations"] == tmp_path / "out" / "synthesize"
+    assert guided[1]["start"] == tmp_path / "out" / "fit" / "street_gaussians"
+    assert guided[0][0].iterations == plain[0][0].iterations // 2
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "complete"
     assert all(step["state"] == "complete" for step in ledger["steps"].values())
-
-
-def test_the_fits_run_side_by_side_on_two_cores_unless_one_is_there(
-    tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    started: list[tuple[list[Task], int]] = []
-
-    def in_a_row(tasks: list[Task], threads_each: int) -> None:
-        started.append((tasks, threads_each))
-        for task in tasks:
-            fit.run(*task.arguments, **task.named)
-
-    monkeypatch.setattr(processes, "run_side_by_side", in_a_row)
-    run.run_chain(RunConfig(), "city", tmp_path / "one core")
-    assert not started
-    monkeypatch.setenv("MUDG_THREADS", "5")
-    run.run_chain(RunConfig(), "city", tmp_path / "out")
-    ((tasks, threads),) = started
-    assert threads == 2
-    assert all(task.function is fit.run for task in tasks)
-    assert verbs["calls"] == [*CHAIN, *CHAIN]
-    plain, guided = verbs["fit:street_gaussians"], verbs["fit:mudg_s"]
-    assert plain[0][0].method == "street_gaussians"
-    assert plain[1]["observations"] is None
-    assert guided[0][0].method == "mudg_s"
-    assert guided[1]["observations"] == tmp_path / "out" / "synthesize"
-    store.write_json(tmp_path / "out" / "fit" / "street_gaussians" / "run.json", {"state": "complete"})
-    run.run_chain(RunConfig(), "city", tmp_path / "out")
-    assert len(started) == 1
 
 
 def test_a_repeat_makes_no_second_report_unless_it_was_touched(tmp_path: Path, verbs: dict[str, Any]) -> None:

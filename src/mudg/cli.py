@@ -99,8 +99,10 @@ def _synthesize(args: f.Synthesize) -> dict[str, Any]:
 def _fit(args: f.Fit) -> dict[str, Any]:
     from mudg.stages import fit
 
-    virtual = args.observations
-    made = fit.run(args.settings, args.scene, args.fused, args.out, observations=virtual, overwrite=args.overwrite)
+    made = fit.run(
+        args.settings, args.scene, args.fused, args.out,
+        observations=args.observations, start=args.start_from, overwrite=args.overwrite,
+    )  # fmt: skip
     return {"model": made}
 
 
@@ -214,7 +216,8 @@ VERBS: dict[str, Verb] = {
     "fit": Verb(
         "Fit a dynamic 3D Gaussian scene to recorded (and virtual) views.",
         ("mudg fit scenes/city --fused runs/fused --method street_gaussians --out runs/plain",
-         "mudg fit scenes/city --fused runs/fused --observations runs/virtual --out runs/mudg_s"),
+         "mudg fit scenes/city --fused runs/fused --observations runs/virtual --out runs/mudg_s",
+         "mudg fit scenes/city --fused runs/fused --observations runs/virtual --start-from runs/plain --iterations 1000 --out runs/mudg_s"),
         _fit,
     ),
     "render": Verb(

@@ -144,6 +144,9 @@ class Fit(Output):
     """Point clouds written by fuse."""
     observations: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Virtual views written by synthesize; required by method mudg_s."""
+    start_from: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views are used
+    from the first of them on."""
     settings: Annotated[stage_config.FitConfig, arg(name="")]
 
 

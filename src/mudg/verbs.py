@@ -84,15 +84,21 @@ def synthesize(
 
 def fit(
     scene: Location, fused: Location, out: Location, *,
-    observations: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+    observations: Location | None = None, start_from: Location | None = None, overwrite: bool = False,
+    config: Location | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
-    """Fit a dynamic Gaussian scene to recorded and, with ``observations``, generated views; returns the model's folder."""
+    """Fit a dynamic Gaussian scene to recorded and, with ``observations``, generated views; returns the model's folder.
+
+    Args:
+        start_from: a finished fit of ``street_gaussians`` to the same scene, to go on with for ``iterations`` more steps.
+    """
     from mudg.stages import fit as stage
 
     made = _settings(stage_config.FitConfig, config, settings)
     return stage.run(
-        made, Path(scene), Path(fused), Path(out), observations=_optional(observations), overwrite=overwrite
-    )
+        made, Path(scene), Path(fused), Path(out),
+        observations=_optional(observations), start=_optional(start_from), overwrite=overwrite,
+    )  # fmt: skip
 
 
 def render(

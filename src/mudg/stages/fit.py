@@ -4,10 +4,12 @@ The loop is ``optimise`` and reads top to bottom. What it calls: ``fitting/views
 Gaussians start), ``models.scene.model.compose`` (the scene at a time), ``core.raster`` (the renderer), ``core.losses`` (every
 loss), ``models.scene.densify``. Nothing else touches the parameters.
 
-    OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``)
+    OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``) and its certainty
     OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
     OUT/log.jsonl, preview/*.png                                how it went
     OUT/steps/                                                  checkpoints, while it runs
+
+With ``start`` it goes on with a finished fit (``fitting/continued.py``).
 """
 
 from __future__ import annotations
@@ -26,10 +28,10 @@ from torch import Tensor
 
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import to_dict
-from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.errors import NumericsError, UsageError
 from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.base.types import FusedCloud, Gaussians, Observation, Render, Scene, View
+from mudg.base.types import FusedCloud, Gaussians, Render, Scene
 from mudg.core import losses, metrics, native_ops
 from mudg.core.pictures import panels_of
 from mudg.core.raster.rasterize import RasterConfig, rasterize
@@ -40,13 +42,27 @@ from mudg.methods import METHODS
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.densify import DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
 from mudg.models.scene.mcmc import McmcSettings, drift, relocate_and_grow
-from mudg.models.scene.model import SceneModel, compose, composite_semantics, composite_sky, sky_lift
+from mudg.models.scene.model import CERTAINTY, SceneModel, compose, composite_sky, sky_lift
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages.config import FitConfig
+from mudg.stages.fitting.certainty import certainty_of
+from mudg.stages.fitting.continued import (
+    StartFit,
+    all_classes,
+    begun_at,
+    continued_appearance,
+    continued_model,
+    whole_run,
+)
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
 from mudg.stages.fitting.poses import refine_poses
+from mudg.stages.fitting.rendering import NEAR_M as NEAR_M
+from mudg.stages.fitting.rendering import render_view as render_view
+from mudg.stages.fitting.schedule import appearance_rates, densify_schedule, learning_rates, pose_round_due
 from mudg.stages.fitting.start import start_model
+from mudg.stages.fitting.storage import load_model as load_model
+from mudg.stages.fitting.storage import save_appearance, save_model
 from mudg.stages.fitting.trust import unseen_maps, unseen_rows
 from mudg.stages.fitting.views import (
     TrainView,
@@ -60,21 +76,21 @@ from mudg.stages.fitting.views import (
 )
 
 OUTPUT = VerbOutput(
-    "fit", 2,
+    "fit", 3,
     ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "preview/*.png", "steps/"),
 )  # fmt: skip
-PUBLISHED_STEPS = 30_000
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
-LAST_POSE_ROUND = 0.85
-NEAR_M = 0.2
+LEAST_WITNESSES, WITNESS_SHARE = 8, 0.015
+"""Recorded views that the certainty is computed from, at most: this many, or this share of the steps (one costs about a step)."""
 MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
 """Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
 
 
 def run(
-    config: FitConfig, scene: Path, fused: Path, out: Path, *, observations: Path | None = None, overwrite: bool = False
-) -> Path:
+    config: FitConfig, scene: Path, fused: Path, out: Path, *,
+    observations: Path | None = None, start: Path | None = None, overwrite: bool = False,
+) -> Path:  # fmt: skip
     """Fit a scene.
 
     Args:
@@ -83,22 +99,28 @@ def run(
         fused: fused clouds (fuse).
         out: folder for the model.
         observations: folder of virtual observation sets (synthesize); needed by methods that use them, ignored by others.
+        start: folder of a finished fit of street_gaussians to the same scene and clouds to go on with: ``config.iterations`` more
+            steps, virtual views from the first of them on. None: a fit from nothing.
 
     Returns:
         ``out``, finished. An interrupted run continues when called again with the same arguments.
 
     Raises:
         UsageError: a method with virtual views without ``observations``. NumericsError: a loss or gradient is not
-        finite. InputError: damaged inputs, or recorded views among ``observations``.
+        finite. InputError: damaged inputs, recorded views among ``observations``, or a ``start`` that does not fit.
     """
     learns_virtual = "virtual" in METHODS[config.method].supervision
     if learns_virtual and observations is None:
         remedy = "run `mudg synthesize` and give its folder as --observations, or choose --method street_gaussians"
         raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
-    refuse_overlap(
-        out, {"scene": scene, "fused": fused, "observations": observations, "virtual.lpips-weights": config.virtual.lpips_weights}
-    )
+    refuse_overlap(out, {
+        "scene": scene, "fused": fused, "observations": observations, "start": start,
+        "virtual.lpips-weights": config.virtual.lpips_weights,
+    })  # fmt: skip
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
+    begun = None if start is None else StartFit.of_folder(Path(start), inputs)
+    if begun is not None:
+        inputs["start"] = begun.digest
     virtual: Mapping[str, ObservationSet] = {}
     if learns_virtual and observations is not None:
         virtual = virtual_sets(Path(observations))
@@ -108,9 +130,12 @@ def run(
     folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
+    if begun is not None:
+        config = whole_run(config)
     with one_torch_thread():
-        state = _prepare(config, Path(scene), Path(fused), virtual, folder.path)
+        state = _prepare(config, FitInputs(Path(scene), Path(fused), virtual, begun), folder.path)
         optimise(state, config, folder)
+        add_certainty(state, config)
     save_model(state.model, folder.path)
     save_appearance(state.appearance, folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
@@ -130,38 +155,52 @@ class FitState:
     seconds: float = 0.0
     last: Mapping[str, float] | None = None
     appearance: Appearance = field(default_factory=lambda: Appearance({}))
+    begun_at: int = 0
+    """Steps of the schedule that counted as done when the fit began: above 0 where it goes on with a finished one."""
 
     def summary(self) -> dict[str, Any]:
         """For run.json."""
-        return {"gaussians": len(self.model.table), "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
+        counts = {"gaussians": len(self.model.table), "steps": self.step - self.begun_at}
+        return {**counts, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def _prepare(config: FitConfig, scene_path: Path, fused_path: Path, virtual: Mapping[str, ObservationSet], out: Path) -> FitState:
+@dataclass(frozen=True)
+class FitInputs:
+    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it goes on with."""
+
+    scene: Path
+    fused: Path
+    virtual: Mapping[str, ObservationSet]
+    start: StartFit | None = None
+
+
+def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene, fused = read_scene(scene_path), read_fused(fused_path)
-    views, classes = recorded_views(config, scene, virtual)
-    if virtual:
+    scene, fused, start = read_scene(given.scene), read_fused(given.fused), given.start
+    views, classes = recorded_views(config, scene, given.virtual, start)
+    if given.virtual:
         measured = fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
-        views = replace(views, virtual=load_virtual(virtual, classes, measured))
+        views = replace(views, virtual=load_virtual(given.virtual, classes, measured))
     found = checkpoint.latest(out / "steps")
     if found is None:
-        return start_state(config, scene, fused, views, classes)
+        return start_state(config, scene, fused, views, classes) if start is None else continued_state(config, start, views, classes)
     log.info(f"resuming at step {found.step} of {config.iterations}")
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
     stats, appearance = found.tensors("stats"), Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
     return FitState(
         model, views, DensifyStats.from_state(stats), densify_schedule(config), found.step, float(found.state["seconds"]),
-        found.state["last"], appearance,
+        found.state["last"], appearance, 0 if start is None else begun_at(config.iterations),
     )  # fmt: skip
 
 
 def recorded_views(
-    config: FitConfig, scene: Scene, virtual: Mapping[str, ObservationSet] | None = None
+    config: FitConfig, scene: Scene, virtual: Mapping[str, ObservationSet] | None = None, start: StartFit | None = None
 ) -> tuple[ViewSet, tuple[int, ...]]:
     """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels (those that
-    ``virtual`` shows included)."""
+    ``virtual`` shows and ``start`` knows included)."""
     frames = training_frames(scene, config.cameras)
     classes = classes_of(scene, frames, virtual or {}) if config.semantics else ()
+    classes = classes if start is None else all_classes(start, classes)
     with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
     return ViewSet(load_recorded(scene, frames, classes, config.width_px, with_lidar), ()), classes
 
@@ -170,24 +209,45 @@ def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewS
     """The state that a fit starts from: a model built from the fused cloud, nothing corrected yet."""
     model = start_model(scene, cloud, views.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
+    stats = DensifyStats.zeros(len(model.table))
+    return FitState(model, views, stats, densify_schedule(config), 0, appearance=_nothing_corrected(config, views))
+
+
+def continued_state(config: FitConfig, start: StartFit, views: ViewSet, classes: tuple[int, ...]) -> FitState:
+    """The state of a fit that goes on with a finished one; ``config`` is that of the whole run."""
+    model = continued_model(start, classes, config)
+    model.facts |= {"method": config.method, "classes": [palette.CLASSES[i] for i in classes]}
+    appearance = continued_appearance(start, _nothing_corrected(config, views))
+    log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
+    stats, step = DensifyStats.zeros(len(model.table)), begun_at(config.iterations)
+    return FitState(model, views, stats, densify_schedule(config), step, appearance=appearance, begun_at=step)
+
+
+def _nothing_corrected(config: FitConfig, views: ViewSet) -> Appearance:
     wanted = config.appearance
-    appearance = Appearance.of_views(
+    return Appearance.of_views(
         [view.name for view in views.recorded], [view.name for view in views.virtual], wanted.exposure, wanted.cameras, wanted.virtual
     )
-    return FitState(model, views, DensifyStats.zeros(len(model.table)), densify_schedule(config), 0, appearance=appearance)
+
+
+def add_certainty(state: FitState, config: FitConfig) -> None:
+    """Note in the model how well the photographs constrain every Gaussian (``fitting/certainty.py``)."""
+    raster, most = RasterConfig(backend=config.raster, near_m=NEAR_M), max(LEAST_WITNESSES, round(WITNESS_SHARE * config.iterations))
+    state.model.table.labels[CERTAINTY] = certainty_of(state.model, state.views.recorded, raster, state.appearance, most)
 
 
 # ---- the loop ------------------------------------------------------------------------------------------------------
 
 
 def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
-    """Fit ``state.model`` to its views for ``config.iterations`` steps, one view each (or two, see ``VirtualConfig.beside``).
+    """Fit ``state.model`` to its views up to step ``config.iterations``, one view each (or two, see ``VirtualConfig.beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
     raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
+    virtual_from = state.begun_at or virtual_from
     with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
         while state.step < config.iterations:
             began = time.perf_counter()
@@ -197,8 +257,8 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
             views = state.views.choose(config.seed, step, probability, config.virtual.beside)
             learnt = [_learn_from(state, view, config, raster, perception, step, view is views[0]) for view in views]
-            adam_step(state.model, step, config.iterations)
-            state.appearance.adam_step(step, appearance_rates(step, config.iterations), native_ops.adam_columns)
+            adam_step(state.model, step, config.iterations, state.begun_at)
+            state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.densify.longest_to_middle)
                 settle_nodes(state.model, config, step)
@@ -355,15 +415,6 @@ def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
             node.after_step(share)
 
 
-def pose_round_due(config: FitConfig, step: int) -> bool:
-    """Whether boxes are corrected after a step."""
-    poses = config.poses
-    if not poses.learn or not poses.rounds:
-        return False
-    shares = np.linspace(poses.start, max(poses.start, LAST_POSE_ROUND), poses.rounds)
-    return step in {max(1, round(float(share) * config.iterations)) for share in shares}
-
-
 def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
     """NumericsError naming term, view and step if a loss term is not finite; nothing has been changed by then."""
     for name, value in terms.items():
@@ -385,59 +436,14 @@ def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
                     remedy="the parameters are those of the step before; report the scene, or leave this view out")  # fmt: skip
 
 
-# ---- schedules -----------------------------------------------------------------------------------------------------
+# ---- the optimiser ---------------------------------------------------------------------------------------------------
 
 
-def learning_rates(step: int, iterations: int) -> dict[str, float]:
-    """Learning rate of every column at a step (from 1).
-
-    Published rates belong to 30,000 steps. A shorter run takes larger steps, by the square root of the ratio and at most
-    4 times; positions decay to a hundredth over the run, scales and colours to a fifth.
-    """
-    boost = min(4.0, math.sqrt(max(1.0, PUBLISHED_STEPS / iterations)))
-    along = step / max(1, iterations)
-    decay, gentle = 0.01**along, 0.2**along
-    return {
-        "means": 1.6e-4 * 10.0 * boost * decay,
-        "quats": 1e-3 * boost,
-        "log_scales": 5e-3 * boost * gentle,
-        "logits": 5e-2 * math.sqrt(boost),
-        "sh_dc": 2.5e-3 * boost * gentle,
-        "sh_rest": 1.25e-4 * boost * gentle,
-        "semantics": 1e-2 * boost,
-        "panorama": 1e-2 * gentle,
-        "deform": 1e-3 * boost * gentle,
-    }
-
-
-def appearance_rates(step: int, iterations: int) -> dict[str, float]:
-    """Learning rates of the corrections of appearance at a step (from 1)."""
-    gentle = 0.2 ** (step / max(1, iterations))
-    return {"affine": 2e-3 * gentle, "shift": 1e-3 * gentle, "turn": 1e-4 * gentle}
-
-
-def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None:
-    """The published schedules, scaled to the iterations; None without densification.
-
-    gradient: from 500, every 100, until 0.6 of the run, opacity reset every 3000. mcmc: the same rounds until 0.8.
-    """
-    total = config.iterations
-    every = max(10, min(100, total // 20))
-    start = max(every, min(500, total // 10))
-    if config.densify.kind == "mcmc":
-        return McmcSettings(start, int(0.8 * total), every, max_rows=config.densify.max_gaussians)
-    if config.densify.kind == "none":
-        return None
-    return DensifySettings(
-        start, int(0.6 * total), every, max_rows=config.densify.max_gaussians, reset_every=3000 if total >= 10_000 else 0
-    )
-
-
-def adam_step(model: SceneModel, step: int, iterations: int) -> None:
-    """One Adam step on every table of the model, then gradients are dropped."""
+def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) -> None:
+    """One Adam step on every table of the model, then gradients are dropped; moments are those of the steps after ``begun_at``."""
     rates = learning_rates(step, iterations)
     for table in (model.table, *model.node_tables().values()):
-        table.adam_step(step, rates, native_ops.adam_columns)
+        table.adam_step(step - begun_at, rates, native_ops.adam_columns)
         table.clear_gradients()
 
 
@@ -472,41 +478,6 @@ def save_checkpoint(state: FitState, folder: Path) -> None:
     checkpoint.save(folder, state.step, groups, facts)
 
 
-def save_model(model: SceneModel, folder: Path) -> None:
-    """The fitted scene without optimiser moments."""
-    values, groups = model.state()
-    store.write_json(folder / "model.json", {"schema": 1, **values})
-    for name, tensors in groups.items():
-        kept = {key: value for key, value in tensors.items() if "moment" not in key}
-        store.write_safetensors(folder / f"{name}.safetensors", kept)
-
-
-def save_appearance(appearance: Appearance, folder: Path) -> None:
-    """What was learnt about cameras, images and virtual sets, for those who want to know; renders do not use it."""
-    if appearance:
-        names, tensors = appearance.state()
-        store.write_json(folder / "appearance.json", {"schema": 1, "names": names})
-        store.write_safetensors(folder / "appearance.safetensors", {k: v for k, v in tensors.items() if "moment" not in k})
-
-
-def load_model(folder: Path) -> SceneModel:
-    """Read a fitted scene.
-
-    Raises:
-        InputError: not the folder of a finished fit, or of another schema. IntegrityError: a file was altered.
-    """
-    folder = Path(folder)
-    if not (folder / "model.json").is_file():
-        raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
-    if (folder / store.MANIFEST).is_file():
-        store.verify_manifest(folder)
-    values = store.read_json(folder / "model.json")
-    if values.get("schema") != 1:
-        raise InputError("unknown schema of a fitted scene", where=str(folder / "model.json"), expected="1", got=str(values.get("schema")))
-    groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
-    return SceneModel.from_state(values, groups)
-
-
 # ---- pictures -------------------------------------------------------------------------------------------------------
 
 
@@ -515,29 +486,6 @@ def _progress(state: FitState, view: TrainView, render: Render, terms: Mapping[s
         rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
         psnr = metrics.psnr(rgb, view.rgb, view.mask)
     return {"psnr": round(min(psnr, 99.0), 3), **{f"loss_{name}": round(value.item(), 6) for name, value in terms.items()}}
-
-
-@torch.no_grad()
-def render_view(model: SceneModel, view: View, raster: RasterConfig, sky_below_alpha: float = 0.5, source: str = "") -> Observation:
-    """Render one view of a fitted scene as an observation of kind "virtual".
-
-    Where coverage is below ``sky_below_alpha``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
-    sky has no depth. Confidence is the coverage (1 where the sky is a valid answer).
-    """
-    render = rasterize(compose(model, view.time_s), view, raster)
-    rgb = composite_sky(model, view, render.rgb, render.alpha).clamp(0, 1)
-    covered = render.alpha >= sky_below_alpha
-    depth = torch.where(covered, render.depth, torch.nan)
-    semantics = None
-    if render.extra is not None:
-        channel = composite_semantics(model, render.extra, render.alpha).argmax(0)
-        semantics = torch.tensor(model.classes)[channel]
-        if model.sky is not None:
-            semantics = torch.where(covered[0], semantics, palette.ID["sky"])
-            depth = torch.where(semantics[None] == palette.ID["sky"], torch.nan, depth)
-    confidence = render.alpha if model.sky is None else torch.where(covered, render.alpha, 1 - render.alpha)
-    source = source or str(model.facts.get("method", "fit"))
-    return Observation(view, rgb, depth, semantics, confidence.clamp(0, 1), torch.ones_like(covered), "virtual", source)
 
 
 def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:

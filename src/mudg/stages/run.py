@@ -23,6 +23,8 @@ CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
 DIFFUSION = "mudg_r"
 WITH_DIFFUSION = "mudg_s"
+CONTINUED_SHARE = 0.5
+"""Further steps of the fit with diffusion, as a share of those of the fit that it continues."""
 
 
 @dataclass(frozen=True)
@@ -135,28 +137,19 @@ def _has_semantics(scene: Path) -> bool:
 
 
 def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[Step, ...]:
-    from mudg import native
-    from mudg.base.processes import Task, run_side_by_side
     from mudg.stages import fit, fuse, render, score, synthesize
 
     fused, virtual = out / "fuse", out / "synthesize"
     plain = replace(config.fit, method=WITHOUT_DIFFUSION)
-    guided = replace(config.fit, method=WITH_DIFFUSION)
+    guided = replace(config.fit, method=WITH_DIFFUSION, iterations=max(1, round(CONTINUED_SHARE * config.fit.iterations)))
     models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     renders = {name: out / "render" / name for name in models}
 
-    def fitted_both() -> None:
-        """Side by side where there are two cores: they need nothing of each other, and much of a fit uses one core only."""
-        threads = native.default_threads()
-        tasks = [
-            Task(name, fit.run, (settings, scene, fused, models[name]), {"observations": views, "overwrite": overwrite})
-            for name, settings, views in ((WITHOUT_DIFFUSION, plain, None), (WITH_DIFFUSION, guided, virtual))
-        ]
-        if threads >= 2 and all(overwrite or _unfinished(folder) for folder in models.values()):
-            run_side_by_side(tasks, threads // 2)
-            return
-        for task in tasks:
-            task.function(*task.arguments, **task.named)
+    def fitted_guided() -> Path:
+        return fit.run(
+            guided, scene, fused, models[WITH_DIFFUSION],
+            observations=virtual, start=models[WITHOUT_DIFFUSION], overwrite=overwrite,
+        )  # fmt: skip
 
     def rendered(name: str) -> Path:
         return render.run(config.render, scene, models[name], renders[name], overwrite=overwrite)
@@ -171,19 +164,15 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
 
     return (
         Step("fuse", "fuse", lambda: fuse.run(config.fuse, scene, fused, overwrite=overwrite)),
+        Step("fit without diffusion", f"fit/{WITHOUT_DIFFUSION}",
+             lambda: fit.run(plain, scene, fused, models[WITHOUT_DIFFUSION], overwrite=overwrite)),
         Step("synthesize", "synthesize",
              lambda: synthesize.run(config.synthesize, scene, fused, virtual, overwrite=overwrite)),
-        Step("both fits", "fit", fitted_both),
+        Step("fit with diffusion", f"fit/{WITH_DIFFUSION}", fitted_guided),
         Step("render without diffusion", f"render/{WITHOUT_DIFFUSION}", lambda: rendered(WITHOUT_DIFFUSION)),
         Step("render with diffusion", f"render/{WITH_DIFFUSION}", lambda: rendered(WITH_DIFFUSION)),
         Step("score", "score", scored),
     )  # fmt: skip
-
-
-def _unfinished(folder: Path) -> bool:
-    """Whether no finished result lies there (a finished one is verified by the verb itself)."""
-    state = folder / "run.json"
-    return not state.is_file() or store.read_json(state).get("state") != "complete"
 
 
 def _report_key(out: Path) -> str:

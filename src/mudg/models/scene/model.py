@@ -11,6 +11,8 @@ Columns of the table (raw, unactivated):
     logits [N]        opacity = sigmoid
     sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0)
     semantics [N, C]  class logits of the classes in ``SceneModel.classes``
+
+Label columns: ``node`` i32[N], the index into ``SceneModel.nodes``; of a finished fit also ``certainty`` (``SceneModel.certainty``).
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ from mudg.models.scene.sky import SkyNode
 NODES: Final[dict[str, Any]] = {"static": StaticNode, "rigid": RigidNode, "deformable": DeformableNode, "sky": SkyNode}
 COLUMNS: Final = frozenset({"means", "quats", "log_scales", "logits", "sh_dc", "sh_rest", "semantics"})
 """Columns that every scene may have; others belong to a kind of node (``NodeRows.own``)."""
+CERTAINTY: Final = "certainty"
+"""Label column of the table of a finished fit, f16[N]."""
 SKY_LOGIT: Final = 10.0
 """Logit of the sky class where nothing covers it; large beside what a Gaussian learns."""
 
@@ -66,6 +70,11 @@ class SceneModel:
         if self._counted is None or self._counted[0] is not owner:
             self._counted = owner, torch.bincount(owner.long(), minlength=len(self.nodes)).tolist()
         return list(self._counted[1])
+
+    @property
+    def certainty(self) -> Tensor | None:
+        """How well the photographs constrain each Gaussian, f16[N] in [0, 1]; None: not known."""
+        return self.table.labels.get(CERTAINTY)
 
     def sort_rows(self) -> None:
         """Bring rows back into node order after rows were appended (stable)."""
@@ -105,7 +114,8 @@ class SceneModel:
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
         owner = renumber[self.table.labels["node"].long()]
         rows = (owner >= 0).nonzero()[:, 0]
-        table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, {"node": owner[rows]})
+        labels = {key: value[rows] for key, value in self.table.labels.items()} | {"node": owner[rows]}
+        table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, labels)
         return replace(self, table=table, nodes=tuple(self.nodes[i] for i in kept), facts=dict(self.facts))
 
     def with_object_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:

@@ -104,10 +104,12 @@ class VirtualConfig:
 
     probability: float = Field(default=0.4, ge=0, le=1)
     """Probability that a step uses a virtual view, 0 to 1 (published: 0.2)."""
+    continued_probability: float = Field(default=0.7, ge=0, le=1)
+    """The same for a fit that continues a finished one (`--start-from`), which has few steps to learn from them."""
     beside: bool = True
     """A step with a virtual view also learns from its recorded view. Off: from the virtual view alone, as published."""
     start: float = Field(default=0.15, ge=0, le=1)
-    """Share of the iterations before virtual views are used, 0 to 1."""
+    """Share of the iterations before virtual views are used, 0 to 1. A fit that continues a finished one uses them at once."""
     stop: float = Field(default=0.9, ge=0, le=1)
     """Share of the iterations after which virtual views are no longer used, 0 to 1. Ending on recorded views restores quality on
     the recorded path."""
@@ -165,7 +167,7 @@ class FitConfig:
     virtual views."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
     """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
-    to this number."""
+    to this number. With `--start-from`: further steps, the second half of a schedule of twice as many."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     cameras: tuple[str, ...] = ()

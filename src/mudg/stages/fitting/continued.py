@@ -1,0 +1,128 @@
+"""Going on with a finished fit: its Gaussians, sky and corrections are the start of another one.
+
+The new steps are the second half of a run of twice as many: 500 more steps are the steps 501 to 1000 of a run of 1000, with the learning
+rates, the densification and the rounds of box corrections that these have. (Going on where a run of all steps together would be, at two
+thirds for 500 after 1000, was measured to learn less from virtual views: the steps are too short by then.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from mudg.base import palette, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import run_state
+from mudg.core.table import Table
+from mudg.models.scene.appearance import CAMERA_POSE, RECORDED_COLOR, Appearance
+from mudg.models.scene.model import CERTAINTY, SceneModel
+from mudg.models.scene.nodes import RigidNode
+from mudg.stages.config import FitConfig
+from mudg.stages.fitting.storage import load_appearance, load_model
+
+START_METHOD = "street_gaussians"
+NEW_CLASS_LOGIT = -6.0
+"""Logit of a class that the finished fit did not know: as unlikely as classes are that a Gaussian has learnt not to show."""
+
+
+@dataclass(frozen=True)
+class StartFit:
+    """A finished fit to go on with: its folder and the digest of its files."""
+
+    folder: Path
+    digest: str
+
+    @classmethod
+    def of_folder(cls, folder: Path, inputs: Mapping[str, str]) -> StartFit:
+        """The finished fit in a folder.
+
+        Args:
+            inputs: digests of what the new fit reads; scene and fused cloud must be those of the finished one.
+
+        Raises:
+            InputError: no finished fit of street_gaussians, or one of another scene or cloud.
+        """
+        folder = Path(folder)
+        try:
+            state = run_state(folder)
+        except UsageError:
+            state = {}
+        remedy = "give the folder of a finished `mudg fit --method street_gaussians` as --start-from"
+        if state.get("verb") != "fit" or state.get("state") != "complete":
+            got = f"{state['verb']}, {state['state']}" if state else "no run of mudg"
+            raise InputError(
+                "this folder holds no finished fit to go on with", where=str(folder), got=got, remedy=remedy
+            )
+        for name, expected in inputs.items():
+            found = state.get("inputs", {}).get(name)
+            if found != expected:
+                raise InputError(f"the finished fit belongs to another {WHAT[name]}", where=f"{folder / 'run.json'}, inputs.{name}",
+                                 expected=expected, got=str(found), remedy=f"fit street_gaussians to this {WHAT[name]} first")  # fmt: skip
+        method = store.read_json(folder / "model.json").get("facts", {}).get("method")
+        if method != START_METHOD:
+            raise InputError("a fit can only go on with one on recorded views", where=f"{folder / 'model.json'}, facts.method",
+                             expected=START_METHOD, got=str(method), remedy=remedy)  # fmt: skip
+        return cls(folder, store.digest(folder))
+
+
+WHAT = {"scene": "scene", "fused": "fused cloud"}
+
+
+def begun_at(iterations: int) -> int:
+    """Steps of a whole run of ``iterations`` that count as done when a fit goes on with a finished one."""
+    return iterations // 2
+
+
+def whole_run(config: FitConfig) -> FitConfig:
+    """Settings of the run whose second half ``config.iterations`` steps are, with virtual views as often as they then are used."""
+    virtual = replace(config.virtual, probability=config.virtual.continued_probability)
+    return replace(config, iterations=2 * config.iterations, virtual=virtual)
+
+
+def continued_model(start: StartFit, classes: Sequence[int], config: FitConfig) -> SceneModel:
+    """The model of a finished fit, with channels for all of ``classes`` (train ids) and no moments.
+
+    Raises:
+        UsageError: it was fitted with other degrees of spherical harmonics.
+    """
+    model = load_model(start.folder)
+    model.table.labels.pop(CERTAINTY, None)
+    if model.sh_degree != config.sh_degree:
+        raise UsageError("the finished fit has another degree of spherical harmonics", where=str(start.folder),
+                         expected=str(config.sh_degree), got=str(model.sh_degree), remedy=f"add --sh-degree {model.sh_degree}")  # fmt: skip
+    for node in model.nodes:
+        if isinstance(node, RigidNode) and config.poses.learn and not node.learn_pose:
+            node.learn_pose = True
+            node.settle()
+    return with_classes(model, classes)
+
+
+def with_classes(model: SceneModel, classes: Sequence[int]) -> SceneModel:
+    """The model with a channel for each of these train ids, in their order; new ones are unlikely everywhere."""
+    if tuple(classes) == model.classes:
+        return model
+    table, known = model.table, {train_id: channel for channel, train_id in enumerate(model.classes)}
+    old = table["semantics"].detach()
+    logits = torch.full((len(table), len(classes)), NEW_CLASS_LOGIT if known else 0.0)
+    for channel, train_id in enumerate(classes):
+        if train_id in known:
+            logits[:, channel] = old[:, known[train_id]]
+    columns = {name: value.detach() for name, value in table.columns.items()} | {"semantics": logits}
+    return replace(model, table=Table(columns, table.labels), classes=tuple(classes), facts=dict(model.facts))
+
+
+def all_classes(start: StartFit, classes: Sequence[int]) -> tuple[int, ...]:
+    """Train ids of the finished fit's classes and of ``classes``, sorted."""
+    known = store.read_json(start.folder / "model.json")["classes"]
+    return tuple(sorted({*classes, *(i for i in map(int, known) if i < len(palette.CLASSES))}))
+
+
+def continued_appearance(start: StartFit, fresh: Appearance) -> Appearance:
+    """The corrections that a new fit starts from, with those that the finished one learnt about the same images and cameras."""
+    learnt = load_appearance(start.folder)
+    kept = {group: learnt.tables[group] for group in (RECORDED_COLOR, CAMERA_POSE)
+            if group in fresh.names and learnt.names.get(group) == fresh.names[group]}  # fmt: skip
+    return Appearance(fresh.names, {**fresh.tables, **kept})

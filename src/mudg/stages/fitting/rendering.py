@@ -1,0 +1,87 @@
+"""Renders of a fitted scene: as an observation, and as what a generator may start from, with the certainty of every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mudg.base import palette
+from mudg.base.types import Observation, Render, View
+from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.models.scene.model import SceneModel, compose, composite_semantics, composite_sky
+
+NEAR_M = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedCondition:
+    """One rendered view.
+
+    Args:
+        rgb: f32[3, H, W] in [0, 1], over the sky.
+        depth: f32[H, W], camera z in metres; NaN in the sky and where the scene is empty.
+        alpha: f32[H, W] in [0, 1], how much of the pixel Gaussians cover; the rest is sky.
+        semantics: u8[H, W] train ids, 255 = unknown.
+        certainty: f32[H, W] in [0, 1], how well photographs and LiDAR constrain what the pixel shows; at most alpha, so 0 in the sky.
+            None: unknown, for a scene fitted by a version that did not measure it.
+    """
+
+    rgb: Tensor
+    depth: Tensor
+    alpha: Tensor
+    semantics: Tensor
+    certainty: Tensor | None
+
+
+@torch.no_grad()
+def render_view(
+    model: SceneModel, view: View, raster: RasterConfig, sky_below_alpha: float = 0.5, source: str = ""
+) -> Observation:
+    """Render one view of a fitted scene as an observation of kind "virtual".
+
+    Where coverage is below ``sky_below_alpha``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
+    sky has no depth. Confidence is the coverage (1 where the sky is a valid answer).
+    """
+    return _observed(model, rasterize(compose(model, view.time_s), view, raster), view, sky_below_alpha, source)
+
+
+@torch.no_grad()
+def render_condition(
+    model: SceneModel, view: View, raster: RasterConfig | None = None, sky_below_alpha: float = 0.5
+) -> RenderedCondition:
+    """Render one view of a fitted scene with the certainty of its pixels; see ``render_view``."""
+    gaussians, certainty = compose(model, view.time_s), model.certainty
+    if certainty is not None:
+        known = certainty.float()[:, None]
+        gaussians = replace(
+            gaussians, extra=known if gaussians.extra is None else torch.cat([gaussians.extra, known], 1)
+        )
+    render = rasterize(gaussians, view, raster or RasterConfig(near_m=NEAR_M))
+    blended = None
+    if certainty is not None and render.extra is not None:
+        blended = torch.minimum(render.extra[-1].clamp_min(0), render.alpha[0])
+        render = replace(render, extra=render.extra[:-1] if len(render.extra) > 1 else None)
+    seen = _observed(model, render, view, sky_below_alpha)
+    shape = render.alpha.shape[1:]
+    depth = torch.full(shape, torch.nan) if seen.depth is None else seen.depth[0]
+    unknown = torch.full(shape, palette.UNLABELLED, dtype=torch.uint8)
+    semantics = unknown if seen.semantics is None else seen.semantics.to(torch.uint8)
+    return RenderedCondition(seen.rgb, depth, render.alpha[0], semantics, blended)
+
+
+def _observed(model: SceneModel, render: Render, view: View, sky_below_alpha: float, source: str = "") -> Observation:
+    rgb = composite_sky(model, view, render.rgb, render.alpha).clamp(0, 1)
+    covered = render.alpha >= sky_below_alpha
+    depth = torch.where(covered, render.depth, torch.nan)
+    semantics = None
+    if render.extra is not None:
+        channel = composite_semantics(model, render.extra, render.alpha).argmax(0)
+        semantics = torch.tensor(model.classes)[channel]
+        if model.sky is not None:
+            semantics = torch.where(covered[0], semantics, palette.ID["sky"])
+            depth = torch.where(semantics[None] == palette.ID["sky"], torch.nan, depth)
+    confidence = render.alpha if model.sky is None else torch.where(covered, render.alpha, 1 - render.alpha)
+    source = source or str(model.facts.get("method", "fit"))
+    return Observation(view, rgb, depth, semantics, confidence.clamp(0, 1), torch.ones_like(covered), "virtual", source)

@@ -1,0 +1,53 @@
+"""A fitted scene on disk: the model and what was learnt about cameras and colours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.models.scene.appearance import Appearance
+from mudg.models.scene.model import SceneModel
+
+
+def save_model(model: SceneModel, folder: Path) -> None:
+    """The fitted scene without optimiser moments."""
+    values, groups = model.state()
+    store.write_json(folder / "model.json", {"schema": 1, **values})
+    for name, tensors in groups.items():
+        kept = {key: value for key, value in tensors.items() if "moment" not in key}
+        store.write_safetensors(folder / f"{name}.safetensors", kept)
+
+
+def save_appearance(appearance: Appearance, folder: Path) -> None:
+    """What was learnt about cameras, images and virtual sets, for those who want to know; renders do not use it."""
+    if appearance:
+        names, tensors = appearance.state()
+        store.write_json(folder / "appearance.json", {"schema": 1, "names": names})
+        store.write_safetensors(folder / "appearance.safetensors", {k: v for k, v in tensors.items() if "moment" not in k})
+
+
+def load_appearance(folder: Path) -> Appearance:
+    """What ``save_appearance`` wrote; nothing corrected where there is none."""
+    if not (folder / "appearance.json").is_file():
+        return Appearance({})
+    names = store.read_json(folder / "appearance.json")["names"]
+    return Appearance.from_state(names, store.read_tensors(folder / "appearance.safetensors"))
+
+
+def load_model(folder: Path) -> SceneModel:
+    """Read a fitted scene.
+
+    Raises:
+        InputError: not the folder of a finished fit, or of another schema. IntegrityError: a file was altered.
+    """
+    folder = Path(folder)
+    if not (folder / "model.json").is_file():
+        raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
+    if (folder / store.MANIFEST).is_file():
+        store.verify_manifest(folder)
+    values = store.read_json(folder / "model.json")
+    if values.get("schema") != 1:
+        raise InputError("unknown schema of a fitted scene", where=str(folder / "model.json"), expected="1", got=str(values.get("schema")))
+    groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
+    return SceneModel.from_state(values, groups)

@@ -1,0 +1,187 @@
+"""A fit that goes on with a finished one: what it starts from, that it resumes bit for bit, what is refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_settings import fit_config
+from toy_world import camera, fused_cloud, truth, view_at, write_scene
+
+from mudg.base import store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.core import metrics, trajectory
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.data.cloudfile import write_fused
+from mudg.data.observations import ObservationWriter
+from mudg.models.scene.appearance import Appearance
+from mudg.stages import fit
+from mudg.stages.config import FitConfig
+from mudg.stages.fitting import continued
+
+SIZE = (60, 40)
+FRAMES = 6
+FILES = ("gaussians.safetensors", "nodes.safetensors", "model.json")
+
+
+def settings(method: str = "mudg_s", **changes) -> FitConfig:
+    small = {"iterations": 16, "start__gaussians": 900, "densify__max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
+    return fit_config(method=method, **{**small, **changes})
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> dict[str, Path]:
+    """A scene, its fused cloud, perfect virtual views 2 m to the left, and a finished fit on recorded views."""
+    root = tmp_path_factory.mktemp("world")
+    scene = write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
+    write_fused(root / "fuse", fused_cloud(FRAMES), {})
+    path = trajectory.shifted(scene, "front", 2.0)
+    with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
+        for view in path.views:
+            writer.add(truth(view.resized(30, 20)))
+    fit.run(settings("street_gaussians", iterations=80), root / "scene", root / "fuse", root / "plain")
+    return {name: root / name for name in ("scene", "fuse", "virtual", "plain")}
+
+
+def go_on(world: dict[str, Path], out: Path, config: FitConfig | None = None, **changes) -> Path:
+    named = {"observations": world["virtual"], "start": world["plain"], **changes}
+    return fit.run(config or settings(), world["scene"], world["fuse"], out, **named)
+
+
+def psnr_beside(folder: Path) -> float:
+    model = fit.load_model(folder)
+    views = [view_at(time_s, camera(width=SIZE[0], height=SIZE[1]), left_m=2.0) for time_s in (0.3, 0.9)]
+    return float(np.mean([metrics.psnr(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb) for view in views]))
+
+
+def test_it_starts_from_the_finished_scene_and_learns_from_virtual_views_at_once(world, tmp_path, monkeypatch):
+    seen, learn = [], fit._learn_from
+
+    def spy(state, view, *rest):
+        seen.append((len(seen), view.kind))
+        return learn(state, view, *rest)
+
+    monkeypatch.setattr(fit, "_learn_from", spy)
+    one = go_on(world, tmp_path / "one", settings(iterations=1, virtual__continued_probability=1.0, virtual__stop=1.0))
+    assert [kind for _, kind in seen] == ["recorded", "virtual"]
+    old, new = fit.load_model(world["plain"]), fit.load_model(one)
+    added = len(new.table) - len(old.table)
+    assert added > 0  # Gaussians at surfaces that only virtual views show
+    moved = torch.cdist(old.table["means"], new.table["means"]).amin(1)
+    assert float(moved.detach().median()) < 0.02
+    assert new.facts["method"] == "mudg_s" and new.facts["scene"] == old.facts["scene"]
+    assert store.read_json(one / "run.json")["inputs"]["start"] == store.digest(world["plain"])
+    assert store.read_json(one / "run.json")["summary"]["steps"] == 1
+
+
+def test_few_more_steps_help_beside_the_path(world, tmp_path):
+    assert psnr_beside(go_on(world, tmp_path / "fit", settings(iterations=40))) > psnr_beside(world["plain"]) + 0.3
+
+
+def test_the_steps_are_the_second_half_of_a_run(monkeypatch):
+    config = continued.whole_run(settings(iterations=500))
+    assert (config.iterations, continued.begun_at(config.iterations)) == (1000, 500)
+    assert config.virtual.probability == FitConfig().virtual.continued_probability
+    schedule = fit.densify_schedule(config)
+    assert schedule.due(600) and not schedule.due(601 + schedule.every)
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one(world, tmp_path, monkeypatch):
+    whole, parts, adam_step = go_on(world, tmp_path / "whole"), tmp_path / "parts", fit.adam_step
+    stops = [17, 18, 20, 25]  # of the steps 17 to 32; densification after 20
+
+    def ctrl_c(model, step, *rest):
+        adam_step(model, step, *rest)
+        if stops and step == stops[0]:
+            os.kill(os.getpid(), signal.SIGTERM if step % 2 else signal.SIGINT)
+
+    monkeypatch.setattr(fit, "adam_step", ctrl_c)
+    while stops:
+        with pytest.raises(KeyboardInterrupt):
+            go_on(world, parts)
+        assert (parts / "steps" / f"step_{stops.pop(0):08d}").is_dir()
+    go_on(world, parts)
+    assert [(parts / name).read_bytes() for name in FILES] == [(whole / name).read_bytes() for name in FILES]
+
+
+def test_another_start_is_another_fit(world, tmp_path):
+    go_on(world, tmp_path / "fit", settings(iterations=2))
+    with pytest.raises(UsageError, match="another configuration"):
+        go_on(world, tmp_path / "fit", settings(iterations=2), start=None)
+
+
+def test_a_fit_without_virtual_views_goes_on_too(world, tmp_path):
+    made = go_on(world, tmp_path / "fit", settings("street_gaussians", iterations=4), observations=None)
+    assert fit.load_model(made).facts["method"] == "street_gaussians"
+
+
+# ---- what is carried over --------------------------------------------------------------------------------------------
+
+
+def test_classes_that_only_virtual_views_show_are_added(world):
+    model = fit.load_model(world["plain"])
+    wanted = tuple(sorted({*model.classes, ID["bicycle"]}))
+    wider = continued.with_classes(model, wanted)
+    assert wider.classes == wanted and wider.table["semantics"].shape[1] == len(wanted)
+    for channel, train_id in enumerate(wanted):
+        column = wider.table["semantics"][:, channel].detach()
+        if train_id in model.classes:
+            assert torch.equal(column, model.table["semantics"][:, model.classes.index(train_id)].detach())
+        else:
+            assert (column == continued.NEW_CLASS_LOGIT).all()
+    assert continued.with_classes(model, model.classes) is model
+
+
+def test_learnt_corrections_of_cameras_are_kept(world, tmp_path):
+    changes = {"appearance__cameras": True, "appearance__exposure": "camera"}
+    arguments = (world["scene"], world["fuse"])
+    plain = fit.run(settings("street_gaussians", iterations=12, **changes), *arguments, tmp_path / "plain")
+    learnt = store.read_tensors(plain / "appearance.safetensors")
+    start = continued.StartFit(plain, "")
+    names = store.read_json(plain / "appearance.json")["names"]
+    fresh = Appearance({**names, "virtual": ("left",)})
+    kept = continued.continued_appearance(start, fresh)
+    assert torch.equal(kept.tables["cameras"]["shift"], learnt["cameras/column.shift"])
+    assert learnt["cameras/column.shift"].abs().max() > 0
+    assert torch.equal(kept.tables["virtual"]["affine"], torch.zeros(1, 3, 4))
+    other = continued.continued_appearance(start, Appearance({"cameras": ("front/999999",)}))
+    assert other.tables["cameras"]["shift"].abs().max() == 0
+    go_on(world, tmp_path / "more", settings(iterations=2, **changes), start=plain)
+
+
+# ---- what is refused -------------------------------------------------------------------------------------------------
+
+
+def test_another_scene_cloud_or_method_is_refused(world, tmp_path):
+    other = write_scene(tmp_path / "scene", frames=FRAMES - 1, width=SIZE[0], height=SIZE[1]).root
+    with pytest.raises(InputError, match=r"belongs to another scene[\s\S]*inputs.scene"):
+        go_on({**world, "scene": Path(other)}, tmp_path / "a")
+    write_fused(tmp_path / "fuse", fused_cloud(FRAMES - 1), {})
+    with pytest.raises(InputError, match=r"another fused cloud[\s\S]*fit street_gaussians to this fused cloud"):
+        go_on({**world, "fuse": tmp_path / "fuse"}, tmp_path / "b")
+    guided = go_on(world, tmp_path / "guided", settings(iterations=1))
+    with pytest.raises(InputError, match=r"on recorded views[\s\S]*street_gaussians[\s\S]*mudg_s"):
+        go_on(world, tmp_path / "c", start=guided)
+    assert not any((tmp_path / name).exists() for name in "abc")
+
+
+def test_what_is_no_finished_fit_is_refused(world, tmp_path):
+    for folder in (world["fuse"], world["scene"], tmp_path / "nothing"):
+        with pytest.raises(InputError, match=r"no finished fit to go on with[\s\S]*--start-from"):
+            go_on(world, tmp_path / "fit", start=folder)
+    unfinished = tmp_path / "unfinished"
+    shutil.copytree(world["plain"], unfinished)
+    state = store.read_json(unfinished / "run.json")
+    store.write_json(unfinished / "run.json", {**state, "state": "interrupted"})
+    with pytest.raises(InputError, match="interrupted"):
+        go_on(world, tmp_path / "fit", start=unfinished)
+    with pytest.raises(UsageError, match=r"spherical harmonics[\s\S]*--sh-degree 0"):
+        go_on(world, tmp_path / "fit", settings(sh_degree=1))
+    with pytest.raises(UsageError, match="the output is also an input"):
+        go_on(world, world["plain"])
