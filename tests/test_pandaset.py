@@ -195,10 +195,12 @@ def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source
     shutil.rmtree(source / "annotations")
     write_frame(source / "lidar" / "01.pkl.gz", {"t": np.array([EPOCH_S + 2.0]), **{n: np.zeros(1) for n in "xyzid"}})
     scene = ingest(source, tmp_path / "out", cameras=("front",), frames=(0, 2))
-    moved = scene.ego.world_from_ego[1, :3, 3]
+    moved = scene.ego.world_from_ego[-1, :3, 3]
     assert np.linalg.norm(moved) == pytest.approx(18.96, abs=0.01)
     assert abs(np.arctan2(moved[1], moved[0])) < np.deg2rad(1.0)  # along x of the scene's world
-    in_ego = invert(scene.ego.world_from_ego[0]) @ scene.frames[0].view.world_from_cam
+    ego = scene.ego.pose_at(scene.frames[0].view.time_s)
+    assert ego is not None
+    in_ego = invert(ego) @ scene.frames[0].view.world_from_cam
     assert in_ego[:3, 2] == pytest.approx([1, 0, 0], abs=0.03)  # looks forward
     assert in_ego[:3, 0] == pytest.approx([0, -1, 0], abs=0.03)  # its right is the vehicle's
     assert in_ego[:3, 3] == pytest.approx([0.85, 0.0, 1.8], abs=0.1)
