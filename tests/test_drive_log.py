@@ -19,6 +19,7 @@ from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.common import nearest_index
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord, write_log
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.check import check_records
 
 UP = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 
@@ -147,6 +148,35 @@ def test_tracks_are_sorted_and_split_at_gaps() -> None:
     assert notes == ["1 tracks are not seen for more than 1.1 s and were split there"]
     with pytest.raises(InputError, match="two boxes"):
         tracks_of((1.0, 0.0), (1.0, 1.0))
+
+
+def test_what_stands_needs_no_keys_in_between_and_what_left_its_place_does(tmp_path: Path) -> None:
+    """Boxes that stand in the whole log have two keys, from the first image to the last; that is no gap."""
+
+    def scene_of(*standing: bool, x_m: float) -> tuple[list[Track], list[str]]:
+        boxes = BoxTracks("table", {}, 9.0)
+        times = np.arange(len(standing)) * 3.0
+        for index, stands in enumerate(standing):
+            x = x_m * index / (len(standing) - 1)
+            boxes.add("7", "car", times[index], (4.0, 2.0, 1.5), yaw_matrix(0.0, (x, 0.0, 0.0)), standing=stands)
+        tracks, _ = boxes.tracks(images_s={time_s: (time_s - 0.09, time_s - 0.02) for time_s in times.tolist()})
+        found = made(tmp_path / f"{x_m}{standing}")
+        scene = write_log(found, tmp_path / f"out {x_m}{standing}", ImportOptions())
+        gaps = [f.message for f in check_records(replace(scene, tracks=tuple(tracks))) if "not seen" in f.message]
+        return tracks, gaps
+
+    (stays,), gaps = scene_of(True, True, True, x_m=0.0)
+    assert stays.times_s == pytest.approx([-0.09, 6.0])
+    assert gaps == []
+    (seldom,), gaps = scene_of(
+        False, False, False, x_m=0.0
+    )  # not known to stand, but nowhere else when it is seen again
+    assert len(seldom.times_s) == 4
+    assert gaps == []
+    (moved,), gaps = scene_of(False, False, False, x_m=2.0)
+    assert "not seen for 3.0 s" in gaps[0]
+    (changed,), _ = scene_of(True, False, True, x_m=2.0)  # one box that moves makes an object that moves
+    assert len(changed.times_s) == 4
 
 
 def test_swapped_sides_are_refused_when_most_vehicles_have_them() -> None:

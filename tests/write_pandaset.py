@@ -11,13 +11,18 @@ from pandas_pickles import write_frame
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
-from mudg.base.types import Scene
+from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.types import EgoPath, Scene
+from mudg.data.importers.common import pose_near
 from mudg.data.scene import read_image, read_points
 
 EPOCH_S = 1_557_539_924.0
 SOURCE_FROM_WORLD = yaw_matrix(0.8, (12.0, -34.0, 1.5))
 """The data set's world is not the scene's."""
+STAMPED_LATE_S = 0.01
+"""Images carry a time stamp this long after they were taken."""
+POSED_AHEAD_S = 0.02
+"""Where cameras are said to be is where they truly are, this long ahead on the vehicle's path."""
 CAMERA_OF = {"front": "front_camera", "front_left": "front_left_camera"}
 
 
@@ -38,18 +43,28 @@ def write_pandaset(
         cameras: the data set's camera -> camera of the log; None = ``CAMERA_OF``.
         suffix: of the images; ``.jpg`` is what the data set has, ``.png`` loses nothing.
     """
+    path = EgoPath(
+        np.array([sweep.time_s for sweep in truth.sweeps]),
+        np.stack([pose_near(truth.ego, sweep.time_s) for sweep in truth.sweeps]),
+    )
     for theirs, name in (cameras or {theirs: name for name, theirs in CAMERA_OF.items()}).items():
         here = folder / "camera" / theirs
         here.mkdir(parents=True)
         frames = truth.frames_of(name)
+        moved = [
+            pose_near(path, f.view.time_s + STAMPED_LATE_S, 1.0)
+            @ invert(pose_near(path, f.view.time_s + STAMPED_LATE_S - POSED_AHEAD_S, 1.0))
+            @ f.view.world_from_cam
+            for f in frames
+        ]
         for index, frame in enumerate(frames):
             Image.fromarray(read_image(truth, frame)).save(here / f"{index:02d}{suffix}", quality=95)
         camera = truth.cameras[name]
         _dump(
             here / "intrinsics.json", {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - 0.5, "cy": camera.cy - 0.5}
         )
-        _dump(here / "poses.json", [pose_entry(SOURCE_FROM_WORLD @ frame.view.world_from_cam) for frame in frames])
-        _dump(here / "timestamps.json", [EPOCH_S + frame.view.time_s for frame in frames])
+        _dump(here / "poses.json", [pose_entry(SOURCE_FROM_WORLD @ pose) for pose in moved])
+        _dump(here / "timestamps.json", [EPOCH_S + frame.view.time_s + STAMPED_LATE_S for frame in frames])
     poses = []
     for index, sweep in enumerate(truth.sweeps):
         ego = truth.ego.pose_at(sweep.time_s)

@@ -213,16 +213,20 @@ class SweepPoints:
         xyz: f32[N, 3] metres in the LiDAR frame.
         intensity: f32[N] in [0, 1].
         dt_s: f32[N] seconds relative to the sweep's time.
+        classes: u8[N] train ids that people gave the points (255 = unlabelled), or None where the log has none.
     """
 
     xyz: NDArray[np.float32]
     intensity: NDArray[np.float32]
     dt_s: NDArray[np.float32]
+    classes: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         checks.check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
         checks.check_array(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
         checks.check_array(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
+        if self.classes is not None:
+            checks.check_array(self.classes, "sweep points: classes", (len(self.xyz),), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,8 @@ The rules, stated once:
   closest to it wins. Points that no camera sees have no colour and are left out.
 * **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects included,
   the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
-* **Semantics.** The cameras that see a point vote, weighted by the cosine to their axes; in a voxel the samples vote.
+* **Semantics.** A point keeps the class that people gave it. For others the cameras that see a point vote, weighted by the cosine to their
+  axes. In a voxel the samples vote.
 * **Small objects.** A dynamic object with too few coloured points over the whole log is left out, and so are its points: they would
   smear the static world.
 """
@@ -269,6 +270,21 @@ def color_points(
     return Colors(seen, in_image & ~seen, rgb, _count_votes(votes, count), depth_m)
 
 
+def points_in_image(
+    sweep: SweepShots, view: View, dynamic: Sequence[Track], rules: FusionRules
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """Points of a sweep that an image shows: indices, column, row and depth f32[n]. Objects stand where they are at its time."""
+    owner, owned = separate(sweep, dynamic, rules)
+    members = {index: np.flatnonzero(owner == index) for index in owned}
+    xyz_cam, known = _points_in_camera(sweep, view, members, owned, dynamic)
+    ids, column, row, z = _pixels(xyz_cam, known, view, rules)
+    if not rules.occlusion_test or len(ids) == 0:
+        return ids, column, row, z
+    stands = standing_points(_apply(_turn_only(sweep.world_from_lidar), sweep.points.xyz))[ids]
+    visible = ~hidden_points(xyz_cam[ids], stands, view, rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz))
+    return ids[visible], column[visible], row[visible], z[visible]
+
+
 def _points_in_camera(
     sweep: SweepShots,
     view: View,
@@ -365,6 +381,11 @@ def _count_votes(
     winner = tally.argmax(1).astype(np.uint8)
     winner[tally.max(1, initial=0.0) <= 0] = palette.UNLABELLED
     return winner
+
+
+def _classes_first(classes: NDArray[np.uint8] | None, voted: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Classes given to the points u8[N]; where they have none, those that the images ``voted`` for."""
+    return voted if classes is None else np.where(classes == palette.UNLABELLED, voted, classes)
 
 
 def _turn_only(a_from_b: Matrix) -> Matrix:
@@ -505,7 +526,7 @@ def fuse_sweeps(
 
     Returns:
         The fused cloud (static: world frame; objects: box frame, by track id) and a report. ``semantics`` are None
-        when no image carried labels. A log without points gives an empty static cloud.
+        when neither points nor images carried labels. A log without points gives an empty static cloud.
     """
     report = FusionReport()
     report.verdicts = {track.id: judge_track(track, rules) for track in tracks}
@@ -514,21 +535,22 @@ def fuse_sweeps(
     objects = [CloudAccumulator(rules.voxel_m) for _ in dynamic]
     labelled = False
     for sweep in sweeps:
-        labelled |= any(shot.semantics is not None for shot in sweep.shots)
+        labelled |= sweep.points.classes is not None or any(shot.semantics is not None for shot in sweep.shots)
         owner, owned = separate(sweep, dynamic, rules)
         colors = color_points(sweep, owner, owned, dynamic, rules)
+        semantics = _classes_first(sweep.points.classes, colors.semantics)
         keep = colors.seen & (owner == STATIC)
         static.add(
             _apply(sweep.world_from_lidar, sweep.points.xyz[keep]),
             colors.rgb[keep],
-            colors.semantics[keep],
+            semantics[keep],
             colors.depth_m[keep],
         )
         for index, xyz_object in owned.items():
             ids = np.flatnonzero(owner == index)
             seen = colors.seen[ids]
             ids = ids[seen]
-            objects[index].add(xyz_object[seen], colors.rgb[ids], colors.semantics[ids], colors.depth_m[ids])
+            objects[index].add(xyz_object[seen], colors.rgb[ids], semantics[ids], colors.depth_m[ids])
         report.sweeps += 1
         report.points_in += len(owner)
         report.points_moving_in += int((owner != STATIC).sum())

@@ -91,7 +91,7 @@ class BoxTracks:
             time_s: when, seconds of the scene's clock.
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
-            standing: the data set says that the object does not move in the whole log.
+            standing: the data set says that the object does not move in the whole log. It must say so with every box of the object.
             late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The track's key
                 stands at ``time_s``, moved there with the object's velocity.
             where: file and record, for messages.
@@ -102,7 +102,7 @@ class BoxTracks:
         size = box_size(*size_m, where=where or f"{self._where}: object {track} ({label})")
         member = self._members.setdefault(track, _Member())
         member.labels[label] = member.labels.get(label, 0) + 1
-        member.standing = standing
+        member.standing = standing and (member.standing or not member.rows)
         member.rows.extend((time_s, late_s, *size, *world_from_box[:3].ravel().tolist()))
 
     def tracks(
@@ -136,7 +136,7 @@ class BoxTracks:
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
             poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
             if member.standing:
-                ends = times[[0, -1]] if len(times) > 1 else times
+                ends = _ends(times, images_s)
                 tracks.append(Track(name, label, size, ends, np.stack([_mean_pose(poses)] * len(ends))))
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
@@ -208,6 +208,15 @@ def _reaching(
         times_s, poses = np.concatenate([times_s, ends_s[1:]]), np.concatenate([poses, poses[-1:]])
         poses[-1, :3, 3] += velocity[-1] * end_s
     return times_s, poses
+
+
+def _ends(times_s: NDArray[np.float64], images_s: Mapping[float, tuple[float, float]] | None) -> NDArray[np.float64]:
+    """First and last moment of what stands; one if they are the same. ``images_s`` as in ``BoxTracks.tracks``."""
+    first, last = float(times_s[0]), float(times_s[-1])
+    if images_s is not None:
+        start, end = images_s[first][0], images_s[last][1]
+        first, last = (start if start < first - _SAME_TIME_S else first), (end if end > last + _SAME_TIME_S else last)
+    return np.array([first, last] if last - first > _SAME_TIME_S else [first])
 
 
 def _mean_pose(poses: Matrix) -> Matrix:

@@ -238,7 +238,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
             return
         points = record.read()
         if options.untwist == "no":
-            points = SweepPoints(points.xyz, points.intensity, np.zeros_like(points.dt_s))
+            points = replace(points, dt_s=np.zeros_like(points.dt_s))
         seen.observe(record.time_s, record.map_from_lidar, points)
         pose = world_from_map @ record.map_from_lidar
         yield SceneSweep(record.sensor, numbers[record], time_s, pose, points, where)

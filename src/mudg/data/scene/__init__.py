@@ -3,7 +3,8 @@
     scene.json                       schema version, cameras, frames, sweeps, ego path, split, source and licence
     tracks.json                      tracked boxes
     images/CAM/000000.png|jpg        recorded images (rectified, 8-bit RGB)
-    lidar/SENSOR/000000.safetensors  xyz f32[N, 3] metres in the LiDAR frame, intensity f32[N] 0..1, dt_s f32[N]
+    lidar/SENSOR/000000.safetensors  xyz f32[N, 3] metres in the LiDAR frame, intensity f32[N] 0..1, dt_s f32[N];
+                                     classes u8[N] where people labelled the points
     labels/NAME/CAM/000000.*         see ``read_label``
     manifest.json                    sha256 of every file; checked at each read where it is there
 
@@ -15,15 +16,18 @@ from __future__ import annotations
 
 from mudg.data.scene.check import Finding, check_scene
 from mudg.data.scene.labels import read_label, read_trusted_classes
+from mudg.data.scene.point_classes import ImagePointClasses, image_point_classes
 from mudg.data.scene.read import decode_image, read_image, read_points, read_scene
 from mudg.data.scene.write import SCENE_FILES, SceneWriter, write_zip
 
 __all__ = [
     "SCENE_FILES",
     "Finding",
+    "ImagePointClasses",
     "SceneWriter",
     "check_scene",
     "decode_image",
+    "image_point_classes",
     "read_image",
     "read_label",
     "read_points",

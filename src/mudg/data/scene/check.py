@@ -25,6 +25,7 @@ MAX_TRACK_GAP_S: Final = 1.0
 SAME_MOMENT_S: Final = 0.06
 MAX_GAP_STEPS: Final = 1.8
 MIN_STEP_M: Final = 0.05
+MIN_TURN_DEG: Final = 1.0
 MIN_COURSE_M: Final = 3.0
 VEHICLES: Final = frozenset(
     ("car", "van", "truck", "bus", "vehicle", "trailer", "towed_object", "construction_vehicle", "tram", "train", "motorcycle",
@@ -190,10 +191,11 @@ def _check_tracks(scene: Scene) -> Findings:
             yield _warning(where, f"its box measures {max(track.size_m):.0f} m")
         steps = np.diff(track.times_s)
         if len(steps):
-            if steps.max() > MAX_TRACK_GAP_S:
+            gaps = np.where(_moves_between_keys(track), steps, 0.0)
+            if gaps.max() > MAX_TRACK_GAP_S:
                 yield _warning(
                     where,
-                    f"it is not seen for {steps.max():.1f} s from {track.times_s[int(steps.argmax())]:.1f} s on; its "
+                    f"it is not seen for {gaps.max():.1f} s from {track.times_s[int(gaps.argmax())]:.1f} s on; its "
                     "path across the gap is a guess: split the track",
                 )
             speed = np.linalg.norm(np.diff(track.world_from_object[:, :3, 3], axis=0), axis=1) / steps
@@ -204,6 +206,14 @@ def _check_tracks(scene: Scene) -> Findings:
         if tilt > 30:
             axes = "object axes are x forward, y left, z up"
             yield _warning(where, f"its z axis is tilted by {tilt:.0f} degrees; {axes}")
+
+
+def _moves_between_keys(track: Track) -> NDArray[np.bool_]:
+    """Whether the box is elsewhere at the next key, bool[T - 1]: what stands needs no keys in between."""
+    poses = track.world_from_object
+    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    cosine = (np.einsum("nij,nij->n", poses[:-1, :3, :3], poses[1:, :3, :3]) - 1) / 2
+    return (step_m > MIN_STEP_M) | (cosine < np.cos(np.deg2rad(MIN_TURN_DEG)))
 
 
 def _check_course(track: Track, where: str) -> Findings:

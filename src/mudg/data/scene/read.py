@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from mudg.base import store
+from mudg.base import palette, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Frame, Ref, Scene, Sweep, SweepPoints
 from mudg.data.scene import schema
@@ -158,14 +158,18 @@ def read_points(scene: Scene, sweep: Sweep) -> SweepPoints:
         if name not in arrays:
             expected, got = "xyz, intensity, dt_s", ", ".join(arrays) or "nothing"
             raise InputError(f"sweep has no tensor {name!r}", where=where, expected=expected, got=got)
-    return checked_points(arrays["xyz"], arrays["intensity"], arrays["dt_s"], where)
+    return checked_points(arrays, where)
 
 
-def checked_points(xyz: NDArray[Any], intensity: NDArray[Any], dt_s: NDArray[Any], where: str) -> SweepPoints:
-    """Points from their arrays; wrong shape or type, or values that are not finite, are refused with their place."""
-    count = len(xyz)
-    shapes = {"xyz": (xyz, (count, 3)), "intensity": (intensity, (count,)), "dt_s": (dt_s, (count,))}
-    for name, (array, shape) in shapes.items():
+def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoints:
+    """Points from the arrays ``xyz``, ``intensity``, ``dt_s`` and, if there, ``classes``.
+
+    Raises:
+        InputError: wrong shape or type, values that are not finite, or classes that are no train ids.
+    """
+    count, classes = len(arrays["xyz"]), arrays.get("classes")
+    for name, shape in (("xyz", (count, 3)), ("intensity", (count,)), ("dt_s", (count,))):
+        array = arrays[name]
         if array.shape != shape or array.dtype != np.float32:
             expected, got = f"float32 {shape}", f"{array.dtype} {array.shape}"
             raise InputError(f"sweep tensor {name!r} has the wrong form", where=where, expected=expected, got=got)
@@ -175,4 +179,17 @@ def checked_points(xyz: NDArray[Any], intensity: NDArray[Any], dt_s: NDArray[Any
                 "sweep holds values that are not finite", where=f"{where}: {name}", got=f"{bad} of {count} points",
                 expected="finite metres", remedy="drop missing returns when importing",
             )  # fmt: skip
-    return SweepPoints(xyz, intensity, dt_s)
+    if classes is not None:
+        _check_classes(classes, count, f"{where}: classes")
+    return SweepPoints(arrays["xyz"], arrays["intensity"], arrays["dt_s"], classes)
+
+
+def _check_classes(classes: NDArray[Any], count: int, where: str) -> None:
+    """Refuse classes of points that are not u8[count] train ids or ``UNLABELLED``."""
+    if classes.shape != (count,) or classes.dtype != np.uint8:
+        expected, got = f"uint8 ({count},)", f"{classes.dtype} {classes.shape}"
+        raise InputError("sweep tensor 'classes' has the wrong form", where=where, got=got, expected=expected)
+    wrong = np.unique(classes[(classes >= len(palette.CLASSES)) & (classes != palette.UNLABELLED)])
+    if len(wrong):
+        expected, got = "0..18 or 255 (unlabelled)", str(wrong[:8].tolist())
+        raise InputError("classes of points hold values that are no train id", where=where, expected=expected, got=got)

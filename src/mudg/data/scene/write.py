@@ -173,10 +173,12 @@ class SceneWriter:
     def add_sweep(
         self, sweep_id: str, sensor: str, time_s: float, world_from_lidar: NDArray[np.float64], points: SweepPoints
     ) -> None:
-        """Add a LiDAR sweep: points in the LiDAR frame at ``time_s``. Ids are ``<sensor>/<digits>``."""
+        """Add a LiDAR sweep: points in the LiDAR frame at ``time_s``, with classes if they have any. Ids are ``<sensor>/<digits>``."""
         sweep = Sweep(sweep_id, sensor, time_s, world_from_lidar, _sweep_ref(sweep_id))
-        checked_points(points.xyz, points.intensity, points.dt_s, f"SceneWriter: sweep {sweep_id}")
-        arrays = {"xyz": points.xyz, "intensity": points.intensity, "dt_s": points.dt_s}
+        arrays: dict[str, NDArray[Any]] = {"xyz": points.xyz, "intensity": points.intensity, "dt_s": points.dt_s}
+        if points.classes is not None:
+            arrays["classes"] = points.classes
+        checked_points(arrays, f"SceneWriter: sweep {sweep_id}")
         self._add_sweep_file(sweep, encode_safetensors(arrays))
 
     def _add_sweep_file(self, sweep: Sweep, content: bytes) -> None:

@@ -5,6 +5,7 @@
 ``lidar/NN.pkl.gz``                        points of both LiDARs in the world: x y z, i (0..255), t (s), d (which LiDAR)
 ``lidar/poses.json``, ``timestamps.json``  pose of the vehicle (x right, y forward, z up), not of a LiDAR
 ``annotations/cuboids/NN.pkl.gz``          boxes in the world
+``annotations/semseg/NN.pkl.gz``           class of every point; ``classes.json`` names them
 ========================================= ================================================================================
 
 The tables are pickled pandas frames. They are read by ``pandas_frame``, which runs nothing of them and needs no pandas.
@@ -12,12 +13,16 @@ The tables are pickled pandas frames. They are read by ``pandas_frame``, which r
 Frames. World: z up, origin and x axis at the vehicle of the first frame. The given points are motion-compensated: each lies
 where it was at its own time ``t``; ``dt_s`` keeps that time. The two LiDARs become two sensors, ``pandar64`` (d = 0) and
 ``pandar_gt`` (d = 1, solid state, looks forward). Their places on the vehicle follow from the front camera's recorded
-poses and the published static calibration.
+poses and the published static calibration. A cloud is filed under the end of its turn, 0.05 s after its middle and after the front
+camera's image; a sweep here stands at the middle.
+
+Images. Measured on sequence 002 (see docs/formats/pandaset.md), images show what moves as it was ``EXPOSURE_S`` from their time stamp, and
+fit standing points when the camera is taken ``POSE_S`` along the vehicle's path. Both are applied to all cameras.
 
 Boxes. ``yaw`` 0 looks along the world's y axis, and ``dimensions.y`` is the length. Moving objects where both LiDARs look
 carry two boxes that name each other as siblings; they are one track here, and in a frame with both the turning LiDAR's box is
 kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s apart: 1 m at 20 m/s);
-it is moved to the frame's time with its track's velocity.
+it is moved to the sweep's time with its track's velocity.
 """
 
 from __future__ import annotations
@@ -37,12 +42,13 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
 from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.columns import finite_columns, record_fields, require_columns
-from mudg.data.importers.common import pose_from_quaternion, seconds, world_from_first
+from mudg.data.importers.common import pose_from_quaternion, pose_near, seconds, world_from_first
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
 from mudg.data.importers.pandaset.pandas_frame import read_frame
+from mudg.data.importers.pandaset.point_classes import PointClasses
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
@@ -54,7 +60,7 @@ SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
 OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
 """Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
 LABELS: Final = {
-    "Car": "car", "Pickup Truck": "car", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Towed Object": "trailer",
+    "Car": "car", "Pickup Truck": "truck", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Towed Object": "trailer",
     "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Bicycle": "bicycle", "Bus": "bus", "Train": "train",
     "Trolley": "tram", "Tram / Subway": "tram", "Emergency Vehicle": "vehicle", "Pedestrian": "pedestrian",
     "Pedestrian with Object": "pedestrian", "Personal Mobility Device": "personal_mobility_device",
@@ -63,9 +69,13 @@ LABELS: Final = {
     "Road Barriers": "barrier", "Cones": "traffic_cone", "Signs": "sign", "Construction Signs": "sign",
     "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
 }  # fmt: skip
-"""The data set's classes -> labels; pickup trucks count as cars, as in Cityscapes."""
+"""The data set's classes -> labels; pickup trucks count as trucks, as in Cityscapes."""
 FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
 """Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
+EXPOSURE_S: Final = -0.01
+"""When an image was taken, from its time stamp on, by the places of moving cars in the images of three cameras."""
+POSE_S: Final = -0.02
+"""Where on the vehicle's path the camera's pose is taken, from its time stamp on, by standing points in the images of five cameras."""
 MAX_POINT_DELAY_S: Final = 0.25
 MAX_CAMERA_DELAY_S: Final = 1.0
 _MIN_BOX_POINTS: Final = 5
@@ -129,37 +139,46 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     motion = _Motion.read(folder, frames, chosen)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
     cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
-    notes = [f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here", *image_notes(fits)]
+    classes = PointClasses(folder / "annotations" / "semseg", frames, options)
+    notes = [
+        f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here",
+        *image_notes(fits),
+        *classes.notes,
+    ]
     if "front_camera" not in motion.world_from_cam:
         notes.append("front camera's poses are missing: the LiDARs' places are those of sequence 002")
     if not cuboids:
         notes.append("no boxes found: everything counts as static")
     boxes: dict[int, list[_Cuboid]] = {}
+    images_s: dict[float, tuple[float, float]] = {}
 
     def convert(index: int) -> Iterator[SceneImage | SceneSweep]:
         number = frames[index]
         for name in chosen:
             time_s, pose = float(motion.camera_s[name][index]), motion.world_from_cam[name][index]
             yield SceneImage(cameras[name], index, time_s, pose, images[name][number])
-        points = _read_points(clouds[number], motion.raw_s[index])
+        cloud = _read_points(clouds[number], motion, index)
+        given = classes.of(number, len(cloud.xyz))
         for d, sensor in SENSORS.items():
-            mine = points["d"] == d
+            mine = cloud.d == d
             if d == 0 or mine.any():
-                pose = motion.world_from_lidar[d][index]
-                sweep = _sweep_points(points, mine, invert(pose) @ motion.world_from_source)
-                yield SceneSweep(sensor, index, float(motion.ego.times_s[index]), pose, sweep, str(clouds[number]))
+                pose = motion.world_from_lidar(d, cloud.time_s)
+                sweep = cloud.of_sensor(mine, invert(pose) @ motion.world_from_source, given)
+                yield SceneSweep(sensor, index, cloud.time_s, pose, sweep, str(clouds[number]))
+        taken_s = [float(motion.camera_s[name][index]) for name in chosen]
+        images_s[cloud.time_s] = min(taken_s), max(taken_s)
         if number in cuboids:
-            boxes[index] = _read_cuboids(cuboids[number], points, motion, index)
+            boxes[index] = _read_cuboids(cuboids[number], cloud, motion)
 
     def tracks() -> Tracks:
         found = BoxTracks(str(folder / "annotations" / "cuboids"), LABELS)
         box_notes = _add_boxes(found, boxes)
-        made, track_notes = found.tracks()
+        made, track_notes = found.tracks(images_s=images_s)
         return made, [*box_notes, *track_notes]
 
     origin, numbers = Source("pandaset", LICENCE, None, tuple(notes)), range(len(frames))
     content = SceneContent(
-        folder.resolve().name, origin, fits, numbers, convert, lambda index: f"frame {frames[index]}", motion.ego, tracks
+        folder.resolve().name, origin, fits, numbers, convert, lambda index: f"frame {frames[index]}", motion.ego(), tracks
     )  # fmt: skip
     return write_scene(content, out, options)
 
@@ -197,67 +216,90 @@ def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
-    """Times and poses of the chosen frames, in the scene's world and clock.
+    """Times and poses, in the scene's world and clock.
 
     Args:
         world_from_source: the scene's world from the data set's, f64[4, 4].
-        raw_s: the data set's time of each frame's cloud.
-        camera_s: camera -> seconds of the scene's clock, f64[n].
+        raw_s: the data set's time of each chosen frame's cloud.
+        start_s: the data set's time that is 0 in the scene.
+        camera_s: camera -> when its images were taken, seconds of the scene's clock, f64[n].
         world_from_cam: camera -> f64[n, 4, 4].
-        world_from_lidar: 0 and 1 (``d``) -> f64[n, 4, 4].
-        ego: the vehicle, x forward, y left, z up, at the clouds' times.
+        path: the vehicle, x forward, y left, z up, at the clouds' times from one before the first chosen frame on.
+        places: 0 and 1 (``d``) -> place of the LiDAR on the vehicle, f64[3].
     """
 
     world_from_source: Matrix
     raw_s: NDArray[np.float64]
+    start_s: float
     camera_s: Mapping[str, NDArray[np.float64]]
     world_from_cam: Mapping[str, Matrix]
-    world_from_lidar: Mapping[int, Matrix]
-    ego: EgoPath
+    path: EgoPath
+    places: Mapping[int, Matrix]
 
     @classmethod
     def read(cls, folder: Path, frames: Sequence[int], cameras: Sequence[str]) -> _Motion:
-        raw_s = _times(folder / "lidar" / "timestamps.json", frames)
-        start_s = float(raw_s[0])
-        forward = _poses(folder / "lidar" / "poses.json", frames) @ yaw_matrix(np.pi / 2)
-        world_from_source = world_from_first(forward[0])
-        ego = EgoPath(
-            seconds(raw_s, "s", str(folder / "lidar" / "timestamps.json"), start_s), world_from_source @ forward
-        )
+        file = folder / "lidar" / "timestamps.json"
+        known = [*range(max(frames[0] - 1, 0), frames[0]), *frames]
+        raw_s = _times(file, known)
+        start_s = float(raw_s[len(known) - len(frames)])
+        forward = _poses(folder / "lidar" / "poses.json", known) @ yaw_matrix(np.pi / 2)
+        world_from_source = world_from_first(forward[len(known) - len(frames)])
+        path = EgoPath(seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
+        raw_s = raw_s[-len(frames) :]
         needed = dict.fromkeys((*cameras, "front_camera"))
         camera_s, world_from_cam = {}, {}
         for name in needed:
             here = folder / "camera" / name
             if name not in cameras and not (here / "poses.json").is_file():
                 continue
-            path = here / "timestamps.json"
-            times = _times(path, frames)
+            stamps = here / "timestamps.json"
+            times = _times(stamps, frames)
             late = np.abs(times - raw_s)
             if late.max() > MAX_CAMERA_DELAY_S:
                 raise InputError("camera and LiDAR do not share a clock",
-                    where=f"{path}: entry {frames[int(late.argmax())]}",
+                    where=f"{stamps}: entry {frames[int(late.argmax())]}",
                     expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json",
                     got=f"{late.max():.3f} s apart", remedy="are the times in seconds, and of this sequence?")  # fmt: skip
-            camera_s[name] = seconds(times, "s", str(path), start_s)
-            world_from_cam[name] = world_from_source @ _poses(here / "poses.json", frames)
-        places = _lidar_places(ego, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
-        world_from_lidar = {
-            d: ego.world_from_ego @ from_rotation_translation(np.eye(3), place) for d, place in places.items()
-        }
-        return cls(world_from_source, raw_s, camera_s, world_from_cam, world_from_lidar, ego)
+            stamped_s = seconds(times, "s", str(stamps), start_s)
+            camera_s[name] = stamped_s + EXPOSURE_S
+            given = world_from_source @ _poses(here / "poses.json", frames)
+            world_from_cam[name] = np.stack([
+                pose_on_path(path, time_s + POSE_S) @ invert(pose_on_path(path, time_s)) @ pose
+                for time_s, pose in zip(stamped_s, given, strict=True)
+            ])  # fmt: skip
+        places = _lidar_places(path, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
+        return cls(world_from_source, raw_s, start_s, camera_s, world_from_cam, path, places)
+
+    def world_from_lidar(self, d: int, time_s: float) -> Matrix:
+        """Pose of a LiDAR, f64[4, 4]."""
+        return pose_on_path(self.path, time_s) @ from_rotation_translation(np.eye(3), self.places[d])
+
+    def ego(self) -> EgoPath:
+        """The vehicle's path from its pose before the first image on; where there is none before, it starts with the image."""
+        first_s = min(float(times[0]) for times in self.camera_s.values())
+        times_s, poses = self.path.times_s, self.path.world_from_ego
+        if first_s < times_s[0] - 1e-3:
+            poses = np.concatenate([pose_on_path(self.path, first_s)[None], poses])
+            times_s = np.concatenate([[first_s], times_s])
+        return EgoPath(times_s, poses)
+
+
+def pose_on_path(path: EgoPath, time_s: float) -> Matrix:
+    """The vehicle's pose f64[4, 4]; beyond an end of the path it goes on as it did there."""
+    return pose_near(path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
 
 
 def _lidar_places(
-    ego: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None
+    path: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None
 ) -> dict[int, Matrix]:
     """Where the LiDARs sit on the vehicle: median place of the front camera, plus the static calibration."""
     camera = np.array(FRONT_CAMERA_M)
     if times_s is not None and world_from_cam is not None:
-        seen = []
-        for time_s, pose in zip(times_s, world_from_cam, strict=True):
-            world_from_ego = ego.pose_at(float(np.clip(time_s, ego.times_s[0], ego.times_s[-1])))
-            if world_from_ego is not None:
-                seen.append(transform_points(invert(world_from_ego), pose[None, :3, 3])[0])
+        where_s = times_s - EXPOSURE_S + POSE_S
+        seen = [
+            transform_points(invert(pose_on_path(path, time_s)), pose[None, :3, 3])[0]
+            for time_s, pose in zip(where_s, world_from_cam, strict=True)
+        ]
         camera = np.median(seen, axis=0)
     return {d: camera + np.array(offset) for d, offset in OFFSET_FROM_FRONT_CAMERA_M.items()}
 
@@ -313,33 +355,49 @@ def _columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     return frame
 
 
-def _read_points(path: Path, frame_s: float) -> dict[str, NDArray[np.float64]]:
-    """Columns of one cloud: ``xyz`` f64[N, 3] in the data set's world, ``i`` 0..1, ``dt`` seconds, ``d`` 0 or 1."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cloud:
+    """One cloud: ``xyz`` f64[N, 3] in the data set's world, ``intensity`` 0..1, ``dt_s`` seconds from ``time_s`` (of the scene's clock, the
+    middle of the turn), ``d`` 0 or 1."""
+
+    time_s: float
+    xyz: Matrix
+    intensity: NDArray[np.float64]
+    dt_s: NDArray[np.float64]
+    d: NDArray[np.float64]
+
+    def of_sensor(
+        self, mine: NDArray[np.bool_], lidar_from_source: Matrix, classes: NDArray[np.uint8] | None
+    ) -> SweepPoints:
+        """The points that are ``mine`` in the frame of their LiDAR."""
+        xyz = transform_points(lidar_from_source, self.xyz[mine]).astype(np.float32)
+        intensity, dt_s = (values[mine].astype(np.float32) for values in (self.intensity, self.dt_s))
+        return SweepPoints(xyz, intensity, dt_s, None if classes is None else classes[mine])
+
+
+def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
+    frame_s = float(motion.raw_s[index])
     frame = _columns(path, _POINT_COLUMNS)
     columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
-    dt_s = columns["t"] - frame_s
-    if len(dt_s) and np.abs(dt_s).max() > MAX_POINT_DELAY_S:
+    late_s = columns["t"] - frame_s
+    if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
         raise InputError("points do not belong to their frame's time", where=f"{path}: t",
             expected=f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})",
             got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}",
             remedy="is the file of another frame or sequence?")  # fmt: skip
     if not np.isin(columns["d"], list(SENSORS)).all():
         raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
+    turning = late_s[columns["d"] == 0]
+    middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
     xyz = np.stack([columns[axis] for axis in "xyz"], 1)
-    return {"xyz": xyz, "i": (columns["i"] / 255).clip(0, 1), "dt": dt_s, "d": columns["d"]}
-
-
-def _sweep_points(
-    points: Mapping[str, NDArray[np.float64]], mine: NDArray[np.bool_], lidar_from_source: Matrix
-) -> SweepPoints:
-    xyz = transform_points(lidar_from_source, points["xyz"][mine]).astype(np.float32)
-    return SweepPoints(xyz, points["i"][mine].astype(np.float32), points["dt"][mine].astype(np.float32))
+    intensity = (columns["i"] / 255).clip(0, 1)
+    return _Cloud(frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"])
 
 
 # --- boxes ------------------------------------------------------------------------------------------------------------
 
 
-def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], motion: _Motion, index: int) -> list[_Cuboid]:
+def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
     frame = _columns(path, _CUBOID_COLUMNS)
     centre = finite_columns(frame, ("position.x", "position.y", "position.z"), path)
     sizes = finite_columns(frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path)  # length, width, height
@@ -349,7 +407,7 @@ def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], motion:
         given = np.where(_missing(frame["cuboids.sensor_id"]), -1, frame["cuboids.sensor_id"])
         sensor = finite_columns({"cuboids.sensor_id": given}, ("cuboids.sensor_id",), path)[:, 0]
     siblings = frame.get("cuboids.sibling_id", np.full(len(yaw), "", object))
-    when, time_s = _MeasuringTimes(points, motion, index), float(motion.ego.times_s[index])
+    when = _MeasuringTimes(cloud, motion)
     rows = []
     for row in range(len(yaw)):
         box = yaw_matrix(yaw[row] + np.pi / 2, centre[row])
@@ -359,7 +417,7 @@ def _read_cuboids(path: Path, points: Mapping[str, NDArray[np.float64]], motion:
         late_s = 0.0 if standing else when.delay_s(box, size, of)
         sibling = siblings[row] if isinstance(siblings[row], str) and len(siblings[row]) > 1 else ""
         world_from_box = motion.world_from_source @ box
-        rows.append(_Cuboid(uuid, label, time_s, late_s, size, world_from_box, standing, of, sibling))
+        rows.append(_Cuboid(uuid, label, cloud.time_s, late_s, size, world_from_box, standing, of, sibling))
     return rows
 
 
@@ -371,14 +429,14 @@ def _missing(column: NDArray[Any]) -> NDArray[np.bool_]:
 class _MeasuringTimes:
     """When the boxes of one frame were measured."""
 
-    def __init__(self, points: Mapping[str, NDArray[np.float64]], motion: _Motion, index: int) -> None:
-        self._points = points
-        self._source_from_lidar = invert(motion.world_from_source) @ motion.world_from_lidar[0][index]
+    def __init__(self, cloud: _Cloud, motion: _Motion) -> None:
+        self._cloud = cloud
+        self._source_from_lidar = invert(motion.world_from_source) @ motion.world_from_lidar(0, cloud.time_s)
         self._turning: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
 
     def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
-        """Seconds from the frame's time: the median of the points inside; with few of them, of the points in that direction."""
-        xyz, dt_s, d = self._points["xyz"], self._points["dt"], self._points["d"]
+        """Seconds from the sweep's time: the median of the points inside; with few of them, of the points in that direction."""
+        xyz, dt_s, d = self._cloud.xyz, self._cloud.dt_s, self._cloud.d
         centre, reach = source_from_box[:3, 3], float(np.linalg.norm(size_m)) / 2
         near = np.flatnonzero((np.abs(xyz[:, :2] - centre[:2]) < reach).all(1) & (d == max(sensor, 0)))
         inside = np.abs(transform_points(invert(source_from_box), xyz[near])) < np.array(size_m) / 2
@@ -391,8 +449,8 @@ class _MeasuringTimes:
         """Points of the turning LiDAR within a degree of the direction to ``centre``."""
         place = self._source_from_lidar[:3, 3]
         if self._turning is None:
-            ids = np.flatnonzero(self._points["d"] == 0)
-            seen = self._points["xyz"][ids, :2] - place[:2]
+            ids = np.flatnonzero(self._cloud.d == 0)
+            seen = self._cloud.xyz[ids, :2] - place[:2]
             self._turning = ids, np.arctan2(seen[:, 1], seen[:, 0])
         ids, azimuth = self._turning
         turn = azimuth - np.arctan2(centre[1] - place[1], centre[0] - place[0])
