@@ -3,7 +3,8 @@
 Everything is a pure function of its arguments; random parts take a key from `base.seeds`. Two kinds of effects are kept apart:
 
 * The **look** of a camera: exposure, white balance, vignetting and contrast, which differ from camera to camera and partly drift over
-  time. Recorded images have it, and so has the truth that goes with them (`with_look`): a view beside the recorded path is to look as that camera would show it.
+  time. Recorded images have it, and so has the truth that goes with them (`with_look`): a view beside the recorded path is to look as
+  that camera would show it.
 * **Faults** of a recording: noise, blur, bloom, compression, rolling shutter, errors of poses, calibration, clocks and boxes. Only what is
   recorded has them (`recorded`, `thinned`, `pose_errors`, `noisy_tracks`); the truth does not.
 """
