@@ -75,6 +75,19 @@ def test_vignetting_darkens_the_corners_and_not_the_middle() -> None:
     assert light[0, 0, 0] == pytest.approx(0.6, abs=0.01)
 
 
+def test_contrast_is_the_slope_about_the_middle() -> None:
+    image = np.full((2, 2, 3), 0.6, np.float32)
+    assert np.allclose(with_look(image, CameraLook(contrast=1.5), 0.0), 0.65, atol=1e-5)
+
+
+def test_varied_clips_stay_in_the_free_space() -> None:
+    rules = from_city.CityClipRules(realism="varied")
+    margins = [from_city.city_config(rules, city).shift_margin_m for city in range(40)]
+    assert 0.3 < np.mean(np.array(margins) < 4) < 0.65
+    for city, margin in enumerate(margins):
+        assert max(abs(s) for s in from_city.shifts_of(rules, city)) <= margin
+
+
 def test_noise_has_the_stated_size_and_follows_the_key() -> None:
     flat = np.full((200, 300, 3), 0.25, np.float32)
     first, again, other = (recorded(flat, CameraFaults(noise=0.02, grain_px=0.7), key) for key in (1, 1, 2))

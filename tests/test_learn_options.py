@@ -172,3 +172,21 @@ def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
     (tmp_path / "stage1.yaml").write_text(text.split("```yaml\n")[1].split("```")[0])
     config = load(LearnConfig, None, tmp_path / "stage1.yaml")
     assert config.optimizer.betas == (0.9, 0.999) and config.compute.parallel == "fsdp" and not config.data.augment
+
+
+def test_a_step_has_clips_of_one_size() -> None:
+    from mudg.stages.config import LearnConfig
+    from mudg.stages.config.learn import LearnData
+    from mudg.stages.learning import clips as learn_clips
+
+    config = LearnConfig(data=LearnData(realism="varied"))
+    sizes = learn_clips.sizes_of_cities(config)
+    assert len(set(sizes)) == 5
+    for count in (3, 7, 40):
+        for first in range(count):
+            for city in range(count):
+                chosen = learn_clips._of_same_size(city, first, sizes, count)
+                assert 0 <= chosen < count
+                assert sizes[chosen % 5] == sizes[first % 5]
+    assert learn_clips.sizes_of_cities(LearnConfig()) == [(192, 128)]
+    assert len(learn_clips.sizes_of_cities(learn_clips.of_one_size(config))) == 1

@@ -2,8 +2,9 @@
 
 Everything is a pure function of its arguments; random parts take a key from `base.seeds`. Two kinds of effects are kept apart:
 
-* The **look** of a camera: exposure, white balance and vignetting, which differ from camera to camera and drift over time. Recorded images
-  have it, and so has the truth that goes with them (`with_look`): a view beside the recorded path is to look as that camera would show it.
+* The **look** of a camera: exposure, white balance, vignetting and contrast, which differ from camera to camera and partly drift over
+  time. Recorded images have it, and so has the truth that goes with them (`with_look`): a view beside the recorded path is to look as
+  that camera would show it.
 * **Faults** of a recording: noise, blur, bloom, compression, rolling shutter, errors of poses, calibration, clocks and boxes. Only what is
   recorded has them (`recorded`, `thinned`, `pose_errors`, `noisy_tracks`); the truth does not.
 """
@@ -31,7 +32,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class CameraLook:
-    """Exposure, white balance and vignetting of one camera, on linear light. The default changes nothing.
+    """Exposure, white balance, vignetting (on linear light) and contrast of one camera. The default changes nothing.
 
     Args:
         gain: factor of all channels.
@@ -40,6 +41,7 @@ class CameraLook:
         drift_white: amplitude of a slow change of the red/blue balance, a share.
         drift_period_s, drift_phase_rad: period and phase of both changes.
         vignette: share of the light lost in the corners of the image.
+        contrast: slope of display values about the middle; more than 1 makes shadows black and bright skies white.
     """
 
     gain: float = 1.0
@@ -49,6 +51,7 @@ class CameraLook:
     drift_period_s: float = 4.0
     drift_phase_rad: float = 0.0
     vignette: float = 0.0
+    contrast: float = 1.0
 
     def gains(self, time_s: float) -> Array:
         """Factors f64[3] of red, green and blue at a time."""
@@ -178,7 +181,8 @@ def with_look(rgb: Rgb, look: CameraLook, time_s: float) -> Rgb:
         y, x = np.mgrid[0:height, 0:width].astype(np.float32) + 0.5
         r2 = ((2 * x / width - 1) ** 2 * width**2 + (2 * y / height - 1) ** 2 * height**2) / (width**2 + height**2)
         factors = factors * (1 - look.vignette * r2)[..., None].astype(np.float32)
-    return to_display(to_light(rgb) * factors)
+    shown = to_display(to_light(rgb) * factors)
+    return shown if look.contrast == 1 else np.clip(0.5 + (shown - 0.5) * look.contrast, 0, 1).astype(np.float32)
 
 
 def to_light(rgb: Rgb) -> Rgb:

@@ -3,7 +3,7 @@
 With faults, the cameras are the reference: the view of a clip is where the camera truly was (moved sideways), and its truth is exact. What
 the condition knows may be wrong. Its views carry the recorded poses, which have errors; an image recorded at the time of a view has
 the same error and so still fits it; points and images of other times, and points of a LiDAR that is not where the calibration says,
-do not. The truth has the look of the camera at that time (exposure, white balance, vignetting) but none of its noise and blur.
+do not. The truth has the look of the camera at that time (exposure, white balance, vignetting, contrast) but none of its noise and blur.
 """
 
 from __future__ import annotations

@@ -146,6 +146,8 @@ def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
     rng = seeds.numpy_rng(rules.seed, city, "shifts")
     sides = [1.0, -1.0, *rng.choice([-1.0, 1.0], max(0, rules.clips - 3))]
     shifted = [float(side * rng.uniform(0.5, 4.2)) for side in sides]
+    if is_varied(rules, city):  # less where there is less room
+        shifted = [shift * city_config(rules, city).shift_margin_m / varied.MARGIN_M for shift in shifted]
     return tuple([*shifted, 0.0][-rules.clips :]) if rules.clips > 1 else (shifted[0],)
 
 

@@ -38,6 +38,11 @@ LIDARS: Final = (
 LIDAR_SHARES: Final = (0.3, 0.18, 0.12, 0.12, 0.08, 0.06, 0.06, 0.08)
 
 
+MARGIN_M: Final = 4.2
+"""Largest lateral shift of a clip, metres. Nearly half of the cities have less, so that lorries may stand right beside the camera; their
+clips are shifted by as much less."""
+
+
 def aspect_of(city: int) -> float:
     """Width over height of a city's images."""
     return ASPECTS[city % len(ASPECTS)]
@@ -76,7 +81,7 @@ def draw_city(seed: int, city: int, plain: CityConfig, textures: str = "") -> Ci
         lidar_noise_m=float(rng.uniform(0.01, 0.04)),
         lidar_dropout=float(rng.uniform(0.02, 0.2)),
         traffic=float(rng.uniform(0.3, 1.8)),
-        shift_margin_m=4.2,
+        shift_margin_m=MARGIN_M if rng.random() < 0.55 else float(rng.uniform(1.2, 3.2)),
         overhead=float(rng.choice([0.0, rng.uniform(0.25, 1.0)], p=[0.12, 0.88])),
         skies="varied" if rng.random() < 0.85 else "plain",
         textures=textures if rng.random() < 0.8 else "",
@@ -88,6 +93,7 @@ def draw_sensors(seed: int, city: int, config: CityConfig) -> SensorFaults:
     rng = seeds.numpy_rng(seed, city, "varied sensors")
     common = 2.0 ** rng.uniform(-0.6, 0.9)
     vignette = float(rng.random() < 0.5) * rng.uniform(0.05, 0.5)
+    contrast = float(rng.choice([1.0, rng.uniform(0.85, 1.1), rng.uniform(1.1, 1.7)], p=[0.3, 0.25, 0.45]))
     looks, cameras = {}, {}
     faults = _camera_faults(rng, config.width / 384)
     for name in config.cameras:
@@ -98,6 +104,7 @@ def draw_sensors(seed: int, city: int, config: CityConfig) -> SensorFaults:
             gain=float(common * 2.0 ** rng.normal(0, 0.18)), white=(red, green, blue),
             drift_stops=float(drifts * rng.uniform(0, 0.3)), drift_white=float(drifts * rng.uniform(0, 0.05)),
             drift_period_s=float(rng.uniform(1.0, 5.0)), drift_phase_rad=float(rng.uniform(0, 6.28)), vignette=float(vignette),
+            contrast=contrast,
         )  # fmt: skip
         cameras[name] = faults
     second = None
