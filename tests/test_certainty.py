@@ -69,12 +69,18 @@ def photograph(time_s: float = 0.0, left_m: float = 0.0) -> StoredView:
     mask = np.ones(SIZE[::-1], bool)
     mask[-4:] = False
     pixel = torch.arange(700, 1400, 7)
-    return StoredView("front/000000", seen.view, "recorded", rgb, mask=mask, lidar=LidarPixels(pixel, torch.full((len(pixel),), 9.0)))
+    return StoredView(
+        "front/000000", seen.view, "recorded", rgb, mask=mask, lidar=LidarPixels(pixel, torch.full((len(pixel),), 9.0))
+    )
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:
     values = {field.name: getattr(gaussians, field.name) for field in dataclasses.fields(gaussians)}
-    doubled = {name: value.detach().double() for name, value in values.items() if torch.is_tensor(value) and value.is_floating_point()}
+    doubled = {
+        name: value.detach().double()
+        for name, value in values.items()
+        if torch.is_tensor(value) and value.is_floating_point()
+    }
     return replace(gaussians, **doubled)
 
 
@@ -102,7 +108,9 @@ def test_images_of_differences():
     assert color[-4:].abs().sum() == 0 and color.max() > 0.05
     assert int(lidar.sum()) == 100
     pixel = int(view.lidar.pixel[50])
-    assert depth.flatten()[pixel] == pytest.approx(min(1.0, abs(float(render.depth.flatten()[pixel]) - 9.0) / 9.0), rel=1e-5)
+    assert depth.flatten()[pixel] == pytest.approx(
+        min(1.0, abs(float(render.depth.flatten()[pixel]) - 9.0) / 9.0), rel=1e-5
+    )
 
 
 def test_certainty_of_known_sums():
@@ -152,7 +160,11 @@ def fitted(tmp_path_factory) -> Path:
 
 def test_a_fit_stores_it_and_a_render_shows_it(fitted):
     model, view = fit.load_model(fitted), view_at(0.3, camera(width=60, height=40), left_m=2.0)
-    assert model.certainty is not None and model.certainty.dtype == torch.float16 and len(model.certainty) == len(model.table)
+    assert (
+        model.certainty is not None
+        and model.certainty.dtype == torch.float16
+        and len(model.certainty) == len(model.table)
+    )
     assert 0 < model.certainty.float().mean() < 1
     seen, plain = render_condition(model, view, RASTER), fit.render_view(model, view, RASTER)
     torch.testing.assert_close(seen.rgb, plain.rgb)

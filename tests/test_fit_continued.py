@@ -31,7 +31,13 @@ FILES = ("gaussians.safetensors", "nodes.safetensors", "model.json")
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:
-    small = {"iterations": 16, "start__gaussians": 900, "densify__max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
+    small = {
+        "iterations": 16,
+        "start__gaussians": 900,
+        "densify__max_gaussians": 1500,
+        "checkpoint_every": 1000,
+        "preview_every": 1000,
+    }
     return fit_config(method=method, **{**small, **changes})
 
 
@@ -57,7 +63,9 @@ def go_on(world: dict[str, Path], out: Path, config: FitConfig | None = None, **
 def psnr_beside(folder: Path) -> float:
     model = fit.load_model(folder)
     views = [view_at(time_s, camera(width=SIZE[0], height=SIZE[1]), left_m=2.0) for time_s in (0.3, 0.9)]
-    return float(np.mean([metrics.psnr(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb) for view in views]))
+    return float(
+        np.mean([metrics.psnr(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb) for view in views])
+    )
 
 
 def test_it_starts_from_the_finished_scene_and_learns_from_virtual_views_at_once(world, tmp_path, monkeypatch):

@@ -58,7 +58,11 @@ def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None
     if config.densify.kind == "none":
         return None
     return DensifySettings(
-        start, int(0.6 * total), every, max_rows=config.densify.max_gaussians, reset_every=3000 if total >= 10_000 else 0
+        start,
+        int(0.6 * total),
+        every,
+        max_rows=config.densify.max_gaussians,
+        reset_every=3000 if total >= 10_000 else 0,
     )
 
 

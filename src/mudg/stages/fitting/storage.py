@@ -24,7 +24,9 @@ def save_appearance(appearance: Appearance, folder: Path) -> None:
     if appearance:
         names, tensors = appearance.state()
         store.write_json(folder / "appearance.json", {"schema": 1, "names": names})
-        store.write_safetensors(folder / "appearance.safetensors", {k: v for k, v in tensors.items() if "moment" not in k})
+        store.write_safetensors(
+            folder / "appearance.safetensors", {k: v for k, v in tensors.items() if "moment" not in k}
+        )
 
 
 def load_appearance(folder: Path) -> Appearance:
@@ -48,6 +50,11 @@ def load_model(folder: Path) -> SceneModel:
         store.verify_manifest(folder)
     values = store.read_json(folder / "model.json")
     if values.get("schema") != 1:
-        raise InputError("unknown schema of a fitted scene", where=str(folder / "model.json"), expected="1", got=str(values.get("schema")))
+        raise InputError(
+            "unknown schema of a fitted scene",
+            where=str(folder / "model.json"),
+            expected="1",
+            got=str(values.get("schema")),
+        )
     groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
     return SceneModel.from_state(values, groups)
