@@ -27,7 +27,8 @@ from mudg.data.city.sensors import SensorFaults, noisy_tracks, pose_errors, reco
 class CityLog:
     """A generated log as its training clips need it: world, fused cloud, recorded images of all frames and cameras.
 
-    ``sweeps``: what was fused. ``boxes``: the annotated tracks (None = the exact ones); ``errors`` f64[frames, 4, 4]: recorded pose = true pose @ error.
+    ``sweeps``: what was fused.
+    ``boxes``: the annotated tracks (None = the exact ones); ``errors`` f64[frames, 4, 4]: recorded pose = true pose @ error.
     """
 
     world: CityWorld

@@ -71,7 +71,8 @@ def kind_of(model: nn.Module) -> ModelKind:
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
 
-    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings ask for them. If the settings do
+    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings
+    ask for them. If the settings do
     not describe that network but are the defaults, it is taken as it is. Clips may be of another size and length than before.
 
     Raises:
