@@ -16,12 +16,12 @@ from mudg.data.cloudfile import write_fused
 from mudg.data.scene import SceneWriter
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
-from mudg.stages.config.fit import DensifyConfig
+from mudg.stages.config.fit import DensifyConfig, StartConfig
 from mudg.stages.fitting.planes import render_planes
 
-FEWEST_STEPS, MOST_STEPS = 150, 400
+FEWEST_STEPS, MOST_STEPS = 100, 300
 """Steps of a training city's fit; those for scoring have the middle of them. How good the renders are varies from log to log."""
-MOST_GAUSSIANS = 60_000
+MOST_GAUSSIANS, VOXEL_M = 40_000, 0.25
 FIT_WIDTHS = 2
 """The images are fitted at this many times the width of the clips."""
 
@@ -38,7 +38,7 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
     width = from_city.size_of(rules, city)[0] * FIT_WIDTHS
     config = FitConfig(
         method="street_gaussians", iterations=steps, width_px=width, seed=city, preview_every=1_000_000,
-        densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
+        densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS), start=StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M),
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
