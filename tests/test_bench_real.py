@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import write_custom
 
 from mudg.base import store
 from mudg.base.errors import UsageError
@@ -366,6 +367,18 @@ def test_classes_of_points_are_scored_where_a_log_has_them(city, tmp_path, monke
     document = store.read_json(real.run(config, [city], tmp_path / "out") / "bench.json")
     found = document["protocols"]["classes"]["pooled"]["nearest_fill"]
     assert 0.05 < found["accuracy"] < 0.95 and found["miou"] == pytest.approx(found["accuracy"], abs=1e-6)
+
+
+def test_a_dataset_log_is_imported_with_the_settings_of_the_command(city, tmp_path):
+    log = write_custom.write_log(read_scene(city), tmp_path / "drive")
+    config = BenchConfig(methods=("nearest_fill",), protocols=("gap-1",), frames="0:4", resolution="48", processes=1)
+    out = real.run(config, [log], tmp_path / "out")
+    facts = store.read_json(out / "bench.json")["logs"][0]
+    assert {(tuple(c["size_px"]), c["frames"]) for c in facts["cameras"].values()} == {((48, 32), 4)}
+    assert not read_scene(out / "drive" / "scene").frames_in("test")
+    assert (out / "drive" / "gap-1" / "annotate" / "scene.json").is_file()  # the log has no labels
+    with pytest.raises(UsageError):
+        real.run(dataclasses.replace(config, frames="0:5"), [log], out)
 
 
 def test_other_folders_methods_and_names_are_refused(city, tmp_path):

@@ -92,7 +92,7 @@ def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
             lines.append(f"{name} is left out: {found['left_out'][name]}.")
             continue
         held, facts = log["held_out"].get(found["row"]["split"], {}), found["logs"][name]["facts"]
-        words = [f"{count} views of {place}" for place, count in facts["views"].items()]
+        words = [f"{count} view{'' if count == 1 else 's'} of {place}" for place, count in facts["views"].items()]
         if "blocks" in held:
             blocks = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in held["blocks"])
             words.append(f"held out of {held['moments']} frames: {blocks}")
