@@ -130,7 +130,7 @@ def _name_and_folder(item: str) -> tuple[str, Path]:
 def _bench(args: f.Bench) -> dict[str, Any]:
     from mudg.bench import run as bench
 
-    made = bench.run(args.name, args.settings, args.out, overwrite=args.overwrite)
+    made = bench.run(args.name, args.settings, args.out, sources=args.sources, overwrite=args.overwrite)
     return {"bench": made / "bench.json", "text": (made / "bench.md").read_text(encoding="utf-8")}
 
 
@@ -231,9 +231,10 @@ VERBS: dict[str, Verb] = {
         _score,
     ),
     "bench": Verb(
-        "Run a benchmark against exact ground truth: mdm, poses or shift.",
+        "Run a benchmark: mdm, poses or shift against exact ground truth, real on real logs.",
         ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses",
-         "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift"),
+         "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
+         "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real"),
         _bench,
     ),
 }  # fmt: skip

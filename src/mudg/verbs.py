@@ -13,7 +13,7 @@ settings and inputs is verified and reused; an interrupted one is resumed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -158,12 +158,18 @@ def run(
 
 
 def bench(
-    name: str, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
-) -> Path:
-    """Run a benchmark (``mdm``, ``poses``, ``shift``) against exact truth; returns the folder of ``bench.json``."""
+    name: str, out: Location, *,
+    sources: Sequence[Location] = (), overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Run a benchmark; returns the folder of ``bench.json``.
+
+    Args:
+        name: ``mdm``, ``poses`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``.
+    """
     from mudg.bench import run as stage
 
-    return stage.run(name, _settings(stage_config.BenchConfig, config, settings), Path(out), overwrite=overwrite)
+    made = _settings(stage_config.BenchConfig, config, settings)
+    return stage.run(name, made, Path(out), sources=[Path(source) for source in sources], overwrite=overwrite)
 
 
 def doctor(scene: Location | None = None) -> dict[str, Any]:

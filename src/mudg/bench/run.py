@@ -4,6 +4,7 @@ mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the r
                without given classes, at several numbers of steps, and the seam between windows of a longer video
 poses          how much of the error of tracked boxes a fit takes out (see `bench_poses`); needs no diffusion model
 shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
+real           whole methods on real logs, against what the methods did not see of them (see `bench_real`; own folders, too)
 
 OUT/clips/ the generated clips   OUT/bench.json   OUT/bench.md   OUT/*.png pictures
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from mudg.base.config import to_dict
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.bench import poses as bench_poses
+from mudg.bench import real as bench_real
 from mudg.bench import shift as bench_shift
 from mudg.core import flicker
 from mudg.data.clips import from_city
@@ -38,20 +40,27 @@ from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "fits/", "rows/*.json")
-SHIFT = "shift"
+SHIFT, REAL = "shift", "real"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
 
-def run(name: str, config: BenchConfig, out: Path, *, overwrite: bool = False) -> Path:
-    """Run one of `BENCHES`, or shift; returns the folder with `bench.json` and `bench.md`.
+def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = (), overwrite: bool = False) -> Path:
+    """Run one of `BENCHES`, shift or real; returns the folder with `bench.json` and `bench.md`.
+
+    Args:
+        sources: logs, for real alone.
 
     Raises:
-        UsageError: there is no such benchmark.
+        UsageError: there is no such benchmark, or logs were given to one that makes its own.
     """
+    if name == REAL:
+        return bench_real.run(config, sources, out, overwrite=overwrite)
+    if sources:
+        raise UsageError("this benchmark makes its own logs", where=f"mudg bench {name}", got=", ".join(map(str, sources)))
     if name == SHIFT:  # made of verbs that each keep their own folder
         return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
-        raise UsageError("no such benchmark", expected=" or ".join((*BENCHES, SHIFT)), got=name)
+        raise UsageError("no such benchmark", expected=", ".join((*BENCHES, SHIFT, REAL)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
     directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), to_dict(config), inputs, overwrite)

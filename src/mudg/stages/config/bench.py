@@ -13,8 +13,8 @@ from mudg.base.config import STRICT
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class BenchConfig:
-    """Measure on generated cities against exact ground truth: the diffusion model, the correction of box tracks, or complete
-    methods off the recorded path."""
+    """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on generated cities
+    against exact ground truth; or complete methods on real logs."""
 
     MOVED: ClassVar[Mapping[str, str | None]] = {"ablation_steps": None, "ablation_cities": None}
 
@@ -44,18 +44,29 @@ class BenchConfig:
     logs: int = Field(default=8, ge=1, le=8)
     """shift: number of logs taken from the list, 1 to 8 (the development list has 4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
-    """shift: methods to compare, out of the five of the default."""
+    """shift, real: methods to compare, out of the five of the default. real also has mudg_r+renders and mudg_s+renders, whose
+    diffusion model sees the renders of a fit."""
     iterations: int = Field(default=1000, ge=1)
-    """shift: optimisation steps of every fit."""
+    """shift, real: optimisation steps of every fit."""
     ablation: bool = False
     """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact
     views instead of generated ones."""
     variant: tuple[str, ...] = ()
-    """shift: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such
+    """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such
     as virtual.start."""
     processes: int = Field(default=0, ge=0)
-    """shift: number of logs processed at the same time, with one thread each (0 = one per core). Results do not depend on it."""
+    """shift, real: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per
+    core). Results do not depend on it."""
     videos: bool = True
     """shift: also write videos of all methods side by side."""
+    protocols: tuple[str, ...] = ("gap", "camera", "lidar", "classes")
+    """real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone."""
+    shown: tuple[str, ...] = ()
+    """real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front,
+    or the first camera)."""
+    resolution: str = ""
+    """real: image size of logs that are imported, as for ingest (empty = as recorded)."""
+    frames: str = ""
+    """real: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all)."""
     pose_iterations: int = Field(default=300, ge=1)
     """poses: optimisation steps of every fit."""

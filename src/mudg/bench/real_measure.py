@@ -1,0 +1,355 @@
+"""Scores of ``mudg bench real``: the columns of its tables, and a method's values under a protocol.
+
+A column adds up arrays of numbers over the views of a place (a camera, or a distance beside the path); its value is read from the sum.
+The mean of a method is that of its places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import log, store
+from mudg.base.errors import InputError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.types import Observation, Scene, View
+from mudg.bench.real_points import DEPTH_LIMIT_M
+from mudg.bench.real_protocols import Protocol
+from mudg.bench.real_truth import Target, Targets, read_targets
+from mudg.core import metrics
+from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
+from mudg.data.exporters.video import jpeg_bytes
+from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
+from mudg.data.scene import read_scene
+from mudg.models.featnets import CodecFeatures, PerceptualDistance
+from mudg.models.mdm import files as mdm_files
+from mudg.stages.score import evenly
+from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, apart_m
+
+PERCEPTUAL_VIEWS: Final = 12
+"""Views of each place at which the perceptual distance is computed, evenly spread."""
+_MOST_DB: Final = 100.0
+_OUTPUT: Final = VerbOutput("bench real score", 1, ("metrics.json", "pictures/*.jpg"))
+
+Sum = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A method's view beside its truth: colour f32[3, H, W] as the target's camera would record it, depth f32[1, H, W] metres (80 m
+    where there is none), classes i64[H, W] or None; the photograph f32[3, H, W] or None; ``distance``: perceptual, or None at a view
+    where it is not computed."""
+
+    target: Target
+    rgb: Tensor
+    depth: Tensor | None
+    semantics: Tensor | None
+    photo: Tensor | None
+    distance: Callable[[metrics.Pair], float | None] | None
+
+    def mask(self, name: str) -> Tensor | None:
+        """A mask bool[1, H, W] by the name of its map; ``upper``: the upper third of the image. None where the truth has no such map."""
+        if name == "upper":
+            height, width = self.rgb.shape[-2:]
+            return (torch.arange(height) < height // 3)[None, :, None].expand(1, height, width)
+        found = self.target.maps.get(name)
+        return None if found is None else torch.from_numpy(found > 0)[None]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its heading, digits, whether it is compared as a ratio, and whether lower is better.
+
+    Args:
+        of: what a view adds, or None where it has nothing to say. close: the value from the sum over views.
+    """
+
+    title: str
+    digits: int
+    of: Callable[[Sight], Sum | None]
+    close: Callable[[Sum], float | None]
+    lower: bool = False
+    ratio: bool = False
+
+
+def _mean(total: Sum) -> float | None:
+    return float(total[0] / total[1]) if total[1] else None
+
+
+def _root(total: Sum) -> float | None:
+    return float(math.sqrt(total[0] / total[1])) if total[1] else None
+
+
+def _decibels(total: Sum) -> float | None:
+    if not total[1]:
+        return None
+    return min(_MOST_DB, -10.0 * math.log10(max(total[0] / total[1], 1e-12)))
+
+
+def _photo(compare: Callable[[Tensor, Tensor, Tensor | None], float], name: str = "") -> Callable[[Sight], Sum | None]:
+    """A number per view from colours, on all pixels or those of a mask that covers at least a thousandth of the image."""
+
+    def of(sight: Sight) -> Sum | None:
+        mask = sight.mask(name) if name else None
+        if sight.photo is None or (name and (mask is None or float(mask.float().mean()) < metrics.SMALLEST_SHARE)):
+            return None
+        return np.array([min(compare(sight.rgb, sight.photo, mask), _MOST_DB), 1.0])
+
+    return of
+
+
+def _perceptual(name: str = "") -> Callable[[Sight], Sum | None]:
+    def of(sight: Sight) -> Sum | None:
+        mask = sight.mask(name) if name else None
+        if sight.distance is None or sight.photo is None or (mask is not None and not bool(mask.any())):
+            return None
+        found = sight.distance(metrics.Pair(sight.rgb, None, None, sight.photo, None, None, None, mask))
+        return None if found is None else np.array([found, 1.0])
+
+    return of
+
+
+def _depth(error: Callable[[Tensor, Tensor], Tensor], part: str = "") -> Callable[[Sight], Sum | None]:
+    """An error summed over the pixels that show a LiDAR point: all, or those that are dynamic, static or seen."""
+
+    def of(sight: Sight) -> Sum | None:
+        if sight.depth is None:
+            return None
+        true = torch.from_numpy(sight.target.maps["depth"])[None]
+        chosen = _points(sight, true > 0, part)
+        return np.array([float(error(sight.depth[chosen].double(), true[chosen].double()).sum()), float(chosen.sum())])
+
+    return of
+
+
+def _points(sight: Sight, known: Tensor, part: str) -> Tensor:
+    """The known pixels bool[1, H, W] of a part."""
+    if not part:
+        return known
+    mask = sight.mask("dynamic" if part == "static" else part)
+    if mask is None:
+        return torch.zeros_like(known)
+    return known & (~mask if part == "static" else mask)
+
+
+def _point_color(error: Callable[[Tensor], Tensor], part: str) -> Callable[[Sight], Sum | None]:
+    """An error of colour summed over channels and pixels that show a point with a recorded colour."""
+
+    def of(sight: Sight) -> Sum | None:
+        colored = sight.mask("colored")
+        if colored is None:
+            return None
+        chosen = _points(sight, colored, part)[0]
+        true = torch.from_numpy(sight.target.maps["color"]).permute(2, 0, 1).float() / 255
+        apart = (sight.rgb.clamp(0, 1) - true)[:, chosen].double()
+        return np.array([float(error(apart).sum()), float(apart.numel())])
+
+    return of
+
+
+def _confusion(sight: Sight) -> Sum | None:
+    if sight.semantics is None or "classes" not in sight.target.maps:
+        return None
+    true = torch.from_numpy(sight.target.maps["classes"].astype(np.int64))
+    return metrics.confusion(sight.semantics, true).double().numpy()
+
+
+def _mean_iou(total: Sum) -> float | None:
+    iou = metrics.iou_of(torch.from_numpy(total))
+    return sum(iou.values()) / len(iou) if iou else None
+
+
+def _accuracy(total: Sum) -> float | None:
+    return float(np.trace(total[:, : metrics.CLASS_COUNT]) / total.sum()) if total.sum() else None
+
+
+def _relative(made: Tensor, true: Tensor) -> Tensor:
+    return (made - true).abs() / true
+
+
+def _squared(made: Tensor, true: Tensor) -> Tensor:
+    return (made - true) ** 2
+
+
+def _within(made: Tensor, true: Tensor) -> Tensor:
+    return (torch.maximum(made.clamp_min(1e-6) / true, true / made.clamp_min(1e-6)) < 1.25).double()
+
+
+def _depth_columns(part: str) -> dict[str, Column]:
+    return {
+        f"abs_rel_{part}": Column(f"AbsRel, {part}", 4, _depth(_relative, part), _mean, lower=True, ratio=True),
+        f"rmse_{part}": Column(f"RMSE m, {part}", 2, _depth(_squared, part), _root, lower=True, ratio=True),
+        f"delta1_{part}": Column(f"delta1, {part}", 4, _depth(_within, part), _mean),
+        f"point_psnr_{part}": Column(f"PSNR at points, {part}", 2, _point_color(torch.square, part), _decibels),
+        f"point_abs_{part}": Column(
+            f"colour error at points, {part}", 4, _point_color(torch.abs, part), _mean, lower=True, ratio=True
+        ),
+    }
+
+
+COLUMNS: Final[dict[str, Column]] = {
+    "psnr": Column("PSNR dB", 2, _photo(metrics.psnr), _mean),
+    "ssim": Column("SSIM", 3, _photo(metrics.ssim), _mean),
+    "perceptual": Column("perceptual", 4, _perceptual(), _mean, lower=True, ratio=True),
+    "psnr_dynamic": Column("PSNR of dynamic objects", 2, _photo(metrics.psnr, "dynamic"), _mean),
+    "psnr_upper": Column("PSNR, upper third", 2, _photo(metrics.psnr, "upper"), _mean),
+    "psnr_seen": Column("PSNR dB, seen", 2, _photo(metrics.psnr, "seen"), _mean),
+    "perceptual_seen": Column("perceptual, seen", 4, _perceptual("seen"), _mean, lower=True, ratio=True),
+    "abs_rel": Column("AbsRel", 4, _depth(_relative), _mean, lower=True, ratio=True),
+    "abs_rel_seen": Column("AbsRel, seen", 4, _depth(_relative, "seen"), _mean, lower=True, ratio=True),
+    **_depth_columns("static"),
+    **_depth_columns("dynamic"),
+    "miou": Column("mIoU", 3, _confusion, _mean_iou),
+    "accuracy": Column("accuracy", 3, _confusion, _accuracy),
+}
+"""All columns by name; a protocol lists its own."""
+
+
+def write_scores(
+    protocol: Protocol, source: Path, truth: Path, views: Path, out: Path, *, overwrite: bool = False
+) -> Path:
+    """Score a method's views (folders of observations) of a log; writes its values and its pictures for the page."""
+    refuse_overlap(out, {"log": source, "truth": truth, "views": views})
+    inputs = {"log": store.digest(source), "truth": store.digest(truth), "views": store.digest(views)}
+    asked = {"protocol": protocol.name, "columns": list(protocol.columns), "perceptual_views": PERCEPTUAL_VIEWS}
+    folder = RunDir.open(out, _OUTPUT, asked, inputs, overwrite)
+    if folder.complete:
+        return folder.reused()
+    scene, targets = read_scene(source), read_targets(truth)
+    finder = _Finder(views)
+    sums: dict[str, dict[str, Sum]] = {}
+    sampled = perceptual_views(targets)
+    features = (
+        PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec)) if sampled and _wants(protocol) else None
+    )
+    with log.task(f"score {protocol.name}", len(targets)) as bar:
+        for number in range(len(targets)):
+            target = targets.load(number, scene)
+            sight = sight_of(target, finder.at(target.view), scene, protocol, features if number in sampled else None)
+            place = sums.setdefault(target.place, {})
+            for name in protocol.columns:
+                found = COLUMNS[name].of(sight)
+                if found is not None:
+                    place[name] = place[name] + found if name in place else found
+            if number in targets.pictures:
+                picture = jpeg_bytes(picture_of(sight, protocol), quality=80)
+                store.atomic_write(folder.path / "pictures" / f"{number:06d}.jpg", picture)
+            bar.advance()
+    store.write_json(folder.path / "metrics.json", values_of(protocol, sums))
+    folder.finish({"views": len(targets)})
+    return folder.path
+
+
+def _wants(protocol: Protocol) -> bool:
+    return any(name.startswith("perceptual") for name in protocol.columns)
+
+
+def perceptual_views(targets: Targets) -> set[int]:
+    """Numbers of the views at which the perceptual distance is computed."""
+    by_place: dict[str, list[int]] = {}
+    for number, record in enumerate(targets.records):
+        by_place.setdefault(record["place"], []).append(number)
+    return {number for own in by_place.values() for number in evenly(own, PERCEPTUAL_VIEWS)}
+
+
+def values_of(protocol: Protocol, sums: Mapping[str, Mapping[str, Sum]]) -> dict[str, Any]:
+    """Values by place and their mean, from the sums; a column without a number says so."""
+    places: dict[str, dict[str, float | str]] = {}
+    for place, found in sums.items():
+        closed = {name: COLUMNS[name].close(found[name]) if name in found else None for name in protocol.columns}
+        places[place] = {
+            name: "none" if value is None or math.isnan(value) else round(value, 6) for name, value in closed.items()
+        }
+    mean: dict[str, float | str] = {}
+    for name in protocol.columns:
+        numbers = [value for of in places.values() if not isinstance(value := of[name], str)]
+        mean[name] = round(sum(numbers) / len(numbers), 6) if numbers else "none"
+    return {"mean": mean, "places": places}
+
+
+def sight_of(
+    target: Target,
+    seen: Observation,
+    scene: Scene,
+    protocol: Protocol,
+    distance: Callable[[metrics.Pair], float | None] | None,
+) -> Sight:
+    """A method's view brought to the size and the colours of its target."""
+    height, width = target.view.camera.height, target.view.camera.width
+    rgb = resize_rgb(seen.rgb, height, width)
+    if target.color_map.pairs:
+        gain, offset = (
+            torch.tensor(values).view(3, 1, 1) for values in (target.color_map.gain, target.color_map.offset)
+        )
+        rgb = (rgb * gain + offset).clamp(0, 1)
+    depth = None
+    if seen.depth is not None:
+        depth = resize_nearest(seen.depth, height, width)
+        given = torch.isfinite(depth) & (depth > 0)
+        depth = torch.where(given, depth, DEPTH_LIMIT_M).clamp(max=DEPTH_LIMIT_M)
+    semantics = None if seen.semantics is None else resize_nearest(seen.semantics, height, width)
+    photo = target.photo(scene) if "photo" in protocol.maps else None
+    return Sight(target, rgb, depth, semantics, photo, distance)
+
+
+class _Finder:
+    """Finds the view of a method by camera, time and position."""
+
+    def __init__(self, views: Path) -> None:
+        self._folder = views
+        self._sets: list[ObservationSet] = [read_observations(path) for path in list_observation_sets(views).values()]
+
+    def at(self, view: View) -> Observation:
+        for found in self._sets:
+            for index, own in enumerate(found.views):
+                same = own.camera.name == view.camera.name and abs(own.time_s - view.time_s) <= SAME_TIME_S
+                if same and apart_m(own, view) <= SAME_PLACE_M:
+                    return found[index]
+        raise InputError("a method lacks a view that is scored", where=str(self._folder),
+                         expected=f"camera {view.camera.name} at {view.time_s:.3f} s")  # fmt: skip
+
+
+def picture_of(sight: Sight, protocol: Protocol) -> NDArray[np.uint8]:
+    """What the page shows of a method: colour above its error or, without a photograph, above its depth; or classes."""
+    height, width = sight.rgb.shape[-2:]
+    blank = np.full((height, width, 3), 24, np.uint8)
+    if "classes" in protocol.maps:
+        return blank if sight.semantics is None else class_colors(sight.semantics.numpy().astype(np.uint8))
+    if sight.photo is not None:
+        return np.vstack([to_bytes(sight.rgb), error_image(sight.rgb, sight.photo)])
+    return np.vstack([to_bytes(sight.rgb), blank if sight.depth is None else depth_colors(sight.depth[0].numpy())])
+
+
+def better(name: str, found: float, other: float) -> bool:
+    """Whether a value of a column is better than another."""
+    return found < other if COLUMNS[name].lower else found > other
+
+
+def compared(name: str, found: Any, against: Any) -> float | None:
+    """A value against another: a ratio or a difference, as the column says; None where either is no number."""
+    if isinstance(found, str) or isinstance(against, str) or found is None or against is None:
+        return None
+    if COLUMNS[name].ratio:
+        return found / against if against else None
+    return found - against
+
+
+def compared_text(name: str, found: Any, against: Any) -> str:
+    """The comparison as text: ``x0.91`` or ``+0.72``; empty where there is none."""
+    value = compared(name, found, against)
+    if value is None:
+        return ""
+    return f"x{value:.3f}" if COLUMNS[name].ratio else f"{value:+.{COLUMNS[name].digits}f}"
+
+
+def number_text(name: str, value: Any) -> str:
+    """A value as text."""
+    return value if isinstance(value, str) else f"{value:.{COLUMNS[name].digits}f}"

@@ -1,0 +1,425 @@
+"""``mudg bench real``: what is hidden stays unused, measures with known answers, and the command end to end on a tiny log."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import write_custom
+
+from mudg.base import store
+from mudg.base.errors import UsageError
+from mudg.base.palette import ID
+from mudg.base.types import Camera, Observation, SweepPoints, View
+from mudg.bench import real, real_measure, real_points, real_protocols, real_tables, real_truth
+from mudg.bench.real_protocols import SPLITS
+from mudg.bench.shift import write_fill
+from mudg.core.fusion import STATIC
+from mudg.data.city import CityWorld
+from mudg.data.observations import ObservationWriter
+from mudg.data.scene import SceneWriter, read_image, read_label, read_points, read_scene
+from mudg.data.scene.part import write_part
+from mudg.stages import fuse, ingest, render
+from mudg.stages.config import BenchConfig, FitConfig, FuseConfig, IngestConfig, RenderConfig, SynthesizeConfig
+
+CITY = {
+    "n_frames": 6,
+    "width": 96,
+    "height": 64,
+    "cameras": ("front", "front_left"),
+    "seed": 2100000,
+    "lidar_azimuth_step_deg": 0.6,
+}
+PROTOCOLS = {protocol.name: protocol for protocol in real_protocols.PROTOCOLS}
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory):
+    from mudg.data.city.config import CityConfig
+
+    out = tmp_path_factory.mktemp("log") / "city"
+    return ingest.run(IngestConfig(test_every=0, contact_sheet=False, city=CityConfig(**CITY)), ingest.CITY, out)
+
+
+# ---- what is hidden ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("moments", "length", "blocks"),
+    [
+        (24, 1, [4, 8, 12, 16, 20]),
+        (24, 3, [(4, 6), (10, 12), (17, 19)]),
+        (24, 5, [(5, 9), (14, 18)]),
+        (16, 5, [(6, 10)]),
+        (3, 1, [1]),
+        (4, 3, []),
+    ],
+)
+def test_blocks_are_spread_and_leave_both_ends(moments, length, blocks):
+    found = real_protocols.blocks_of(moments, length)
+    expected = [b if isinstance(b, tuple) else (b, b) for b in blocks]
+    assert all(len(block) == length for block in found) and len(found) == len(expected)
+    hidden = {moment for block in found for moment in block}
+    assert len(hidden) == length * len(found) and not hidden & {0, moments - 1}
+    between = np.diff([-1, *sorted(hidden), moments]) - 1
+    runs = between[between > 0]
+    assert len(found) == 0 or (len(runs) == len(found) + 1 and runs.max() - runs.min() <= 1)
+
+
+def test_a_block_hides_all_cameras_and_the_sweeps_of_its_moments(city):
+    scene = read_scene(city)
+    held = real_protocols.held_out(scene, SPLITS["gap-3"], ())
+    first, last = dict(held.facts)["blocks"][0]
+    times = [frame.view.time_s for frame in scene.frames_of("front")]
+    expected = {f.id for f in scene.frames if times[first] - 0.02 <= f.view.time_s <= times[last] + 0.02}
+    assert set(held.frames) == expected and len(expected) == 6
+    assert {s.id for s in scene.sweeps} - set(held.sweeps)
+    assert all(times[first] - 0.05 <= s.time_s <= times[last] + 0.05 for s in scene.sweeps if s.id in held.sweeps)
+
+
+def test_a_log_that_is_too_short_is_left_out_with_the_reason(city):
+    scene = dataclasses.replace(read_scene(city), frames=read_scene(city).frames[:8])
+    assert "too few" in real_protocols.held_out(scene, SPLITS["gap-3"], ()).reason
+    one = dataclasses.replace(scene, cameras={"front": scene.cameras["front"]}, frames=scene.frames_of("front"))
+    assert "no camera besides" in real_protocols.held_out(one, SPLITS["camera"], ()).reason
+
+
+def test_a_part_holds_nothing_of_what_is_hidden(city, tmp_path):
+    scene = read_scene(city)
+    held = real_protocols.held_out(scene, SPLITS["gap-3"], ())
+    places = real_protocols.places_of(scene, held)
+    shown = {f.id for f in scene.frames} - set(held.frames)
+    part = write_part(scene, tmp_path / "part", shown, {s.id for s in scene.sweeps} - set(held.sweeps), places)
+    assert part.source.recipe is None
+    assert {f.id for f in part.frames_in("test")} == set(held.frames)
+    assert {f.id for f in part.frames_in("train")} == shown
+    assert not {s.id for s in part.sweeps} & set(held.sweeps)
+    for frame in part.frames_in("test"):
+        assert not read_image(part, frame).any() and not frame.labels
+    frame = part.frames_in("train")[0]
+    original = next(f for f in scene.frames if f.id == frame.id)
+    assert np.array_equal(read_image(part, frame), read_image(scene, original)) and set(frame.labels) == set(
+        original.labels
+    )
+
+
+def corrupted(scene, out, frames, sweeps):
+    """A copy of a scene in which some frames (with their labels) and sweeps are noise."""
+    rng = np.random.default_rng(0)
+    with SceneWriter(out, scene.id, scene.source) as writer:
+        for camera in scene.cameras.values():
+            writer.add_camera(camera)
+        for sweep in scene.sweeps:
+            points = read_points(scene, sweep)
+            if sweep.id in sweeps:
+                xyz = rng.uniform(-30, 30, points.xyz.shape).astype(np.float32)
+                points = SweepPoints(xyz, points.intensity, points.dt_s)
+            writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, points)
+        for frame in scene.frames:
+            if frame.id not in frames:
+                writer.copy_frame(scene, frame)
+                continue
+            shape = (frame.view.camera.height, frame.view.camera.width)
+            labels = {name: read_label(scene, frame, name) for name in frame.labels}
+            labels |= {"depth": rng.uniform(1, 50, shape), "semantics": rng.integers(0, 19, shape).astype(np.uint8)}
+            writer.add_frame(frame.id, frame.view, rng.integers(0, 256, (*shape, 3)).astype(np.uint8), labels)
+        for track in scene.tracks:
+            writer.add_track(track)
+        writer.set_ego(scene.ego)
+        return writer.finish()
+
+
+def made_from(source, out, split):
+    """Everything that methods make of a log under a split, by name, as bytes."""
+    rows = tuple(row for row in real.METHOD_ROWS if row.name in ("nearest_fill", "mudg_s"))
+    job = real.SplitJob(
+        out, source, split, (), rows, FitConfig(method="mudg_s", iterations=6, densify={"kind": "none"}),
+        SynthesizeConfig(model="embedded-tiny", steps=1, shifts_m=(2.0,), processes=1), (), False,
+    )  # fmt: skip
+    whole = read_scene(source)
+    held = real_protocols.held_out(whole, split, ())
+    real.write_seen(job, whole, held)
+    fuse.run(FuseConfig(), job.scene, job.fused)
+    cameras = real._asked_cameras(job, whole, held)
+    for row in rows:
+        real.views_of(job, row, cameras)
+    kept = ("gaussians.safetensors", "nodes.safetensors", "static.safetensors")
+    return {
+        path.relative_to(out).as_posix(): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.name in kept or path.suffix == ".png" or path.parent.name == "data"
+    }
+
+
+@pytest.fixture(scope="module")
+def untouched(city, tmp_path_factory):
+    return {name: made_from(city, tmp_path_factory.mktemp(name), SPLITS[name]) for name in ("gap-3", "camera")}
+
+
+@pytest.mark.parametrize("split", ["gap-3", "camera"])
+def test_held_out_content_changes_no_fit_no_cloud_and_no_view(city, tmp_path, split, untouched):
+    scene, plain, split = read_scene(city), untouched[split], SPLITS[split]
+    held = real_protocols.held_out(scene, split, ())
+    corrupted(scene, tmp_path / "noise", set(held.frames), set(held.sweeps))
+    assert any("fit/mudg_s" in name for name in plain) and any("virtual/plain" in name for name in plain)
+    assert any("render/mudg_s" in name for name in plain) and any("fuse/static" in name for name in plain)
+    assert made_from(tmp_path / "noise", tmp_path / "out", split) == plain
+
+
+def test_shown_content_changes_the_fit(city, tmp_path, untouched):
+    scene, split = read_scene(city), SPLITS["gap-3"]
+    corrupted(scene, tmp_path / "noise", {"front/000000"}, ())
+    other = made_from(tmp_path / "noise", tmp_path / "out", split)
+    name = f"{split.name}/fit/mudg_s/gaussians.safetensors"
+    assert untouched["gap-3"][name] != other[name]
+
+
+# ---- measures with known answers ---------------------------------------------------------------------------------------
+
+CAMERA = Camera("front", 40, 30, 30.0, 30.0, 20.0, 15.0)
+VIEW = View(CAMERA, np.eye(4), 0.0)
+
+
+def test_a_point_is_seen_if_it_is_not_behind_the_surface():
+    shown = [real_points.ShownFrame(VIEW, np.full((30, 40), 10.0, np.float32), np.full((30, 40, 3), 77, np.uint8))]
+    xyz = np.array([[0, 0, 9.9], [0, 0, 10.5], [0, 0, 14.0], [100, 0, 5.0], [0, 0, -5.0]], np.float32)
+    points = real_points.OwnedPoints(xyz, np.full(5, STATIC, np.int32), np.zeros(5, np.uint8), 0.4)
+    log = SimpleNamespace(placed=lambda points, _: points.xyz)
+    seen, colors = real_points.seen_by(log, points, shown, 0.0)
+    assert seen.tolist() == [True, True, False, False, False]
+    assert colors[0].tolist() == [77, 77, 77] and not colors[2].any()
+
+
+def test_the_mask_takes_the_answer_of_the_nearest_point_nearby():
+    mask = real_points.spread(np.array([True, False]), np.array([5, 5]), np.array([10, 20]), (11, 100))
+    assert mask[5, 8:14].all() and not mask[5, 16:24].any()
+    assert not mask[5, 40:].any()  # no point is near
+
+
+def test_a_color_map_is_found_under_noise_and_outliers():
+    rng = np.random.default_rng(0)
+    true = rng.uniform(0.1, 0.8, (20_000, 3))
+    given = true + rng.normal(0, 0.04, true.shape)
+    wanted = true * [0.8, 1.0, 1.1] + [0.1, 0.0, -0.05] + rng.normal(0, 0.04, true.shape)
+    wanted[:2000] = rng.uniform(0.1, 0.9, (2000, 3))
+    found = real_points.color_map(*((np.clip(c, 0, 1) * 255).round().astype(np.uint8) for c in (given, wanted)))
+    assert found.gain == pytest.approx((0.8, 1.0, 1.1), abs=0.03)
+    assert found.offset == pytest.approx((0.1, 0.0, -0.05), abs=0.02)
+    loose = [rng.uniform(90, 110, (1000, 3)).astype(np.uint8) for _ in range(2)]
+    loosely = real_points.color_map(loose[0], (loose[1] * 1.5).astype(np.uint8))
+    assert loosely.gain == pytest.approx((1.5, 1.5, 1.5), abs=0.03) and loosely.offset == (0, 0, 0)
+    few = real_points.color_map(np.full((10, 3), 50, np.uint8), np.full((10, 3), 90, np.uint8))
+    assert (few.gain, few.pairs) == ((1.0, 1.0, 1.0), 10)
+
+
+def sight(maps, *, depth=None, rgb=None, semantics=None, photo=None):
+    target = real_truth.Target("front", None, VIEW, maps, real_points.ColorMap())
+    rgb = torch.full((3, 30, 40), 0.5) if rgb is None else rgb
+    return real_measure.Sight(target, rgb, depth, semantics, photo, None)
+
+
+def test_columns_by_hand():
+    depth, dynamic = np.zeros((30, 40), np.float32), np.zeros((30, 40), np.uint8)
+    depth[3, 4], depth[6, 7], dynamic[6, 7] = 10.0, 20.0, 1
+    color = np.full((30, 40, 3), 102, np.uint8)  # 0.4
+    colored = (depth > 0).astype(np.uint8)
+    seen = sight(
+        {"depth": depth, "dynamic": dynamic, "color": color, "colored": colored}, depth=torch.full((1, 30, 40), 12.0)
+    )
+    value = lambda name: real_measure.COLUMNS[name].close(real_measure.COLUMNS[name].of(seen))  # noqa: E731
+    assert value("abs_rel") == pytest.approx((0.2 + 0.4) / 2)
+    assert (value("abs_rel_static"), value("abs_rel_dynamic")) == (pytest.approx(0.2), pytest.approx(0.4))
+    assert (value("rmse_static"), value("rmse_dynamic")) == (pytest.approx(2.0), pytest.approx(8.0))
+    assert (value("delta1_static"), value("delta1_dynamic")) == (1.0, 0.0)
+    assert (value("point_abs_static"), value("point_psnr_static")) == (pytest.approx(0.1), pytest.approx(20.0))
+    photo = torch.full((3, 30, 40), 0.5)
+    photo[:, :10] = 0.6
+    upper = sight({}, photo=photo)
+    assert real_measure.COLUMNS["psnr_upper"].of(upper)[0] == pytest.approx(20.0, abs=1e-4)
+    assert real_measure.COLUMNS["psnr_dynamic"].of(upper) is None
+    classes = np.full((30, 40), 255, np.uint8)
+    classes[0, :4] = ID["road"]
+    made = torch.full((30, 40), ID["road"])
+    made[0, 3] = ID["car"]
+    labelled = sight({"classes": classes}, semantics=made)
+    assert real_measure.COLUMNS["accuracy"].close(real_measure.COLUMNS["accuracy"].of(labelled)) == 0.75
+
+
+def test_comparisons_are_differences_or_ratios():
+    assert real_measure.compared_text("psnr", 20.5, 20.0) == "+0.50"
+    assert real_measure.compared_text("perceptual", 0.09, 0.1) == "x0.900"
+    assert real_measure.compared("psnr", "none", 20.0) is None
+
+
+# ---- the truth, scored as if it were a method --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def exact(city, tmp_path_factory):
+    """A function that scores the exact views of the city under a protocol."""
+
+    def of(name, classes=None):
+        out = tmp_path_factory.mktemp(name)
+        scene, protocol = read_scene(city), PROTOCOLS[name]
+        split = SPLITS[protocol.split]
+        held = real_protocols.held_out(scene, split, ())
+        job = real.SplitJob(out, city, split, (), (), FitConfig(), SynthesizeConfig(), (), False)
+        real.write_seen(job, scene, held)
+        cameras = real._asked_cameras(job, scene, held)
+        world = CityWorld.from_source(scene.source)
+        for path in render.trajectories(scene, RenderConfig(cameras=cameras, shifts_m=split.shifts_m)):
+            with ObservationWriter(out / "views" / path.name, path.name, "truth") as writer:
+                for view in path.views:
+                    writer.add(world.observation(view, world.render(view)))
+        truth = real_truth.write_targets(protocol, city, job.scene, held.frames, cameras, out / "truth")
+        scored = real_measure.write_scores(protocol, city, truth, out / "views", out / "score")
+        return store.read_json(scored / "metrics.json")["mean"], real_truth.read_targets(truth)
+
+    return of
+
+
+def test_exact_views_are_right_on_held_out_frames(exact):
+    found, targets = exact("gap-3")
+    assert (
+        found["psnr"] > 45 and found["ssim"] > 0.99 and found["perceptual"] < 0.01 and found["abs_rel"] < 0.06
+    )  # points lie beside pixel centres
+    assert found["psnr_dynamic"] > 45 and found["psnr_upper"] > 45
+    assert targets.facts["views"] == {"front": 3, "front_left": 3}
+
+
+def test_exact_views_are_right_for_a_camera_that_was_never_shown(exact):
+    found, targets = exact("camera")
+    assert list(targets.facts["views"]) == ["front_left"] and targets.facts["views"]["front_left"] == 3
+    assert 0.02 < targets.facts["seen_share"]["front_left"] < 0.9
+    assert (
+        found["psnr_seen"] > 25 and found["abs_rel_seen"] < 0.03
+    )  # a colour map near the identity, fitted to noisy pairs
+    assert targets.color_maps["front_left"].gain == pytest.approx((1, 1, 1), abs=0.12)
+
+
+def test_exact_views_are_right_beside_the_recorded_path(exact):
+    found, targets = exact("lidar")
+    assert targets.facts["views"] == {"2 m": 12, "3 m": 12}
+    assert found["abs_rel_static"] < 0.05 and found["delta1_static"] > 0.97
+    assert found["point_psnr_static"] > 20 and found["point_abs_static"] < 0.06
+
+
+# ---- the command -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made(city, tmp_path_factory):
+    out = tmp_path_factory.mktemp("real")
+    config = BenchConfig(methods=("nearest_fill", "street_gaussians"), iterations=10, processes=1)
+    return real.run(config, [city], out), config
+
+
+def test_the_command_compares_methods_under_every_protocol(made, city):
+    out, _ = made
+    document = store.read_json(out / "bench.json")
+    assert list(document["protocols"]) == ["gap-1", "gap-3", "gap-5", "camera", "lidar", "classes"]
+    for name in ("gap-1", "gap-3", "camera", "lidar"):
+        values = document["protocols"][name]["logs"]["city"]["values"]
+        assert set(values) == {"nearest_fill", "street_gaussians"}
+        against = document["protocols"][name]["against"]["nearest_fill"]
+        assert against and "street_gaussians" not in document["protocols"][name]["against"]
+    gap = document["protocols"]["gap-1"]
+    mean = gap["logs"]["city"]["values"]["nearest_fill"]["mean"]["psnr"]
+    assert gap["against"]["nearest_fill"]["psnr"] == pytest.approx(
+        mean - gap["pooled"]["street_gaussians"]["psnr"], abs=1e-5
+    )
+    assert "too few" in document["protocols"]["gap-5"]["left_out"]["city"]
+    assert "no classes of LiDAR points" in document["protocols"]["classes"]["left_out"]["city"]
+    assert document["logs"][0]["digest"] == store.digest(city)
+    text = (out / "bench.md").read_text()
+    assert "city is left out: the log has no classes of LiDAR points" in text and "## gap-3" in text
+    page = (out / "page.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 3 * (2 + 2 + 1 + 2) and 'src="city' not in page
+
+
+def test_finished_work_is_reused_and_a_method_can_be_added(made, city):
+    out, config = made
+    watched = [
+        out / "city" / "gap-1" / "fit" / "street_gaussians" / "run.json",
+        out / "city" / "truth" / "lidar" / "run.json",
+    ]
+    before = [path.stat().st_mtime_ns for path in watched]
+    added = ("street_gaussians", "mudg_r+renders")
+    more = dataclasses.replace(
+        config, methods=added, protocols=("gap-1", "gap-3"), model="embedded-tiny", variant=("rough=densify.kind:none,method:gs3d",)
+    )  # fmt: skip
+    real.run(more, [city], out)
+    assert [path.stat().st_mtime_ns for path in watched] == before
+    document = store.read_json(out / "bench.json")
+    assert [row["name"] for row in document["methods"]] == ["street_gaussians", "mudg_r+renders", "rough"]
+    assert isinstance(document["protocols"]["gap-3"]["against"]["mudg_r+renders"]["psnr"], float)
+
+
+def test_classes_of_points_are_scored_where_a_log_has_them(city, tmp_path, monkeypatch):
+    scene = read_scene(city)
+    monkeypatch.setattr(
+        real_points,
+        "lidar_point_classes",
+        lambda _, sweep: np.full(len(read_points(scene, sweep).xyz), ID["road"], np.uint8),
+    )
+    config = BenchConfig(methods=("nearest_fill",), protocols=("classes",), processes=1)
+    document = store.read_json(real.run(config, [city], tmp_path / "out") / "bench.json")
+    found = document["protocols"]["classes"]["pooled"]["nearest_fill"]
+    assert 0.05 < found["accuracy"] < 0.95 and found["miou"] == pytest.approx(found["accuracy"], abs=1e-6)
+
+
+def test_a_dataset_log_is_imported_with_the_settings_of_the_command(city, tmp_path):
+    log = write_custom.write_log(read_scene(city), tmp_path / "drive")
+    config = BenchConfig(methods=("nearest_fill",), protocols=("gap-1",), frames="0:4", resolution="48", processes=1)
+    out = real.run(config, [log], tmp_path / "out")
+    facts = store.read_json(out / "bench.json")["logs"][0]
+    assert {(tuple(c["size_px"]), c["frames"]) for c in facts["cameras"].values()} == {((48, 32), 4)}
+    assert not read_scene(out / "drive" / "scene").frames_in("test")
+    assert (out / "drive" / "gap-1" / "annotate" / "scene.json").is_file()  # the log has no labels
+    with pytest.raises(UsageError):
+        real.run(dataclasses.replace(config, frames="0:5"), [log], out)
+
+
+def test_other_folders_methods_and_names_are_refused(city, tmp_path):
+    with pytest.raises(UsageError, match="unknown method"):
+        real.run(BenchConfig(methods=("nerf",)), [city], tmp_path / "out")
+    with pytest.raises(UsageError, match="unknown protocol"):
+        real.run(BenchConfig(protocols=("shift",)), [city], tmp_path / "out")
+    with pytest.raises(UsageError, match="no log"):
+        real.run(BenchConfig(), [], tmp_path / "out")
+    with pytest.raises(UsageError, match="same name"):
+        real.run(BenchConfig(), [city, city], tmp_path / "out")
+    with pytest.raises(UsageError, match="taken as it is"):
+        real.run(BenchConfig(frames="0:2"), [city], tmp_path / "out")
+    store.write_json(tmp_path / "other" / "bench.json", {"schema": 1, "methods": []})
+    with pytest.raises(UsageError, match="do not belong"):
+        real.run(BenchConfig(), [city], tmp_path / "other")
+
+
+def test_pooled_values_leave_out_logs_without_a_number():
+    protocol = PROTOCOLS["gap-1"]
+    values = lambda psnr: {"mean": dict.fromkeys(protocol.columns, "none") | {"psnr": psnr}, "places": {}}  # noqa: E731
+    logs = [
+        {
+            "log": name,
+            "protocols": {"gap-1": {"values": {"street_gaussians": values(a), "mudg_s": values(b)}, "facts": {}}},
+        }
+        for name, a, b in (("one", 20.0, 21.0), ("two", 22.0, "none"))
+    ]
+    rows = [{"name": "street_gaussians"}, {"name": "mudg_s"}]
+    found = real_tables.document(logs, rows, [protocol], {})["protocols"]["gap-1"]
+    assert found["pooled"]["street_gaussians"]["psnr"] == 21.0 and found["pooled"]["mudg_s"]["psnr"] == 21.0
+    assert found["pooled"]["mudg_s"]["ssim"] == "none" and found["against"]["mudg_s"]["ssim"] is None
+
+
+def test_a_view_that_a_method_lacks_is_an_error(city, tmp_path):
+    from mudg.base.errors import InputError
+
+    fused = fuse.run(FuseConfig(), city, tmp_path / "fuse")
+    paths = render.trajectories(read_scene(city), RenderConfig(cameras=("front",), shifts_m=(0.0,)))
+    views = write_fill(city, fused, paths, tmp_path / "views")
+    finder = real_measure._Finder(views)
+    assert isinstance(finder.at(paths[0].views[1]), Observation)
+    with pytest.raises(InputError, match="lacks a view"):
+        finder.at(dataclasses.replace(paths[0].views[1], time_s=9.0))
