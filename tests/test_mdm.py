@@ -12,6 +12,7 @@ from mudg.core import noise
 from mudg.models import diffusion
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import codec, files, network
+from mudg.models.mdm import extended as extending
 from mudg.models.mdm import model as mdm
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig
@@ -80,15 +81,15 @@ def test_sample_shapes_ranges_and_determinism():
 
 def test_a_model_with_a_new_refiner_has_the_same_denoiser_and_codec():
     small = randomised(PLAIN)
-    big = mdm.extended(small, TINY)
+    big = extending.extended(small, TINY)
     state = big.state_dict()
     assert all(torch.equal(value, state[name]) for name, value in small.state_dict().items())
     assert any(name.startswith("refiner.") for name in state)
     refined = randomised(TINY)
-    again = mdm.extended(refined, replace(TINY, area_px=100)).state_dict()
+    again = extending.extended(refined, replace(TINY, area_px=100)).state_dict()
     assert all(torch.equal(value, again[name]) for name, value in refined.state_dict().items())
     with pytest.raises(UsageError, match="another kind"):
-        mdm.extended(small, replace(TINY, widths=(16, 32)))
+        extending.extended(small, replace(TINY, widths=(16, 32)))
 
 
 def test_given_classes_are_copied_where_they_are_known():

@@ -180,13 +180,9 @@ def test_modalities_have_no_eight_bit_step(model):
     back = (image.mean(1, keepdim=True) + 1) * 50
     assert torch.allclose(back, depth.clamp(0, 100), atol=1e-4)
     ids = torch.arange(19).repeat(2).view(1, 2, 19)
-    made, margin = nearest_class(codec.semantic_image(ids))
-    assert torch.equal(made, ids)
-    assert torch.allclose(margin, torch.ones_like(margin), atol=1e-3)
-    between = (
-        codec.semantic_image(torch.tensor([[[0]]])) + codec.semantic_image(torch.tensor([[[palette.ID["pole"]]]]))
-    ) / 2
-    assert float(nearest_class(between)[1].max()) < 1e-3
+    assert torch.equal(nearest_class(codec.semantic_image(ids)), ids)
+    mixed = 0.6 * codec.semantic_image(torch.tensor([[[0]]])) + 0.4 * codec.semantic_image(torch.tensor([[[palette.ID["pole"]]]]))
+    assert nearest_class(mixed).tolist() == [[[0]]]
     assert torch.equal(codec.semantic_image(torch.tensor([[[255]]])), torch.full((1, 3, 1, 1), -1.0))
 
 

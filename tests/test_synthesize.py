@@ -1,26 +1,26 @@
 """synthesize: every frame is made, windows join, interruptions leave no trace, sizes fit."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 from fit_settings import fit_config
-from scipy import ndimage
 from toy_scene import ToyStreet
 
 from mudg import cli
+from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
 from mudg.core import trajectory
-from mudg.data.clips.condition import ConditionRules, build_conditions
-from mudg.data.cloudfile import read_fused
 from mudg.data.observations import list_observation_sets, read_observations
 from mudg.data.scene import read_scene
 from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.extended import extended
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import fit, fuse, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
+from mudg.stages.fitting.planes import FAR_M, render_planes
+from mudg.stages.fitting.rendering import render_condition
 
 FRAMES = 7
 
@@ -186,29 +186,64 @@ def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, cap
     assert cli.main([*words, "--sampler", "ddim", "--eta", "0.5"]) == 3  # on to the next fault: no such scene
 
 
-def test_a_fitted_scene_fills_what_no_point_reaches(world, tmp_path):
-    """Views change where nothing was measured, and the scene's class stands there."""
+@pytest.fixture(scope="module")
+def fitted(world, tmp_path_factory):
+    """A short fit of the street, and a model that takes renders and has a finisher."""
+    root, _ = world
+    folder = tmp_path_factory.mktemp("fitted")
+    settings = fit_config(method="street_gaussians", iterations=4, start__gaussians=900)
+    scene = fit.run(settings, root / "scene", root / "fused", folder / "fit")
+    before = files.load(root / "model")
+    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+    files.save(extended(before, grown), folder / "model", "", {})
+    return scene, folder / "model"
+
+
+def test_renders_of_a_fitted_scene_as_planes(world, fitted):
+    root, _ = world
+    view = trajectory.shifted(read_scene(root / "scene"), "front", 1.0).views[2].resized(96, 64)
+    model = fit.load_model(fitted[0])
+    shown, made = render_planes(model, view), render_condition(model, view)
+    solid = torch.isfinite(made.depth)
+    assert shown.color.shape == (3, 64, 96) and shown.semantics.dtype == torch.uint8
+    assert torch.equal(shown.depth[0][solid], made.depth[solid].clamp(max=FAR_M))
+    assert bool((shown.depth[0][~solid] == FAR_M).all())
+    assert torch.equal(shown.alpha[0][solid], made.alpha[solid]) and not bool(shown.alpha[0][~solid].any())
+    assert bool((shown.certainty <= shown.alpha).all()) and float(shown.certainty.min()) >= 0
+    assert bool(solid.any())
+    unmeasured = render_planes(replace(model, certainty=None) if is_dataclass(model) else without_certainty(model), view)
+    assert torch.equal(unmeasured.certainty, 0.5 * unmeasured.alpha)
+
+
+def without_certainty(model):
+    """The scene as a version that measured no certainty would have fitted it."""
+    model.certainty = None
+    return model
+
+
+def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkeypatch):
+    """Its renders reach the model, and full-size views come from the finisher."""
     root, config = world
-    fitted = fit.run(
-        fit_config(method="street_gaussians", iterations=4, start__gaussians=900), root / "scene", root / "fused",
-        tmp_path / "fit",
-    )  # fmt: skip
-    scene, cloud = read_scene(root / "scene"), read_fused(root / "fused")
-    view = trajectory.shifted(scene, "front", 1.0).views[2]
-    rules = ConditionRules(96, 64)
-    model = fit.load_model(fitted)
-    plain = build_conditions(cloud, scene.tracks, [view], [], rules)[0]
-    helped = build_conditions(cloud, scene.tracks, [view], [], rules, beyond=partial(synthesize.rendered_points, model))[0]
-    assert bool(helped.valid[plain.valid].all())
-    assert int(helped.valid.sum()) > int(plain.valid.sum())
-    near = torch.from_numpy(ndimage.binary_dilation(plain.valid[0, 0].numpy(), iterations=rules.measured_reach_px))
-    new = helped.valid[0, 0] & ~plain.valid[0, 0]
-    assert not bool((new & near).any())
-    shown = synthesize.rendered_points(model, view.resized(96, 64))
-    assert torch.equal(helped.depth[0, 0][new], shown.depth[new])
-    assert torch.equal(helped.semantics[0, 0][new], shown.semantics[new])
-    run = lambda name, **more: synthesize.run(  # noqa: E731
-        replace(config, **more), root / "scene", root / "fused", tmp_path / name, fitted=fitted
-    )
-    usual = frames_of(made(world, tmp_path / "plain") / "front_shift+1.0")
-    assert not all(torch.equal(a.rgb, b.rgb) for a, b in zip(usual, frames_of(run("helped") / "front_shift+1.0")))
+    scene, model = fitted
+    given, finished = [], []
+    sample, finish = MDM.sample, MDM.finish
+    monkeypatch.setattr(MDM, "sample", lambda self, condition, *rest: (given.append(condition), sample(self, condition, *rest))[1])
+    monkeypatch.setattr(MDM, "finish", lambda self, clip, fine, **more: (finished.append(fine), finish(self, clip, fine, **more))[1])
+    settings = replace(config, model=str(model), full_size=True, steps=1)
+    out = synthesize.run(settings, root / "scene", root / "fused", tmp_path / "out", fitted=scene)
+    made = frames_of(out / "front_shift+1.0")
+    assert len(made) == FRAMES and made[0].rgb.shape == (3, 64, 96)
+    assert all(c.renders is not None and c.renders.color.shape[-2:] == (32, 48) for c in given)
+    assert all(c.renders is not None and c.renders.color.shape[-2:] == (64, 96) for c in finished)
+    assert len(finished) == len(given) > 1
+    sky = made[0].semantics == palette.ID["sky"]
+    assert bool((torch.isnan(made[0].depth[0]) | ~sky | finished[0].valid[0, 0]).all())
+    plain = synthesize.run(settings, root / "scene", root / "fused", tmp_path / "plain")  # works without a fit, too
+    assert not torch.equal(made[2].rgb, frames_of(plain / "front_shift+1.0")[2].rgb)
+
+
+def test_a_model_without_renders_takes_no_fitted_scene(world, fitted, tmp_path):
+    root, config = world
+    with pytest.raises(UsageError, match="not trained with renders"):
+        synthesize.run(config, root / "scene", root / "fused", tmp_path / "out", fitted=fitted[0])
+    assert not (tmp_path / "out").exists()

@@ -85,7 +85,6 @@ def test_uniform_classes_survive():
         with torch.no_grad():
             made = decoded(codec, semantics=codec.encode_semantics(ids))
         assert torch.equal(made.semantics, ids)
-        assert float(made.margin.min()) > 0.5
 
 
 def test_a_single_frame_without_leading_axes_is_fine():

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mudg.base.types import Camera, Clip, Condition, View
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import Camera, Clip, Condition, FinePatch, View
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_city import HELD_OUT
 from mudg.stages.config import LearnConfig
@@ -34,14 +35,34 @@ def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
     camera = Camera("front", width, height, 40.0, 40.0, width / 2, height / 2)
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(WINDOW))
     seen = torch.where(valid, rgb, torch.rand(rgb.shape, generator=generator))
-    condition = Condition(views, seen, torch.where(valid, depth, 20.0).clamp(max=100), valid, rgb[0], valid, rgb)
+    alpha = (depth < 500).float()
+    renders = RenderPlanes((rgb + 0.05).clamp(max=1), depth, alpha, 0.5 * alpha, ids[:, None].to(torch.uint8))
+    condition = Condition(views, seen, torch.where(valid, depth, 20.0).clamp(max=100), valid, rgb[0], valid, rgb, renders=renders)
     return Clip(condition, rgb, depth, depth < 500, ids)
+
+
+def with_patch(clip: Clip, row: int = 6, column: int = 10, side: int = 12, scale: int = 2) -> Clip:
+    """The clip with a patch that shows a square of it `scale` times finer (and no more sharply)."""
+
+    def finer(x: torch.Tensor) -> torch.Tensor:
+        cut = x[..., row : row + side, column : column + side]
+        return cut.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
+
+    c = clip.condition
+    camera = Camera("front", side * scale, side * scale, 40.0 * scale, 40.0 * scale, side * scale / 2, side * scale / 2)
+    assert c.renders is not None
+    names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
+    given = {name: finer(tensor) for name in names if (tensor := getattr(c, name)) is not None}
+    views = tuple(View(camera, v.world_from_cam, v.time_s) for v in c.views)
+    condition = Condition(views=views, **given, renders=c.renders.map(finer))
+    own = {name: finer(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
+    return replace(clip, fine=FinePatch(Clip(condition, **own), row, column, scale))
 
 
 def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, points: bool = False) -> Path:
     """Three shards to train on and one to score, two clips each; `points`: of points alone, and one to score."""
     for number in [*range(3), HELD_OUT]:
-        made = [made_up_clip(number * 7 + k, width, height) for k in range(2)]
+        made = [with_patch(made_up_clip(number * 7 + k, width, height)) for k in range(2)]
         made = [points_alone(clip) for clip in made[: 1 if number == HELD_OUT else 2]] if points else made
         made = [replace(clip, shift_m=shift) for clip, shift in zip(made, (2.0, 0.0), strict=False)]
         clip_shards.write_shard(folder, number, clip_shards.pack_clips(made))
@@ -51,7 +72,7 @@ def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, point
 def points_alone(clip: Clip) -> Clip:
     """The clip with the published system's condition: 0 where nothing was seen, nothing warped in."""
     c = clip.condition
-    return replace(clip, condition=Condition(c.views, c.color * c.valid, c.depth * c.valid, c.valid, c.reference))
+    return replace(clip, condition=Condition(c.views, c.color * c.valid, c.depth * c.valid, c.valid, c.reference), fine=None)
 
 
 def with_settings(config: LearnConfig, **changes: Any) -> LearnConfig:
@@ -78,7 +99,7 @@ def tiny(clips: Path | str, **changes: Any) -> LearnConfig:
         LearnConfig(codec=LearnCodec(steps=3, batch=2, fit_batches=1)), cities=3, first_cities=2, clips_per_city=2, held_out=1,
         score_watched=1, clips=str(clips), workers=0, precision="float32", width=WIDTH, height=HEIGHT, window=WINDOW,
         widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), refine_widths=(8, 16),
-        refine_blocks=(1, 1), steps=4, batch_frames=4, full_window_share=0.5, warmup_steps=1, checkpoint_every=2, score_every=100,
-        score_steps=1,
+        refine_blocks=(1, 1), finish_widths=(8, 16), finish_blocks=(1, 1), steps=4, batch_frames=4, full_window_share=0.5,
+        warmup_steps=1, checkpoint_every=2, score_every=100, score_steps=1,
     )  # fmt: skip
     return with_settings(config, **changes)

@@ -66,7 +66,8 @@ class GeneratedClip:
 
     rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1]. `latents`:
     modality -> [T,C,h,w], to be handed to the next window as `known`. `depth_fits`: one per frame, how depth was brought to
-    the measured scale; empty without `SampleRequest.align`.
+    the measured scale; empty without `SampleRequest.align`. `log_error`: of small models with a refiner, logarithm of the expected
+    absolute error of colour codes (-1 to 1) f32[T,1,H,W], for `MDM.finish`.
     """
 
     rgb: Tensor
@@ -75,6 +76,7 @@ class GeneratedClip:
     confidence: Tensor
     latents: dict[Modality, Tensor] = field(repr=False)
     depth_fits: tuple[DepthFit, ...] = ()
+    log_error: Tensor | None = field(default=None, repr=False)
 
 
 def check_image_size(height: int, width: int, multiple: int) -> None:

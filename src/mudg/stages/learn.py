@@ -41,7 +41,7 @@ from mudg.stages.learning import codec as learn_codec
 from mudg.stages.learning import parallel
 from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.clips import class_weights, draw_clips
-from mudg.stages.learning.models import Model, draw_weights, freeze, kind_of, starting_model
+from mudg.stages.learning.models import Model, draw_weights, freeze, hold_finisher, kind_of, starting_model
 from mudg.stages.learning.parallel import SAME_SIGNAL_S, Ranks, Spread, agreed_terms
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.state import TrainingState, mean_of
@@ -119,6 +119,8 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
     bf16 = choose_bf16(config.precision)
     folder = Path(config.data.clips) if config.data.clips else out / "clips"
     about_data = ""
+    if isinstance(model, MDM) and not model.config.renders:
+        config = learn_clips.without_renders(config)
     making: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
     if config.data.scenes:
         sources = [from_log.log_source(text) for text in config.data.scenes]
@@ -142,6 +144,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
                 part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
+        hold_finisher(model, fresh, learn_clips.have_patches(folder))
         weights = _train_network(model, config, directory, folder, bf16, ranks)
 
     def finish() -> None:

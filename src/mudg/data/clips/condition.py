@@ -32,7 +32,8 @@ from torch.nn import functional
 
 from mudg.base import geometry, palette
 from mudg.base.errors import InputError
-from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, Track, View
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
@@ -254,7 +255,8 @@ def build_conditions(
         small_renders = RenderPlanes(
             reduced(renders.color), picked(renders.depth), reduced(renders.alpha), reduced(renders.certainty), picked(renders.semantics)
         )
-    own = [DrawnCloud(cloud, tracks, rules, _in_order(small_renders)).look(view) for view in small]
+    small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders))
+    own = [small_points.look(view) for view in small]
     own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
     condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
                           reduced(backdrop), picked(ids), picked(far_ids), small_renders)  # fmt: skip

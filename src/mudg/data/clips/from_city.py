@@ -223,7 +223,7 @@ def make_clips(
         if rules.fitted:
             place = seeds.numpy_rng(rules.seed, city * 16 + number, "patch")
             full = clip_from_truth(fine, [log.truth(view) for view in views])
-            clip = replace(clip, fine=cut_patch(full, scale, PATCH_PX, place))
+            clip = replace(clip, fine=cut_patch(full, scale, patch_side(size), place))
         clips.append(clip)
     return clips
 
@@ -236,6 +236,11 @@ def _split_moments(
     chosen = set(times[int(rng.integers(gap)) :: gap])
     kept = tuple(photo for photo in recorded if photo.view.time_s in chosen)
     return kept, tuple(photo for photo in recorded if photo.view.time_s not in chosen)
+
+
+def patch_side(size: tuple[int, int]) -> int:
+    """Side of the patches of clips of a size, in pixels of the patch: the same at all scales, so that a step can mix them."""
+    return min(PATCH_PX, 2 * min(size)) // 12 * 12
 
 
 def cut_patch(full: Clip, scale: int, side_px: int, rng: np.random.Generator) -> FinePatch:

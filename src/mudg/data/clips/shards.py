@@ -33,7 +33,8 @@ from torch import Tensor
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError
-from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, View
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import Camera, Clip, Condition, FinePatch, View
 
 FAR_M = 1000.0
 FINE = "fine_"

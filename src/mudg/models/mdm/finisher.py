@@ -20,8 +20,6 @@ from torch.nn import functional
 from mudg.models.mdm.codec import ChannelNorm, DecoderBlock
 from mudg.models.mdm.network import ConditionPixels, one_hot
 
-MARGIN_PX = 48
-"""More than the receptive field on each side for up to two blocks per level; a multiple of `STRIDE_PX`."""
 TILE_PX = 320
 """Longest side of a tile's core."""
 STRIDE_PX = 4
@@ -102,6 +100,11 @@ class Finisher(nn.Module):
         self.leave = nn.Conv2d(fine, sum(self.SIZES), 1)
         self.reset()
 
+    @property
+    def margin_px(self) -> int:
+        """More than what a pixel of the result depends on at either side; a multiple of `STRIDE_PX`."""
+        return 8 * (len(self.before) + len(self.middle)) + STRIDE_PX
+
     def reset(self) -> None:
         """Output that takes most of what was generated and adds nothing, whatever the other weights are."""
         starts = [torch.tensor(part).repeat_interleave(4) for part in self.STARTS]
@@ -155,9 +158,9 @@ def class_scores(finished: Finished) -> Tensor:
 def spans(length: int, longest: int = TILE_PX) -> list[tuple[int, int]]:
     """Cut 0..length into pieces of about equal size, none longer than `longest` (up to `STRIDE_PX`), with borders at multiples of
     `STRIDE_PX`."""
-    count = -(-length // longest)
+    count = -(-length // max(longest, STRIDE_PX))
     borders = [round(number * length / count / STRIDE_PX) * STRIDE_PX for number in range(count)] + [length]
-    return list(zip(borders, borders[1:], strict=False))
+    return [(first, last) for first, last in zip(borders, borders[1:], strict=False) if first < last]
 
 
 def finish_in_tiles(finisher: Finisher, made: Made, given: ConditionPixels, tile_px: int = TILE_PX) -> Made:
@@ -170,11 +173,15 @@ def finish_in_tiles(finisher: Finisher, made: Made, given: ConditionPixels, tile
     frames, size = len(given.color), (int(given.color.shape[-2]), int(given.color.shape[-1]))
     small = made.rgb.shape[-2:]
     scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=given.color.device)
+    margin = finisher.margin_px
     whole = Made(*(torch.empty(frames, c, *size, dtype=t, device=given.color.device) for c, t in (
         (3, torch.float32), (1, torch.float32), (1, torch.uint8), (1, torch.float32))))  # fmt: skip
     for top, bottom in spans(size[0], tile_px):
         for left, right in spans(size[1], tile_px):
-            rows, columns = _with_margin(top, bottom, size[0]), _with_margin(left, right, size[1])
+            rows, columns = (
+                (max(0, first - margin), min(length, last + margin))
+                for first, last, length in ((top, bottom, size[0]), (left, right, size[1]))
+            )
             part = _padded(given.crop(slice(*rows), slice(*columns)))
             reach = (rows[0], rows[0] + part.color.shape[-2]), (columns[0], columns[0] + part.color.shape[-1])
             found = finisher(made.enlarged(size, *reach), part, frames, scale)
@@ -184,10 +191,6 @@ def finish_in_tiles(finisher: Finisher, made: Made, given: ConditionPixels, tile
             whole.ids[target] = found.shares.argmax(1, keepdim=True).to(torch.uint8)[core]
             whole.log_error[target] = found.log_error[core]
     return whole
-
-
-def _with_margin(first: int, last: int, length: int) -> tuple[int, int]:
-    return max(0, first - MARGIN_PX), min(length, last + MARGIN_PX)
 
 
 def _padded(given: ConditionPixels) -> ConditionPixels:

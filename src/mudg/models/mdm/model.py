@@ -24,7 +24,8 @@ from torch.nn import functional
 
 from mudg.base import palette, seeds
 from mudg.base.errors import UsageError
-from mudg.base.types import Clip, Condition, RenderPlanes
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import Clip, Condition
 from mudg.core import losses, noise
 from mudg.core.align import align_depth
 from mudg.core.noise import Schedule
@@ -438,7 +439,7 @@ class MDM(nn.Module):
         self.check_request(request)
         encoded = self.encode_condition(condition)
         drawn: list[dict[Modality, Tensor]] = []
-        change = torch.zeros_like(encoded.seen["rgb"])
+        change, log_error = torch.zeros_like(encoded.seen["rgb"]), None
         for number in range(request.n_samples):
             latents, moved = self._denoise(encoded, request, number)
             change = torch.maximum(change, moved)
@@ -452,7 +453,8 @@ class MDM(nn.Module):
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
                 made = self._made(self.refine(latents, encoded.pixels, len(condition.views)))
-                decoded, confidence = self._decoded(made), torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR)
+                decoded, log_error = self._decoded(made), made.log_error
+                confidence = torch.exp(-_expected_error(log_error) / TRUSTED_ERROR)
                 if request.n_samples > 1:
                     confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
         depth, fits = decoded.depth, []
@@ -460,7 +462,7 @@ class MDM(nn.Module):
             depth, fits = align_depth(depth, condition.depth, condition.valid)
         confidence = confidence * depth_agreement(depth, condition)
         depth = settle_depth(depth, condition, self.config.codec.far_m)
-        return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits))
+        return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits), log_error)
 
     @torch.no_grad()
     def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip:
@@ -469,20 +471,21 @@ class MDM(nn.Module):
         Measured depth replaces generated depth, as in `sample`; latents and depth fits stay those of the clip.
 
         Raises:
-            UsageError: the model has no finisher.
+            UsageError: the model has no finisher, or `clip` does not come from `sample`.
         """
-        if self.finisher is None:
-            raise UsageError("this model has no finisher", where="MDM.finish")
+        if self.finisher is None or clip.log_error is None:
+            raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
         given = self._pixels_of(_Stacked.of([fine]))
-        log_error = (-clip.confidence.clamp(min=1e-3).log() * TRUSTED_ERROR * 2).clamp(min=1e-4).log()
         code = self.codec.linear_depth_code(clip.depth)
-        made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), log_error)
+        made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             made = finish_in_tiles(self.finisher, made, given)
         decoded = self._decoded(made)
         confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
         depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
-        return replace(clip, rgb=decoded.rgb, depth=depth, semantics=decoded.semantics, confidence=confidence)
+        return replace(
+            clip, rgb=decoded.rgb, depth=depth, semantics=decoded.semantics, confidence=confidence, log_error=made.log_error
+        )  # fmt: skip
 
     def _decoded(self, made: Made) -> Decoded:
         """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made."""
@@ -556,44 +559,3 @@ def _no_render(condition: Condition) -> RenderPlanes:
     nothing = torch.zeros_like(condition.depth)
     unknown = torch.full_like(condition.valid, palette.UNLABELLED, dtype=torch.uint8)
     return RenderPlanes(condition.color, condition.depth, nothing + NO_RENDER, nothing, unknown)
-
-
-def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size they were trained at."""
-    plain = {"refine_widths": (), "refine_blocks": (), "finish_widths": (), "finish_blocks": (), "renders": False, "area_px": 0}
-    without = lambda config: replace(config, **plain)  # noqa: E731
-    return without(one) == without(other)
-
-
-def extended(before: MDM, config: MDMConfig) -> MDM:
-    """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape. For
-    continuing the training of an earlier, plainer model. What new inputs weigh is 0, so they change nothing at first.
-
-    Raises:
-        UsageError: the two differ in more than the refiner, the use of renders and the size trained at.
-    """
-    if not same_denoiser(before.config, config) or (before.config.renders and not config.renders):
-        raise UsageError(
-            "the model to continue from is of another kind", expected=str(config), got=str(before.config),
-            remedy="give its widths, blocks, attention, patch, window and renders",
-        )  # fmt: skip
-    model = MDM(config)
-    state = model.state_dict()
-    for name, old in before.state_dict().items():
-        if name in state and state[name].shape == old.shape:
-            state[name] = old
-        elif name in state and name.removesuffix(".weight").removesuffix(".bias") in _WIDENED:
-            state[name] = _widened(old, state[name], zero=name.startswith(_WIDENED[:2]))
-    model.load_state_dict(state)
-    return model
-
-
-_WIDENED = ("net.enter", "refiner.enter", "net.leave", "refiner.leave")
-"""Layers that have further inputs or outputs, behind the others, in a model that uses renders."""
-
-
-def _widened(old: Tensor, new: Tensor, zero: bool) -> Tensor:
-    """A larger tensor with `old` in its first places, and in the others those of `new`, or 0."""
-    made = torch.zeros_like(new) if zero else new.clone()
-    made[tuple(slice(size) for size in old.shape)] = old
-    return made

@@ -212,26 +212,20 @@ class Autoencoder(nn.Module):
     def decode(self, latents: dict[Modality, Tensor], frames_at_once: int = 1) -> Decoded:
         """Pixels of scaled latents [..,4,h,w] of all modalities.
 
-        Depth is the mean of the three channels; a class is the nearest palette colour, its margin the distance to the second
-        nearest minus that to the nearest, divided by the distance between those two colours.
+        Depth is the mean of the three channels; a class is the nearest palette colour.
         """
         images = {m: self.decode_image(z, frames_at_once).clamp(-1.0, 1.0) for m, z in latents.items()}
         depth = (images["depth"].mean(-3, keepdim=True).clamp(-1.0, 1.0) + 1.0) * 0.5 * self.config.far_m
-        return Decoded((images["rgb"] + 1) / 2, depth, *nearest_class(images["semantics"]))
+        return Decoded((images["rgb"] + 1) / 2, depth, nearest_class(images["semantics"]))
 
     def decode_rgb(self, z: Tensor, frames_at_once: int = 1) -> Tensor:
         """Colour f32[..,3,H,W] in [0,1] of its scaled latents."""
         return (self.decode_image(z, frames_at_once).clamp(-1.0, 1.0) + 1) / 2
 
 
-def nearest_class(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Class i64[..,H,W] and margin f32[..,1,H,W] in [0,1] of palette images [..,3,H,W] in [-1,1]."""
+def nearest_class(image: Tensor) -> Tensor:
+    """Class i64[..,H,W] of palette images [..,3,H,W] in [-1,1]."""
     table = torch.from_numpy(palette.COLORS.copy()).float().to(image.device) / 127.5 - 1.0
-    ids, margins = [], []
-    for frame in image.reshape(-1, *image.shape[-3:]):
-        two = torch.cdist(frame.flatten(1).T.contiguous(), table).topk(2, largest=False)
-        apart = torch.cdist(table, table)[two.indices[:, 0], two.indices[:, 1]]
-        ids.append(two.indices[:, 0])
-        margins.append((two.values[:, 1] - two.values[:, 0]) / apart)
-    lead, size = image.shape[:-3], image.shape[-2:]
-    return torch.stack(ids).reshape(*lead, *size), torch.stack(margins).reshape(*lead, 1, *size)
+    frames = image.reshape(-1, *image.shape[-3:])
+    ids = [torch.cdist(frame.flatten(1).T.contiguous(), table).argmin(1) for frame in frames]
+    return torch.stack(ids).reshape(*image.shape[:-3], *image.shape[-2:])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from mudg.base.types import RenderPlanes, View
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import View
 from mudg.models.scene.model import SceneModel
 from mudg.stages.fitting.rendering import render_condition
 

@@ -6,7 +6,8 @@ import tempfile
 from pathlib import Path
 
 from mudg.base import seeds
-from mudg.base.types import Photo, RenderPlanes, View
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import Photo, View
 from mudg.core.fusion import SweepShots
 from mudg.data.clips import from_city
 from mudg.data.clips.city_log import CityLog

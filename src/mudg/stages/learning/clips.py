@@ -54,6 +54,11 @@ def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.Cit
     )
 
 
+def without_renders(config: LearnConfig) -> LearnConfig:
+    """The configuration for a model that uses no renders: no city has to be fitted."""
+    return replace(config, data=replace(config.data, renders=False))
+
+
 class MakingClips:
     """Processes that make the missing clips of cities, held-out ones first, while the block runs."""
 
@@ -230,6 +235,12 @@ def draw_clips(
             clip = clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))
         clips.append(clip)
     return clips
+
+
+def have_patches(folder: Path) -> bool:
+    """Whether the clips have patches at a higher resolution; seen in the first one."""
+    await_shard(folder, 0)
+    return clip_shards.read_clip(folder, 0, 0, range(1)).fine is not None
 
 
 def class_weights(folder: Path, cities: int, balance: float) -> Tensor:

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from mudg.base import log, seeds
 from mudg.base.errors import UsageError
 from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.model import MDM, MDMConfig, extended, same_denoiser
+from mudg.models.mdm.extended import extended, same_denoiser
+from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.models.published.files import is_published
 from mudg.models.published.model import PublishedMDM
 from mudg.stages.config import LearnConfig
@@ -73,14 +74,16 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
 
     With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings
     ask for them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
-    size and length than before.
+    size and length than before. Inputs for renders and a finisher are learned from generated cities with renders; from other clips
+    no model gets any that it does not have.
 
     Raises:
         UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
     """
     wanted = model_config(config)
+    can_grow = config.data.renders and not config.data.scenes
     if not config.start:
-        return MDM(wanted), {"codec", "refiner", "finisher"}
+        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
     if is_published(config.start):
         if not _network_is_default(config):
             raise UsageError("the shape of a published-type network cannot be changed", where="--start",
@@ -89,6 +92,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     before = mdm_files.load(config.start)
     if before.config.window != config.data.window:
         log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")
+    wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
     resized = model_of_window(before, config.data.window, wanted.area_px)
     if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
         log.info("learn: the network has the shape of --start")
@@ -104,6 +108,30 @@ def model_of_window(model: MDM, window: int, area_px: int = 0) -> MDM:
     made = MDM(replace(model.config, window=window, area_px=area_px or model.config.area_px))
     made.load_state_dict(model.state_dict())
     return made.eval()
+
+
+def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:
+    """A network that uses renders, and has a finisher, as `before` does (None: neither)."""
+    if before is None:
+        return replace(wanted, renders=False, finish_widths=(), finish_blocks=())
+    return replace(wanted, renders=before.renders, finish_widths=before.finish_widths, finish_blocks=before.finish_blocks)
+
+
+def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
+    """Let the finisher keep its weights if the clips have no patches at a higher resolution to learn it from.
+
+    Raises:
+        UsageError: it has no weights yet.
+    """
+    if patches or not isinstance(model, MDM) or model.finisher is None:
+        return
+    if "finisher" in fresh:
+        raise UsageError(
+            "the training clips have no patches at a higher resolution, from which the finisher is learned",
+            where="--data.clips", remedy="choose another folder, or give --data.no-renders",
+        )  # fmt: skip
+    model.finisher.requires_grad_(False)
+    log.info("learn: the clips have no patches at a higher resolution; the finisher keeps its weights")
 
 
 def _network_is_default(config: LearnConfig) -> bool:

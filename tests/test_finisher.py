@@ -1,0 +1,278 @@
+"""The last stage of the small models: tiles, what it starts as, what it copies, what it learns from."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from hypothesis import given as drawn
+from hypothesis import strategies
+from test_mdm import TINY, randomised, some_condition
+from torch.nn import functional
+from toy_clips import made_up_clip, with_patch
+
+from mudg.base.errors import UsageError
+from mudg.models import diffusion
+from mudg.models.diffusion import SampleRequest
+from mudg.models.mdm import finisher as finishing
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.finisher import Finisher, Made, finish_in_tiles
+from mudg.models.mdm.model import BatchPart, LossSettings
+from mudg.models.mdm.network import ConditionPixels, Refined
+from mudg.stages.learning.models import draw_weights
+
+FINISHING = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+
+
+def some_pixels(height, width, frames=2, seed=0):
+    """A condition of random pixels, with renders."""
+    generator = torch.Generator().manual_seed(seed)
+    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1  # noqa: E731
+    mask = lambda: (image(1) > 0).float()  # noqa: E731
+    ids = lambda: torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)  # noqa: E731
+    return ConditionPixels(
+        image(3), image(3), image(1), mask(), mask(), ids(), ids(), image(3), image(1), mask(), image(1).abs(), ids()
+    )
+
+
+def some_made(height, width, frames=2, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1  # noqa: E731
+    ids = torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
+    return Made(image(3), image(1), ids, image(1) - 3)
+
+
+def random_finisher(blocks=(1, 1), seed=2):
+    """One whose every weight matters."""
+    made, generator = Finisher((8, 16), blocks), torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for value in made.parameters():
+            fan = value[0].numel() if value.ndim > 1 else 1
+            value.copy_(torch.randn(value.shape, generator=generator) * (1.5 / fan**0.5 if value.ndim > 1 else 0.3))
+    return made.eval()
+
+
+def biases(finisher):
+    """Views of the last layer's biases, one per part of the output."""
+    return finisher.leave.bias.split(Finisher.SIZES)
+
+
+# tiles ----------------------------------------------------------------------------------------------------------------
+
+
+@drawn(strategies.integers(1, 3000), strategies.integers(1, 700))
+def test_spans_cover_the_length_without_overlap(length, longest):
+    found = finishing.spans(length, longest)
+    assert [first for first, _ in found] == [0, *(last for _, last in found[:-1])]
+    assert found[-1][1] == length
+    assert all(first < last and first % finishing.STRIDE_PX == 0 for first, last in found)
+    assert max(last - first for first, last in found) <= max(longest, finishing.STRIDE_PX) + finishing.STRIDE_PX
+
+
+@pytest.mark.parametrize("blocks", [(1, 1), (2, 2), (1, 3)])
+@pytest.mark.parametrize(("size", "tile_px"), [((93, 131), 40), ((64, 117), 17), ((141, 50), 64)])
+@torch.no_grad()
+def test_tiles_equal_the_whole_image(blocks, size, tile_px):
+    finisher, given, made = random_finisher(blocks), some_pixels(*size), some_made(24, 32)
+    whole = finish_in_tiles(finisher, made, given, 1000)
+    tiled = finish_in_tiles(finisher, made, given, tile_px)
+    assert whole.rgb.shape == (2, 3, *size)
+    for name in ("rgb", "depth_code", "log_error"):
+        assert torch.allclose(getattr(tiled, name), getattr(whole, name), atol=2e-5), name
+    assert torch.equal(tiled.ids, whole.ids)
+
+
+@torch.no_grad()
+def test_the_whole_image_is_one_pass():
+    finisher, given, made = random_finisher(), some_pixels(32, 48), some_made(16, 24)
+    enlarged = made.enlarged((32, 48), (0, 32), (0, 48))
+    once = finisher(enlarged, given, 2, torch.full((2,), 2.0))
+    whole = finish_in_tiles(finisher, made, given)
+    assert torch.allclose(whole.rgb, once.rgb, atol=1e-6)
+    assert torch.equal(whole.ids[:, 0], once.shares.argmax(1).to(torch.uint8))
+
+
+@torch.no_grad()
+def test_the_margin_is_not_wider_than_needed(monkeypatch):
+    """With a smaller one, seams would show: what the test above compares does depend on it."""
+    finisher, given, made = random_finisher(), some_pixels(93, 131), some_made(24, 32)
+    whole = finish_in_tiles(finisher, made, given, 1000)
+    monkeypatch.setattr(Finisher, "margin_px", 4)
+    assert float((finish_in_tiles(finisher, made, given, 40).rgb - whole.rgb).abs().max()) > 1e-3
+
+
+@torch.no_grad()
+def test_memory_is_that_of_a_tile(monkeypatch):
+    finisher, seen = random_finisher(), []
+    forward = finisher.forward
+    monkeypatch.setattr(finisher, "forward", lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1])
+    finish_in_tiles(finisher, some_made(24, 32), some_pixels(150, 202), 40)
+    longest = 40 + 2 * finisher.margin_px + 2 * finishing.STRIDE_PX
+    assert len(seen) == 4 * 6
+    assert all(max(shape[-2:]) <= longest for shape in seen)
+
+
+def test_enlarging_is_what_interpolation_does():
+    made = some_made(12, 16)
+    whole = made.enlarged((36, 48), (0, 36), (0, 48))
+    smooth = lambda x: functional.interpolate(x, size=(36, 48), mode="bilinear", align_corners=False)  # noqa: E731
+    sharp = lambda x: functional.interpolate(x.float(), size=(36, 48), mode="nearest-exact")  # noqa: E731
+    assert torch.allclose(whole.rgb, smooth(made.rgb), atol=1e-5)
+    assert torch.allclose(whole.log_error, smooth(made.log_error), atol=1e-5)
+    assert torch.equal(whole.depth_code, sharp(made.depth_code))
+    assert torch.equal(whole.ids.float(), sharp(made.ids))
+    part = made.enlarged((36, 48), (6, 30), (15, 39))
+    for f in fields(Made):
+        assert torch.equal(getattr(part, f.name), getattr(whole.crop(slice(6, 30), slice(15, 39)), f.name)), f.name
+
+
+# what it makes --------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def test_it_starts_as_fixed_shares_of_its_sources():
+    """Logits 2, 0, -2, 0: three quarters of the generated clip, a tenth of what was warped and of the render."""
+    finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(32, 48), some_made(32, 48)
+    draw_weights(finisher, 5, "finisher")
+    finisher.reset()
+    done = finisher(made, given, 2, torch.ones(2))
+    clip, warped, far, render = torch.tensor([2.0, 0, -2, 0]).softmax(0).tolist()
+    assert clip > 0.75
+    expected = clip * made.rgb + warped * given.color + far * given.backdrop + render * given.render
+    assert torch.allclose(done.rgb, expected, atol=1e-5)
+    clip, measured, render = torch.tensor([2.0, 0, -2]).softmax(0).tolist()
+    depth = clip * made.depth_code + measured * given.depth_code + render * given.render_code
+    assert torch.allclose(done.depth_code, depth, atol=1e-5)
+    assert torch.equal(done.shares.argmax(1, keepdim=True), made.ids.long())
+    assert torch.allclose(done.log_error, made.log_error)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("source", range(4))
+def test_it_can_copy_each_source(source):
+    finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(32, 48), some_made(32, 48)
+    of_color, of_depth, of_class = biases(finisher)[:3]
+    of_color[4 * source : 4 * source + 4] = 30.0
+    of_class[4 * source : 4 * source + 4] = 30.0
+    depth_source = {0: 0, 1: 1, 3: 2}.get(source)
+    if depth_source is not None:
+        of_depth[4 * depth_source : 4 * depth_source + 4] = 30.0
+    done = finisher(made, given, 2, torch.ones(2))
+    colors = (made.rgb, given.color, given.backdrop, given.render)
+    classes = (made.ids, given.ids, given.backdrop_ids, given.render_ids)
+    assert torch.allclose(done.rgb, colors[source], atol=1e-5)
+    assert torch.equal(done.shares.argmax(1, keepdim=True), classes[source].long())
+    if depth_source is not None:
+        depths = (made.depth_code, given.depth_code, given.render_code)
+        assert torch.allclose(done.depth_code, depths[depth_source], atol=1e-5)
+
+
+@torch.no_grad()
+def test_an_unknown_class_takes_no_share():
+    finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(16, 16), some_made(16, 16)
+    unknown = torch.full_like(given.ids, 255)
+    done = finisher(made, replace(given, ids=unknown, backdrop_ids=unknown, render_ids=unknown), 2, torch.ones(2))
+    share = float(torch.tensor([2.0, 0, -2, 0]).softmax(0)[0])
+    assert torch.allclose(done.shares.sum(1), torch.full((2, 16, 16), share), atol=1e-5)
+    assert bool(torch.isfinite(finishing.class_scores(done)).all())
+
+
+def test_a_finisher_needs_renders_and_a_refiner():
+    for change in ({"renders": False}, {"refine_widths": (), "refine_blocks": ()}, {"finish_blocks": ()}, {"finish_widths": (8,)}):
+        with pytest.raises(UsageError):
+            replace(FINISHING, **change)
+
+
+# clips ----------------------------------------------------------------------------------------------------------------
+
+
+def test_clips_are_finished_at_any_size():
+    model = randomised(FINISHING)
+    small, fine = some_condition(), some_condition(height=45, width=67, seed=4)
+    clip = model.sample(small, SampleRequest(1))
+    done, again = model.finish(clip, fine), model.finish(clip, fine)
+    assert done.rgb.shape == (3, 3, 45, 67) and done.depth.shape == done.confidence.shape == (3, 1, 45, 67)
+    assert done.semantics.shape == (3, 45, 67) and int(done.semantics.max()) < 19
+    assert float(done.rgb.min()) >= 0 and float(done.rgb.max()) <= 1
+    assert float(done.confidence.min()) >= 0 and float(done.confidence.max()) <= 1
+    assert torch.equal(done.depth[fine.valid], fine.depth[fine.valid].clamp(max=100.0))
+    assert done.latents is clip.latents
+    assert torch.equal(done.rgb, again.rgb)
+    with pytest.raises(UsageError, match="no finisher"):
+        randomised(TINY).finish(clip, fine)
+
+
+def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
+    """Disagreement with measured depth lowers the confidence once, at the new size, and not a second time through the error."""
+    model = mdm.MDM(FINISHING).eval()
+    clip = model.sample(some_condition(), SampleRequest(1))
+    doubted = replace(clip, confidence=clip.confidence * 0.1)
+    fine = replace(some_condition(height=32, width=48, seed=4), valid=torch.zeros(3, 1, 32, 48) > 0)
+    done = model.finish(doubted, fine)
+    stated = functional.interpolate(clip.log_error, size=(32, 48), mode="bilinear", align_corners=False)
+    assert torch.allclose(done.confidence, torch.exp(-stated.exp() / 2 / mdm.TRUSTED_ERROR), atol=1e-4)
+    assert torch.equal(diffusion.depth_agreement(done.depth, fine), torch.ones_like(done.depth))
+
+
+# training -------------------------------------------------------------------------------------------------------------
+
+
+def gradients(model, clips):
+    model.zero_grad(set_to_none=True)
+    loss = model.loss(clips, BatchPart(0, 0, 0, len(clips)), LossSettings(None, 1.0, 0.2))
+    loss.total.backward()
+    return loss, {name: None if p.grad is None else p.grad.clone() for name, p in model.named_parameters()}
+
+
+def test_patches_teach_the_finisher_alone():
+    model, plain = randomised(FINISHING), [made_up_clip(0), made_up_clip(1)]
+    without, before = gradients(model, plain)
+    with_them, after = gradients(model, [with_patch(clip) for clip in plain])
+    assert {name for name in with_them.terms if name not in without.terms} == {
+        "fine_rgb", "fine_depth", "fine_semantics", "fine_error",
+    }  # fmt: skip
+    for name, gradient in after.items():
+        if name.startswith("finisher."):
+            assert before[name] is None
+            assert gradient is not None and float(gradient.abs().sum()) > 0, name
+        elif gradient is not None:
+            assert torch.equal(gradient, before[name]), name
+    assert all(bool(torch.isfinite(torch.tensor(value))) for value in with_them.terms.values())
+
+
+def test_patches_of_several_scales_and_of_some_clips_only_are_learnt_from_together():
+    model = randomised(FINISHING)
+    clips = [with_patch(made_up_clip(0), side=12, scale=2), made_up_clip(1), with_patch(made_up_clip(2), 4, 20, side=8, scale=3)]
+    loss, found = gradients(model, clips)
+    assert "fine_rgb" in loss.terms
+    assert all(found[name] is not None for name in found if name.startswith("finisher."))
+
+
+def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch):
+    """The refined clip is a ramp of places; what the finisher is given are the places of the patch."""
+    model, seen = randomised(FINISHING), []
+    clips = [made_up_clip(0), with_patch(made_up_clip(1), row=6, column=10, side=12, scale=2)]
+    frames, (height, width) = 4, clips[0].rgb.shape[-2:]
+    rows = torch.arange(height).view(1, 1, -1, 1) + 0.5
+    columns = torch.arange(width).view(1, 1, 1, -1) + 0.5
+    clip_number = torch.arange(2).repeat_interleave(frames).view(-1, 1, 1, 1)
+    ramp = torch.cat([x.expand(2 * frames, 1, height, width).float() for x in (rows, columns, clip_number)], 1)
+
+    def refined(latents, pixels, frames):
+        one = ramp[:, :1]
+        return Refined(ramp, one, functional.one_hot(torch.zeros(len(ramp), height, width).long(), 19).permute(0, 3, 1, 2), one)
+
+    def finished(made, given, frames, scale):
+        seen.append((made, scale))
+        return finishing.Finished(made.rgb, made.depth_code, torch.full((len(made.rgb), 19, 24, 24), 1 / 19), made.log_error)
+
+    encoded = model.encode_condition([clip.condition for clip in clips])
+    stated = {m: torch.zeros(2, frames, c, height // 2, width // 2) for m, c in model.codec.channels.items()}
+    monkeypatch.setattr(model, "refine", refined)
+    monkeypatch.setattr(model.finisher, "forward", finished)
+    model._finisher_terms(stated, encoded, clips, LossSettings(None, 1.0, 0.2))
+    made, scale = seen[0]
+    assert scale.tolist() == [2.0] * frames
+    assert made.rgb.shape == (frames, 3, 24, 24)
+    assert torch.allclose(made.rgb[:, 0, :, 0], (6 + (torch.arange(24) + 0.5) / 2).expand(frames, 24), atol=1e-3)
+    assert torch.allclose(made.rgb[:, 1, 0], (10 + (torch.arange(24) + 0.5) / 2).expand(frames, 24), atol=1e-3)
+    assert bool((made.rgb[:, 2] == 1).all())

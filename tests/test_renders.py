@@ -1,0 +1,376 @@
+"""Renders of a fitted scene in the condition: what they tell, how they are stored and varied, how a model takes them up."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from test_clips import RULES, image_of_wall, stripes, view_at, wall
+from test_mdm import TINY, randomised, some_condition, some_ids
+from toy_clips import made_up_clip, with_patch
+
+from mudg import native
+from mudg.base.errors import InputError, UsageError
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import Camera, FusedCloud, Photo, PointCloud
+from mudg.data.clips import condition as clips
+from mudg.data.clips import from_city
+from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.condition import build_conditions
+from mudg.data.clips.from_city import CityClipRules
+from mudg.models.diffusion import SampleRequest
+from mudg.models.mdm import files
+from mudg.models.mdm import model as mdm
+from mudg.models.mdm.extended import extended
+
+NOTHING = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
+WITH_RENDERS = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+
+
+def flat_render(view, depth=40.0, alpha=1.0, color=(0.8, 0.2, 0.1), label=2):
+    """One colour, depth, coverage and class all over a view."""
+    plane = torch.ones(1, view.camera.height, view.camera.width)
+    rgb = torch.tensor(color).view(3, 1, 1) * plane
+    return RenderPlanes(rgb, depth * plane, alpha * plane, 0.5 * alpha * plane, (label * plane).to(torch.uint8))
+
+
+def with_renders(condition, seed=5):
+    generator = torch.Generator().manual_seed(seed)
+    t, _, h, w = condition.color.shape
+    draw = lambda c: torch.rand(t, c, h, w, generator=generator)  # noqa: E731
+    alpha = draw(1)
+    planes = RenderPlanes(draw(3), 3 + 60 * draw(1), alpha, alpha * draw(1), some_ids(generator, t, h, w))
+    return replace(condition, renders=planes)
+
+
+def test_planes_have_one_shape():
+    plane = torch.zeros(2, 1, 4, 6)
+    ids = plane.to(torch.uint8)
+    made = RenderPlanes(torch.zeros(2, 3, 4, 6), plane, plane, plane, ids)
+    assert made.map(lambda x: x[0]).color.shape == (3, 4, 6)
+    assert made.to(torch.device("cpu")).semantics.dtype == torch.uint8
+    with pytest.raises(InputError, match="depth"):
+        RenderPlanes(torch.zeros(2, 3, 4, 6), torch.zeros(2, 1, 4, 5), plane, plane, ids)
+    condition = some_condition()
+    with pytest.raises(InputError):
+        replace(condition, renders=made)
+
+
+# the condition --------------------------------------------------------------------------------------------------------
+
+
+def test_renders_tell_the_depth_beyond_the_reach_of_measured_pixels():
+    """A wall at 12 m whose upper part no point was measured on; the render says 40 m and red, all over."""
+    cloud, view = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {}), view_at()
+    plain = build_conditions(cloud, [], [view], [], RULES)[0]
+    helped = build_conditions(cloud, [], [view], [], RULES, render_at=flat_render)[0]
+    measured = plain.valid[0, 0]
+    near = torch.from_numpy(ndimage.binary_dilation(measured.numpy(), iterations=RULES.measured_reach_px))
+    assert bool((near & ~measured).any()) and bool((~near).any())
+    assert torch.equal(helped.valid, plain.valid)
+    assert torch.equal(helped.depth[0, 0][near], plain.depth[0, 0][near])
+    assert bool((helped.depth[0, 0][~near] == 40.0).all())
+    assert bool((plain.depth[0, 0][~near] < 13.0).all())
+    assert torch.equal(helped.color[0][:, near], plain.color[0][:, near])
+    assert torch.allclose(helped.color[0][:, ~near], torch.tensor([[0.8], [0.2], [0.1]]))
+    assert bool((helped.semantics[0, 0][~near] == 2).all())
+    assert torch.equal(helped.semantics[0, 0][near], plain.semantics[0, 0][near])
+    assert plain.renders is None
+    shown = flat_render(view)
+    assert torch.equal(helped.renders.color[0], shown.color) and torch.equal(helped.renders.depth[0], shown.depth)
+
+
+@pytest.mark.parametrize(("alpha", "depth", "expected"), [(0.4, 40.0, "far"), (0.6, 40.0, 40.0), (1.0, 5000.0, "far")])
+def test_what_the_render_hardly_covers_is_far_away(alpha, depth, expected):
+    made = build_conditions(NOTHING, [], [view_at()], [], RULES, render_at=lambda view: flat_render(view, depth, alpha))[0]
+    assert not bool(made.valid.any())
+    assert bool((made.depth == (RULES.far_m if expected == "far" else expected)).all())
+
+
+def test_images_are_warped_by_rendered_depth():
+    """No point at all: only the render knows that the wall stands at 12 m, here and where the image was recorded."""
+    target, recorded = view_at(y=1.5), [Photo(view_at(), image_of_wall(view_at(), 12.0))]
+    truth = clips.image_tensor(image_of_wall(target, 12.0))
+    made = build_conditions(NOTHING, [], [target], recorded, RULES, render_at=lambda view: flat_render(view, 12.0))[0]
+    found = made.warped[0, 0]
+    assert float(found.float().mean()) > 0.8
+    assert float((made.color[0] - truth).abs()[:, found].max()) < 0.01
+    without = build_conditions(NOTHING, [], [target], recorded, RULES)[0]
+    both = found & without.warped[0, 0]
+    assert float((without.color[0] - truth).abs()[:, both].mean()) > 0.1
+
+
+def test_renders_reach_every_view_in_order_and_are_made_once_per_view_and_image():
+    big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
+    views = [view_at(y=0.2 * n, time_s=0.1 * n, camera=big) for n in range(3)]
+    recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
+    asked = []
+
+    def render_at(view):
+        asked.append(view)
+        number = round(view.time_s / 0.1)
+        return flat_render(view, 20.0 + number, 1.0, (0.1 * number, 0.5, 0.0), number)
+
+    rules = replace(RULES, fine_width=96, fine_height=64)
+    small, fine = build_conditions(NOTHING, [], views, recorded, rules, render_at=render_at)
+    assert len(asked) == len(views) + len(recorded)
+    assert {(v.camera.width, v.camera.height) for v in asked} == {(96, 64)}
+    for made, size in ((small, (32, 48)), (fine, (64, 96))):
+        assert made.renders.color.shape == (3, 3, *size)
+        for number in range(3):
+            assert torch.allclose(made.depth[number], torch.tensor(20.0 + number))
+            assert torch.allclose(made.renders.depth[number], torch.tensor(20.0 + number))
+            assert torch.allclose(made.renders.color[number, 0], torch.tensor(0.1 * number), atol=1e-6)
+            assert bool((made.renders.semantics[number] == number).all())
+
+
+def test_renders_at_the_small_size_are_means_and_picks():
+    big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
+    chequered = (torch.arange(64).view(-1, 1) + torch.arange(96)) % 2
+
+    def render_at(view):
+        plain = flat_render(view)
+        depth, ids = torch.where(chequered > 0, 10.0, 30.0)[None], torch.where(chequered > 0, 3, 7)[None].to(torch.uint8)
+        shown = {name: getattr(plain, name) * chequered for name in ("color", "alpha", "certainty")}
+        return RenderPlanes(depth=depth, semantics=ids, **shown)
+
+    small, _ = build_conditions(NOTHING, [], [view_at(camera=big)], [], replace(RULES, fine_width=96, fine_height=64), render_at=render_at)
+    shown = small.renders
+    assert torch.allclose(shown.alpha, torch.tensor(0.5)) and torch.allclose(shown.certainty, torch.tensor(0.25))
+    assert torch.allclose(shown.color[:, 0], torch.tensor(0.4))
+    assert set(shown.depth.unique().tolist()) <= {10.0, 30.0}  # never a mean of two surfaces
+    assert set(shown.semantics.unique().tolist()) <= {3, 7}
+
+
+def test_the_published_condition_has_no_renders():
+    made = build_conditions(NOTHING, [], [view_at()], [], replace(RULES, published=True), render_at=flat_render)[0]
+    assert made.renders is None and not bool(made.depth.any())
+
+
+# training clips -------------------------------------------------------------------------------------------------------
+
+
+def same_planes(read, planes, frames):
+    assert torch.allclose(read.color, planes.color[frames], atol=0.5 / 255 + 1e-6)
+    for name in ("alpha", "certainty"):
+        assert torch.allclose(getattr(read, name), getattr(planes, name)[frames], atol=0.5 / 255 + 1e-6), name
+    assert torch.allclose(read.depth, planes.depth[frames], rtol=1e-3)
+    assert torch.equal(read.semantics, planes.semantics[frames])
+
+
+def test_shards_give_back_renders_and_patches(tmp_path):
+    first, second = (with_patch(made_up_clip(n), row=4 + n, column=7 + 2 * n, scale=2) for n in (0, 1))
+    bare = replace(second, condition=replace(second.condition, renders=None))
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([first, bare]))
+    frames = [1, 3]
+    read, other = (clip_shards.read_clip(tmp_path, 0, n, frames) for n in (0, 1))
+    same_planes(read.condition.renders, first.condition.renders, frames)
+    assert other.condition.renders is None
+    for found, clip in ((read, first), (other, second)):
+        assert (found.fine.row, found.fine.column, found.fine.scale) == (clip.fine.row, clip.fine.column, clip.fine.scale)
+        same_planes(found.fine.clip.condition.renders, clip.fine.clip.condition.renders, frames)
+        assert torch.allclose(found.fine.clip.rgb, clip.fine.clip.rgb[frames], atol=0.5 / 255 + 1e-6)
+        assert torch.equal(found.fine.clip.semantics, clip.fine.clip.semantics[frames])
+        assert torch.equal(found.fine.clip.condition.valid, clip.fine.clip.condition.valid[frames])
+        assert found.fine.clip.condition.views[0].camera.width == 24
+        assert found.fine.clip.fine is None
+    clip_shards.write_shard(tmp_path, 1, clip_shards.pack_clips([replace(bare, fine=None)]))
+    plain = clip_shards.read_clip(tmp_path, 1, 0, frames)
+    assert plain.fine is None and plain.condition.renders is None
+
+
+def finer(x, fine, side=12):
+    """What a patch made by `with_patch` shows of an image of its clip."""
+    cut = x[..., fine.row : fine.row + side, fine.column : fine.column + side]
+    return cut.repeat_interleave(fine.scale, -1).repeat_interleave(fine.scale, -2)
+
+
+def test_clip_and_patch_are_varied_in_the_same_way():
+    """A patch that shows its part of the clip still does so after mirroring, colour curve and mistakes of classes."""
+    unknown = torch.full_like(made_up_clip(0).condition.valid, 3, dtype=torch.uint8)
+    plain = made_up_clip(0)
+    given = replace(plain.condition, semantics=unknown, backdrop_semantics=unknown + 10)
+    clip = with_patch(replace(plain, condition=given, shift_m=2.0), row=6, column=10)
+    seen = set()
+    for seed in range(60):
+        made = clip_shards.vary(clip, np.random.default_rng(seed))
+        fine, part = made.fine, made.fine.clip
+        mirrored = made.shift_m < 0
+        assert fine.column == (48 - 10 - 12 if mirrored else 10) and fine.row == 6
+        assert torch.equal(part.rgb, finer(made.rgb, fine))
+        assert torch.equal(part.depth, finer(made.depth, fine))
+        assert torch.equal(part.semantics, finer(made.semantics, fine))
+        for name in ("color", "depth", "valid", "warped", "backdrop"):
+            assert torch.equal(getattr(part.condition, name), finer(getattr(made.condition, name), fine)), name
+        rendered = made.condition.renders is not None
+        assert (part.condition.renders is not None) == rendered
+        pairs = [(getattr(part.condition, n), getattr(made.condition, n)) for n in ("semantics", "backdrop_semantics")]
+        if rendered:
+            for name in ("color", "depth", "alpha", "certainty"):
+                assert torch.equal(getattr(part.condition.renders, name), finer(getattr(made.condition.renders, name), fine)), name
+            pairs.append((part.condition.renders.semantics, made.condition.renders.semantics))
+        for of_patch, of_clip in pairs:  # the holes lie elsewhere, the mistakes are the same
+            both = (of_patch != 255) & (finer(of_clip, fine) != 255)
+            assert torch.equal(of_patch[both], finer(of_clip, fine)[both])
+        seen.add((mirrored, rendered))
+    assert seen == {(False, False), (False, True), (True, False), (True, True)}
+
+
+def test_a_mirrored_render_is_the_mirror_image():
+    clip = replace(made_up_clip(0), shift_m=1.0)
+    full = torch.full_like(clip.condition.valid, 3, dtype=torch.uint8)
+    clip = replace(clip, condition=replace(clip.condition, semantics=full, backdrop_semantics=full))
+    made = [clip_shards.vary(clip, np.random.default_rng(seed)) for seed in range(12)]
+    turned = [m for m in made if m.shift_m < 0 and m.condition.renders is not None]
+    assert turned
+    for one in turned:
+        assert torch.equal(one.condition.renders.depth, clip.condition.renders.depth.flip(-1))
+        assert torch.equal(one.condition.renders.certainty, clip.condition.renders.certainty.flip(-1))
+
+
+@pytest.mark.parametrize(("size", "side"), [((192, 128), 96), ((48, 32), 60), ((304, 80), 96), ((32, 16), 24)])
+def test_patches_of_all_scales_have_one_side(size, side):
+    from test_clips import some_clip
+
+    assert from_city.patch_side(size) == side
+    for scale in (2, 3, 4):
+        full = some_clip(1, size[1] * scale, size[0] * scale)
+        full = replace(full, condition=replace(full.condition, semantics=None))
+        found = from_city.cut_patch(full, scale, side, np.random.default_rng(scale))
+        assert found.clip.rgb.shape[-2:] == (side, side) and found.scale == scale
+        top, left = found.row * scale, found.column * scale
+        assert top + side <= size[1] * scale and left + side <= size[0] * scale
+        here = (..., slice(top, top + side), slice(left, left + side))
+        for name in ("rgb", "depth", "depth_valid", "semantics"):
+            assert torch.equal(getattr(found.clip, name), getattr(full, name)[here]), name
+        for name in ("color", "depth", "valid", "warped", "backdrop"):
+            assert torch.equal(getattr(found.clip.condition, name), getattr(full.condition, name)[here]), name
+        assert found.clip.condition.semantics is None
+        assert found.clip.condition.views[0].camera.width == side
+
+
+def test_clips_of_a_fitted_city_show_its_full_size_in_their_patches():
+    if native.library() is None:
+        pytest.skip("the native library is not built")
+    rules = CityClipRules(width=48, height=32, window=1, clips=2, fitted=True)
+    scales = {city: from_city.fine_of(rules, city) for city in range(40)}
+    assert set(scales.values()) == {2, 3, 4}
+    assert from_city.fine_of(rules, from_city.HELD_OUT) == rules.fine
+    city = next(number for number, scale in scales.items() if scale == 3)
+    log = from_city.make_log(rules, city, rules.frames)
+    front = next(view for view in log.world.frame_views("front"))
+    assert (front.camera.width, front.camera.height) == (144, 96)
+    made = from_city.make_clips(rules, city, log, flat_render)
+    for clip in made:
+        fine = clip.fine
+        assert (fine.scale, *fine.clip.rgb.shape[-2:]) == (3, 60, 60)
+        view = from_city.shifted_view(log.world, log.world.frame_views("front")[from_city.FIRST], clip.shift_m)
+        truth = torch.from_numpy(log.truth(view).rgb).permute(2, 0, 1).float()
+        rows, columns = (slice(3 * start, 3 * start + 60) for start in (fine.row, fine.column))
+        assert torch.equal(fine.clip.rgb[0], truth[:, rows, columns])
+        assert fine.clip.condition.renders.color.shape == (1, 3, 60, 60)
+        assert clip.condition.renders.color.shape == (1, 3, 32, 48)
+
+
+def test_images_of_held_out_moments_are_not_given():
+    if native.library() is None:
+        pytest.skip("the native library is not built")
+    rules = CityClipRules(width=48, height=32, window=1, clips=1, fitted=True)
+    log = from_city.make_log(rules, from_city.HELD_OUT, 9)
+    times = sorted({photo.view.time_s for photo in log.recorded})
+    given = {photo.view.time_s for photo in from_city.given_images(rules, from_city.HELD_OUT, log)}
+    assert set(times) - given == {times[4], times[8]}
+    assert from_city.given_images(replace(rules, fitted=False), from_city.HELD_OUT, log) == log.recorded
+
+
+# the model ------------------------------------------------------------------------------------------------------------
+
+
+def shut(model, value=-40.0):
+    """Close the gates through which a render is copied."""
+    area = model.net.patch**2
+    with torch.no_grad():
+        model.net.leave.bias[-mdm.RENDER_GATES * area :] = value
+        model.refiner.leave.bias[-sum(model.refiner.RENDER_SIZES) :] = value
+    return model
+
+
+@pytest.mark.parametrize("patch", [1, 2])
+def test_an_extended_model_is_the_earlier_one_but_for_the_gates_of_renders(patch):
+    before = randomised(replace(TINY, patch=patch))
+    after = extended(before, replace(WITH_RENDERS, patch=patch)).eval()
+    plain, request = some_condition(), SampleRequest(2, seed=3)
+    old, new = before.sample(plain, request), after.sample(plain, request)
+    # without renders its gates take sigmoid(-8) of the denoiser's and sigmoid(-4) of the refiner's colour from the condition's own
+    assert float((old.rgb - new.rgb).abs().max()) < 0.05
+    shut(after)
+    for condition in (plain, with_renders(plain), with_renders(plain, 6)):
+        new = after.sample(condition, request)
+        assert torch.allclose(old.rgb, new.rgb, atol=1e-5)
+        assert torch.allclose(old.depth, new.depth, rtol=1e-4)
+        assert torch.equal(old.semantics, new.semantics)
+        assert torch.allclose(old.confidence, new.confidence, atol=1e-5)
+
+
+def test_open_gates_hand_the_render_through():
+    model, condition = mdm.MDM(WITH_RENDERS).eval(), with_renders(some_condition())
+    condition = replace(condition, renders=replace(condition.renders, alpha=torch.ones_like(condition.renders.alpha)))
+    with torch.no_grad():
+        parts = model.refiner.leave.bias.split(model.refiner.sizes)
+        for number in (1, 2, 4, 6, 7):
+            parts[number].fill_(-40.0)
+        for number in (9, 10, 11):
+            parts[number].fill_(40.0)
+        encoded = model.encode_condition(condition)
+        latents = {m: torch.zeros(3, c, 8, 12) for m, c in model.codec.channels.items()}
+        made = model.refine(latents, encoded.pixels, 3)
+    assert torch.allclose(made.rgb, condition.renders.color * 2 - 1, atol=1e-5)
+    assert torch.allclose(made.depth_code, model.codec.linear_depth_code(condition.renders.depth), atol=1e-5)
+    known = condition.renders.semantics[:, 0] != 255
+    assert torch.equal(made.scores.argmax(1)[known], condition.renders.semantics[:, 0][known].long())
+
+
+def test_no_render_is_told_from_an_empty_one():
+    model = randomised(WITH_RENDERS)
+    plain = some_condition()
+    nothing = torch.zeros_like(plain.depth)
+    empty = RenderPlanes(plain.color, plain.depth, nothing, nothing, torch.full_like(plain.valid, 255, dtype=torch.uint8))
+    missing, blank = model.encode_condition(plain), model.encode_condition(replace(plain, renders=empty))
+    assert bool((missing.pixels.alpha == mdm.NO_RENDER).all()) and bool((blank.pixels.alpha == 0).all())
+    differ = (missing.planes != blank.planes).flatten(3).any(3).any(1)[0]
+    assert int(differ.sum()) == 1  # the plane of coverage alone
+    both = model.encode_condition([plain, with_renders(plain)])
+    assert torch.equal(both.planes[:1], missing.planes)
+
+
+def test_a_model_without_renders_ignores_them():
+    model, plain = randomised(TINY), some_condition()
+    first, second = (model.sample(c, SampleRequest(1)) for c in (plain, with_renders(plain)))
+    assert torch.equal(first.rgb, second.rgb) and torch.equal(first.depth, second.depth)
+
+
+def test_renders_are_not_given_up_again():
+    with pytest.raises(UsageError, match="another kind"):
+        extended(randomised(WITH_RENDERS), TINY)
+    model = randomised(WITH_RENDERS)
+    again = extended(model, replace(WITH_RENDERS, area_px=100)).state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in model.state_dict().items())
+
+
+def test_models_described_before_there_were_renders_load():
+    values = asdict(TINY)
+    for name in files.LATER_FIELDS:
+        del values[name]
+    assert files.config_from_dict(values) == TINY
+    assert files.config_from_dict(asdict(WITH_RENDERS)) == WITH_RENDERS
+    with pytest.raises(InputError):
+        files.config_from_dict({**values, "later": 1})
+
+
+def test_a_model_with_renders_comes_back(tmp_path):
+    model = randomised(WITH_RENDERS)
+    files.save(model, tmp_path / "m", "", {})
+    loaded = files.load(tmp_path / "m")
+    assert loaded.config == WITH_RENDERS
+    assert torch.allclose(loaded.finisher.leave.weight, model.finisher.leave.weight, rtol=1e-3, atol=1e-4)
