@@ -130,7 +130,7 @@ class Synthesize(Output):
     fused: Annotated[Path, arg(metavar="FOLDER")]
     """Point clouds written by fuse."""
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Gaussian scene written by fit. Its renders supply the geometry where LiDAR measured nothing."""
+    """Gaussian scene written by fit. Its renders become part of what the model is given. For models that were trained with renders."""
     settings: Annotated[stage_config.SynthesizeConfig, arg(name="")]
 
 
