@@ -89,6 +89,12 @@ def _convert(args: f.Convert) -> dict[str, Any]:
     return {"model": convert.run(args.settings, args.checkpoint, args.to, overwrite=args.overwrite)}
 
 
+def _adapt(args: f.Adapt) -> dict[str, Any]:
+    from mudg.stages import adapt
+
+    return {"model": adapt.run(args.settings, args.scene, args.fused, args.fitted, args.out, overwrite=args.overwrite)}
+
+
 def _synthesize(args: f.Synthesize) -> dict[str, Any]:
     from mudg.stages import synthesize
 
@@ -208,6 +214,12 @@ VERBS: dict[str, Verb] = {
          "mudg convert checkpoints --to weights/depthlab"),
         _convert,
     ),
+    "adapt": Verb(
+        "Adapt the diffusion model to one recorded log, with the log's own photographs.",
+        ("mudg adapt scenes/kitti --fused runs/fused --fitted runs/plain --out runs/adapted",
+         "mudg synthesize scenes/kitti --fused runs/fused --fitted runs/plain --model runs/adapted/model --out runs/virtual"),
+        _adapt,
+    ),
     "synthesize": Verb(
         "Generate dense RGB, depth and semantics on laterally shifted trajectories.",
         ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",),
@@ -241,7 +253,7 @@ VERBS: dict[str, Verb] = {
 
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
-    ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "synthesize", "fit", "render", "score")),
+    ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "fit", "adapt", "synthesize", "render", "score")),
     ("benchmarks", ("bench",)),
     ("published models", ("convert",)),
 )

@@ -122,6 +122,19 @@ class Convert(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Adapt(Output):
+    """Flags of ``mudg adapt``."""
+
+    scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
+    """Scene directory written by ingest or annotate."""
+    fused: Annotated[Path, arg(metavar="FOLDER")]
+    """Point clouds written by fuse."""
+    fitted: Annotated[Path, arg(metavar="FOLDER")]
+    """Gaussian scene written by fit, without virtual views."""
+    settings: Annotated[stage_config.AdaptConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Synthesize(Output):
     """Flags of ``mudg synthesize``."""
 
@@ -130,7 +143,8 @@ class Synthesize(Output):
     fused: Annotated[Path, arg(metavar="FOLDER")]
     """Point clouds written by fuse."""
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Gaussian scene written by fit. Its renders become part of what the model is given. For models that were trained with renders."""
+    """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were
+    trained with renders."""
     settings: Annotated[stage_config.SynthesizeConfig, arg(name="")]
 
 
@@ -242,7 +256,7 @@ class Doctor(Common):
 
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
-    "convert": Convert, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
+    "convert": Convert, "adapt": Adapt, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
 }  # fmt: skip
 
 CHAINS: dict[str, type[Common]] = {"demo": DemoOwn, "run": RunOwn}

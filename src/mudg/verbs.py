@@ -71,6 +71,17 @@ def convert(
     return stage.run(made, Path(checkpoint), Path(to), overwrite=overwrite)
 
 
+def adapt(
+    scene: Location, fused: Location, fitted: Location, out: Location, *,
+    overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Adapt the diffusion model to a recorded log, with renders of the scene ``fitted`` to it; returns the model's folder."""
+    from mudg.stages import adapt as stage
+
+    made = _settings(stage_config.AdaptConfig, config, settings)
+    return stage.run(made, Path(scene), Path(fused), Path(fitted), Path(out), overwrite=overwrite)
+
+
 def synthesize(
     scene: Location, fused: Location, out: Location, *,
     fitted: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,

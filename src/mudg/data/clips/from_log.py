@@ -254,7 +254,7 @@ def _truth(scene: Scene, frame: Frame, recorded: Photo, view: View) -> tuple[Ten
     ids = np.full((height, width), palette.UNLABELLED, np.uint8)
     if recorded.semantics is not None:
         ids = resize_nearest(recorded.semantics, height, width)
-    depth, known = _measured(scene, view)
+    depth, known = measured_depth(scene, view)
     if "depth" in frame.labels and "depth_confidence" not in frame.labels:  # else a labeller guessed it
         labelled = resize_nearest(read_label(scene, frame, "depth"), height, width)
         depth = np.where(~known & np.isfinite(labelled), labelled, depth)
@@ -265,7 +265,7 @@ def _truth(scene: Scene, frame: Frame, recorded: Photo, view: View) -> tuple[Ten
     return rgb, image, torch.from_numpy(known)[None], torch.from_numpy(ids.astype(np.int64))
 
 
-def _measured(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def measured_depth(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Depth f32[H,W] of the sweep taken with an image and where it measured; points seen through gaps are left out."""
     near = ConditionRules(1, 1).same_time_s
     sweeps: list[Sweep] = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= near]

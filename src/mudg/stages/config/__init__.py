@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from mudg.stages.config.adapt import AdaptConfig
     from mudg.stages.config.bench import BenchConfig
     from mudg.stages.config.convert import ConvertConfig
     from mudg.stages.config.fit import FitConfig
@@ -24,6 +25,7 @@ _HOMES = {
     "ConvertConfig": "mudg.stages.config.convert",
     "FitConfig": "mudg.stages.config.fit",
     "LearnConfig": "mudg.stages.config.learn",
+    "AdaptConfig": "mudg.stages.config.adapt",
     "AnnotateConfig": "mudg.stages.config.prepare",
     "FuseConfig": "mudg.stages.config.prepare",
     "IngestConfig": "mudg.stages.config.prepare",
@@ -39,6 +41,7 @@ _HOMES = {
 
 __all__ = [
     "DEMO_CITY",
+    "AdaptConfig",
     "AnnotateConfig",
     "BenchConfig",
     "ConvertConfig",

@@ -93,9 +93,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     if before.config.window != config.data.window:
         log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")
     wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
-    now = {"window": config.data.window, "area_px": wanted.area_px}
-    resized = MDM(replace(before.config, **now))
-    resized.load_state_dict(before.state_dict())
+    resized = model_of_window(before, config.data.window, wanted.area_px)
     if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
         log.info("learn: the network has the shape of --start")
         wanted = resized.config
@@ -103,6 +101,13 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         return resized, set()
     grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
     return extended(resized, wanted), grown
+
+
+def model_of_window(model: MDM, window: int, area_px: int = 0) -> MDM:
+    """The same model, made for clips of `window` frames (and of `area_px` pixels)."""
+    made = MDM(replace(model.config, window=window, area_px=area_px or model.config.area_px))
+    made.load_state_dict(model.state_dict())
+    return made.eval()
 
 
 def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:

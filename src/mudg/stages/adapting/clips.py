@@ -1,0 +1,101 @@
+"""Training clips of a log's lessons (see `lessons.py`).
+
+The truth of a clip are photographs, and depth where a sweep measured it. Elsewhere depth and all classes are what the model that is
+adapted makes itself of the same condition: the log shows colours, but nobody knows what stands above its LiDAR, and guessed labels
+must not be learned as truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from mudg.base import seeds
+from mudg.base.types import Clip, Condition, Photo, View
+from mudg.core.pictures import resize_area
+from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions, image_tensor
+from mudg.data.clips.from_city import HELD_OUT, PATCH_PX, cut_patch
+from mudg.data.clips.from_log import measured_depth
+from mudg.data.clips.shards import pack_clips, shard_path, write_shard
+from mudg.data.cloudfile import read_fused
+from mudg.data.scene import read_image, read_scene, read_trusted_classes
+from mudg.models.diffusion import GeneratedClip, SampleRequest
+from mudg.models.mdm.model import MDM
+from mudg.stages.adapting.lessons import LearntLog, Lesson
+from mudg.stages.config import AdaptConfig
+from mudg.stages.fitting.planes import render_planes
+from mudg.stages.fitting.storage import load_model
+
+Plan = list[tuple[int, Lesson, tuple[str, ...]]]
+"""Number of the shard, lesson, and ids of the frames of every clip."""
+
+
+def plan_clips(lessons: list[Lesson], config: AdaptConfig) -> Plan:
+    """All clips: those to learn from have numbers from 0, those for scoring from `HELD_OUT`; a block serves for one only."""
+    plan: Plan = []
+    counts = {False: 0, True: 0}
+    for lesson in lessons:
+        for block, frames in lesson.truth:
+            scored = block % config.held_out_every == config.held_out_every // 2
+            if len(frames) < config.block:
+                continue
+            plan.append((counts[scored] + (HELD_OUT if scored else 0), lesson, frames))
+            counts[scored] += 1
+    return plan
+
+
+def write_clips(config: AdaptConfig, log: LearntLog, plan: Plan, model: MDM, folders: dict[str, Path], out: Path) -> int:
+    """Write the shards of a plan that are not there yet; returns how many were made. `folders`: that of each lesson's fit."""
+    made = 0
+    for name in dict.fromkeys(lesson.name for _, lesson, _ in plan):
+        rows = [row for row in plan if row[1].name == name and not shard_path(out, row[0]).is_file()]
+        if rows:
+            maker = ClipMaker(config, log, rows[0][1], model, folders[name])
+            for number, _, frames in rows:
+                write_shard(out, number, pack_clips([maker.make(frames, number)]))
+                made += 1
+    return made
+
+
+class ClipMaker:
+    """Makes the clips of one lesson."""
+
+    def __init__(self, config: AdaptConfig, log: LearntLog, lesson: Lesson, model: MDM, folder: Path) -> None:
+        self._config, self._log, self._lesson, self._model = config, log, lesson, model
+        self._scene, shown = read_scene(log.scene), read_scene(folder / "scene")
+        self._cloud = read_fused(log.fused if lesson.shift_m else folder / "fuse")
+        self._photos = [
+            Photo(f.view, read_image(shown, f), read_trusted_classes(shown, f, config.label_confidence)) for f in shown.frames
+        ]
+        self._fitted = load_model(folder / "fit")
+        self._sources: dict[int, WarpSource] = {}
+        size = (log.width_px, log.height_px)
+        self._rules = ConditionRules(*size, *(log.scale * side for side in size))
+
+    def make(self, frames: tuple[str, ...], number: int) -> Clip:
+        """The clip of some frames."""
+        chosen = [next(f for f in self._scene.frames if f.id == name) for name in frames]
+        views = [f.view for f in chosen]
+        condition, fine = build_conditions(
+            self._cloud, self._scene.tracks, views, self._photos, self._rules, self._sources,
+            lambda view: render_planes(self._fitted, view),
+        )  # fmt: skip
+        images = [read_image(self._scene, f) for f in chosen]
+        sample = self._model.sample(condition, SampleRequest(1, self._config.seed, number))
+        finished = self._model.finish(sample, fine) if self._model.finisher is not None else None
+        clip = self._clip(condition, images, sample)
+        if finished is not None:
+            rng = seeds.numpy_rng(self._config.seed, number, "patch")
+            clip = replace(clip, fine=cut_patch(self._clip(fine, images, finished), self._log.scale, PATCH_PX, rng))
+        return replace(clip, shift_m=self._lesson.shift_m)
+
+    def _clip(self, condition: Condition, images: list, made: GeneratedClip) -> Clip:
+        rgb = torch.stack([image_tensor(resize_area(i, v.camera.width, v.camera.height)) for i, v in zip(images, condition.views)])
+        depth, known = (torch.stack(parts) for parts in zip(*(self._measured(view) for view in condition.views)))
+        return Clip(condition, rgb, torch.where(known, depth, made.depth), torch.ones_like(known), made.semantics)
+
+    def _measured(self, view: View) -> tuple[torch.Tensor, torch.Tensor]:
+        depth, known = measured_depth(self._scene, view)
+        return torch.from_numpy(depth)[None], torch.from_numpy(known)[None]

@@ -1,0 +1,51 @@
+"""Settings of ``mudg adapt``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from mudg.base.config import STRICT
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class AdaptConfig:
+    """Adapt the diffusion model to a recorded log: train it for a few steps on the log's own photographs, seen from where other
+    photographs of the log were taken or might have been taken."""
+
+    model: str = "embedded"
+    """Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must use renders."""
+    cameras: tuple[str, ...] = ("front",)
+    """Cameras whose photographs are learned (empty = the first camera)."""
+    shifts_m: tuple[float, ...] = (2.5, -2.5)
+    """Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate the photographs."""
+    gaps: bool = True
+    """Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the other half."""
+    block: int = Field(default=4, ge=1)
+    """Frames per training clip, and consecutive frames left out together."""
+    held_out_every: int = Field(default=4, ge=2)
+    """Every n-th block of frames is kept for comparing the adapted model with the one it started from."""
+    fit_iterations: int = Field(default=250, ge=1)
+    """Optimisation steps of each of the fits that the clips are made with."""
+    steps: int = Field(default=60, ge=1)
+    """Training steps."""
+    batch_frames: int = Field(default=16, ge=1)
+    """Frames per training step."""
+    lr: float = Field(default=1e-4, gt=0)
+    """Largest learning rate."""
+    trained: Literal["all", "refiner"] = "all"
+    """Parts that are trained. refiner: refiner and finisher only, which takes half the time."""
+    augment: bool = True
+    """Vary the training clips in colour, and mirror them."""
+    label_confidence: float = Field(default=0.5, ge=0, le=1)
+    """Labels of recorded images with a confidence below this, 0 to 1, are not given to the model."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Number format of the diffusion model. auto: bfloat16 where the CPU multiplies in it, float32 elsewhere."""
+    processes: int = Field(default=0, ge=0)
+    """Number of fits made at the same time, with one thread each (0 = one per core). The result does not depend on it."""
+    threads: int = Field(default=1, ge=1)
+    """Threads of the training. Results are repeatable for the same number of threads."""
+    seed: int = 0
+    """Seed of all random numbers; the same seed gives the same result."""
