@@ -6,7 +6,7 @@ the `learn` verb, and the comparison on blocks of frames that were kept for it. 
     OUT/model/            the model to use: adapted, or the one started from if that is as good (same layout as `learn`'s)
     OUT/adapt.json        scores of both on the clips kept for scoring, and which was taken
     OUT/before.png, after.png   those clips: condition, generated and true colour, depth and classes, confidence
-    OUT/work/             fits, clips and training while it runs; removed at the end
+    OUT/work              fits, clips and training while it runs; removed at the end
 """
 
 from __future__ import annotations
