@@ -28,7 +28,7 @@ from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages import learn
-from mudg.stages.adapting.clips import Plan, plan_clips, write_clips
+from mudg.stages.adapting.clips import Plan, plan_clips, why_not, write_clips
 from mudg.stages.adapting.lessons import LearntLog, Lesson, cameras_of, fit_lesson, lessons_of
 from mudg.stages.config import AdaptConfig, LearnConfig
 from mudg.stages.config.learn import LearnCompute, LearnData, LearnOptimizer, LearnScore
@@ -55,7 +55,7 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
     """
     refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "model": mdm_files.folder_of(config.model)})
     model = mdm_files.load(config.model)
-    if not model.config.renders:
+    if not mdm_files.uses_renders(config.model):
         raise UsageError("this model was not trained with renders of a fitted scene", where="--model", got=config.model,
                          remedy="choose another model; `embedded` is one that was")  # fmt: skip
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "fitted": store.digest(fitted),
@@ -65,10 +65,11 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
     if directory.complete:
         return directory.reused() / "model"
     learnt, lessons = _open_log(config, model, Path(scene), Path(fused), Path(fitted))
-    plan = plan_clips(lessons, config)
-    if not any(number < HELD_OUT for number, _, _ in plan) or not any(number >= HELD_OUT for number, _, _ in plan):
-        raise InputError("the log is too short to adapt to", where=str(scene), got=f"{len(plan)} clips of {config.block} frames",
+    reason = why_not(read_scene(scene), config)
+    if reason:
+        raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
                          remedy="smaller --block, or use the model as it is")  # fmt: skip
+    plan = plan_clips(lessons, config)
     work = directory.path / "work"
     folders = _fit_lessons(config, learnt, lessons, work)
     base = model_of_window(model, config.block)

@@ -1,6 +1,6 @@
 """The chain behind ``mudg demo`` and ``mudg run``: every verb in order, each skipped when its result verifies.
 
-OUT/scene  OUT/fuse  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>  OUT/score
+OUT/scene  OUT/fuse  OUT/adapt  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>  OUT/score
 OUT/report.html  OUT/run.yaml (settings)  OUT/run.json (state, seconds per step over all continuations)
 """
 
@@ -136,14 +136,57 @@ def _has_semantics(scene: Path) -> bool:
     return all("semantics" in frame.labels for frame in read_scene(scene).frames)
 
 
+@dataclass(frozen=True)
+class _DiffusionUse:
+    """How the chain uses its diffusion model: with renders of the first fit in its input, and adapted to the log."""
+
+    renders: bool
+    adapts: bool
+
+
+def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
+    """How the chain is to use its diffusion model, said in a line where that is not what the settings say at first sight.
+
+    Raises:
+        UsageError: adaptation is asked for, but the model cannot be adapted or the log is too short.
+    """
+    from mudg.data.scene import read_scene
+    from mudg.models.mdm.files import uses_renders
+    from mudg.stages.adapting.clips import why_not
+
+    renders = uses_renders(config.synthesize.model)
+    if config.adaptation == "off" or (config.adaptation == "auto" and not renders):
+        return _DiffusionUse(renders, False)
+    loaded = read_scene(scene)
+    if config.adaptation == "auto" and loaded.source.recipe is not None:
+        return _DiffusionUse(renders, False)  # a generated city: what the model was trained on
+    cameras = config.synthesize.cameras
+    reason = why_not(loaded, replace(config.adapt, cameras=cameras)) if renders else "the model does not use renders"
+    if reason and config.adaptation == "on":
+        raise UsageError("the diffusion model cannot be adapted to this log", where="--adaptation", got=reason, remedy="leave it at auto")
+    if reason:
+        log.info(f"adapt: left out, {reason}")
+    return _DiffusionUse(renders, not reason)
+
+
 def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[Step, ...]:
-    from mudg.stages import fit, fuse, render, score, synthesize
+    from mudg.stages import adapt, fit, fuse, render, score, synthesize
 
     fused, virtual = out / "fuse", out / "synthesize"
+    diffusion = _diffusion_of(config, scene)
     plain = replace(config.fit, method=WITHOUT_DIFFUSION)
     guided = replace(config.fit, method=WITH_DIFFUSION, iterations=max(1, round(CONTINUED_SHARE * config.fit.iterations)))
     models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     renders = {name: out / "render" / name for name in models}
+
+    def adapted() -> Path:
+        settings = replace(config.adapt, model=config.synthesize.model, cameras=config.synthesize.cameras)
+        return adapt.run(settings, scene, fused, models[WITHOUT_DIFFUSION], out / "adapt", overwrite=overwrite)
+
+    def synthesized() -> Path:
+        settings = replace(config.synthesize, model=str(out / "adapt" / "model")) if diffusion.adapts else config.synthesize
+        rendered_scene = models[WITHOUT_DIFFUSION] if diffusion.renders else None
+        return synthesize.run(settings, scene, fused, virtual, fitted=rendered_scene, overwrite=overwrite)
 
     def fitted_guided() -> Path:
         return fit.run(
@@ -166,8 +209,8 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
         Step("fuse", "fuse", lambda: fuse.run(config.fuse, scene, fused, overwrite=overwrite)),
         Step("fit without diffusion", f"fit/{WITHOUT_DIFFUSION}",
              lambda: fit.run(plain, scene, fused, models[WITHOUT_DIFFUSION], overwrite=overwrite)),
-        Step("synthesize", "synthesize",
-             lambda: synthesize.run(config.synthesize, scene, fused, virtual, overwrite=overwrite)),
+        *((Step("adapt", "adapt", adapted),) if diffusion.adapts else ()),
+        Step("synthesize", "synthesize", synthesized),
         Step("fit with diffusion", f"fit/{WITH_DIFFUSION}", fitted_guided),
         Step("render without diffusion", f"render/{WITHOUT_DIFFUSION}", lambda: rendered(WITHOUT_DIFFUSION)),
         Step("render with diffusion", f"render/{WITH_DIFFUSION}", lambda: rendered(WITH_DIFFUSION)),

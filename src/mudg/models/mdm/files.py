@@ -69,6 +69,12 @@ def digest(path: Path | str) -> str:
     return store.digest(folder_of(path) / MODEL_FILE)
 
 
+def uses_renders(path: Path | str) -> bool:
+    """Whether a model's condition may hold renders of a fitted scene; published-type models' cannot."""
+    config = read_description(path).get("config")
+    return isinstance(config, Mapping) and bool(config.get("renders", LATER_FIELDS["renders"]))
+
+
 def config_from_dict(values: Any, where: str = "model configuration") -> MDMConfig:
     """Inverse of `dataclasses.asdict`.
 

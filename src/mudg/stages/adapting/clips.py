@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from mudg.base import seeds
-from mudg.base.types import Clip, Condition, Photo, View
+from mudg.base.types import Clip, Condition, Photo, Scene, View
 from mudg.core.pictures import resize_area
 from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions, image_tensor
 from mudg.data.clips.from_city import HELD_OUT, PATCH_PX, cut_patch
@@ -23,7 +23,7 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest
 from mudg.models.mdm.model import MDM
-from mudg.stages.adapting.lessons import LearntLog, Lesson
+from mudg.stages.adapting.lessons import LearntLog, Lesson, lessons_of
 from mudg.stages.config import AdaptConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model
@@ -44,6 +44,15 @@ def plan_clips(lessons: list[Lesson], config: AdaptConfig) -> Plan:
             plan.append((counts[scored] + (HELD_OUT if scored else 0), lesson, frames))
             counts[scored] += 1
     return plan
+
+
+def why_not(scene: Scene, config: AdaptConfig) -> str:
+    """Why a log cannot be adapted to; empty if it can."""
+    plan = plan_clips(lessons_of(scene, config), config)
+    scored = sum(number >= HELD_OUT for number, _, _ in plan)
+    if scored and scored < len(plan):
+        return ""
+    return f"it is too short: {len(plan)} clips of {config.block} frames, {scored} of them to score"
 
 
 def write_clips(config: AdaptConfig, log: LearntLog, plan: Plan, model: MDM, folders: dict[str, Path], out: Path) -> int:

@@ -30,6 +30,7 @@ from mudg.data.scene import SceneWriter, read_image, read_points, read_scene, re
 from mudg.models.scene.model import SceneModel
 from mudg.stages import fit, fuse
 from mudg.stages.config import AdaptConfig, FitConfig, FuseConfig
+from mudg.stages.config.fit import DensifyConfig, StartConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model
 
@@ -65,7 +66,9 @@ class LearntLog:
 
 
 FIT_WIDTHS = 2
-"""Lessons are fitted at this many times the width of the clips."""
+"""Lessons are fitted at this many times the width of the clips,"""
+MOST_GAUSSIANS, VOXEL_M = 40_000, 0.25
+"""with so many Gaussians at most, started from one point per cube of this size in metres."""
 
 
 def cameras_of(scene: Scene, config: AdaptConfig) -> tuple[str, ...]:
@@ -159,6 +162,7 @@ def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path
     settings = FitConfig(
         method="street_gaussians", iterations=config.fit_iterations, seed=config.seed, preview_every=1_000_000,
         width_px=min(log.width_px * FIT_WIDTHS, next(iter(scene.cameras.values())).width),
+        start=StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M), densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
     )  # fmt: skip
     fit.run(settings, folder / "scene", cloud, folder / "fit")
     return folder

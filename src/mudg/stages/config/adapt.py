@@ -27,7 +27,7 @@ class AdaptConfig:
     """Frames per training clip, and consecutive frames left out together."""
     held_out_every: int = Field(default=4, ge=2)
     """Every n-th block of frames is kept for comparing the adapted model with the one it started from."""
-    fit_iterations: int = Field(default=250, ge=1)
+    fit_iterations: int = Field(default=150, ge=1)
     """Optimisation steps of each of the fits that the clips are made with."""
     steps: int = Field(default=60, ge=1)
     """Training steps."""

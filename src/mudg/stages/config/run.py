@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
+from typing import Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.stages.config.adapt import AdaptConfig
 from mudg.stages.config.fit import FitConfig
 from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
 from mudg.stages.config.synthesize import SynthesizeConfig
@@ -18,9 +20,13 @@ from mudg.stages.config.views import RenderConfig, ScoreConfig
 class RunConfig:
     """Settings of all steps, in one group per step."""
 
+    adaptation: Literal["auto", "on", "off"] = "auto"
+    """Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not for
+    generated cities."""
     ingest: IngestConfig = Field(default_factory=IngestConfig)
     annotate: AnnotateConfig = Field(default_factory=AnnotateConfig)
     fuse: FuseConfig = Field(default_factory=FuseConfig)
+    adapt: AdaptConfig = Field(default_factory=AdaptConfig)
     synthesize: SynthesizeConfig = Field(default_factory=SynthesizeConfig)
     fit: FitConfig = Field(default_factory=FitConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)
@@ -52,7 +58,7 @@ def run_preset(fast: bool = False) -> RunConfig:
 
 def with_seed(config: RunConfig, seed: int) -> RunConfig:
     """The same settings with ``seed`` in every verb that draws random numbers."""
-    parts = {f.name: getattr(config, f.name) for f in fields(config)}  # type: ignore[arg-type]
+    parts = {f.name: part for f in fields(config) if is_dataclass(part := getattr(config, f.name))}  # type: ignore[arg-type]
     seeded = {n: replace(p, seed=seed) for n, p in parts.items() if any(f.name == "seed" for f in fields(p))}
     seeded["ingest"] = replace(config.ingest, city=replace(config.ingest.city, seed=seed))
     return replace(config, **seeded)
