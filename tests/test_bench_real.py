@@ -20,6 +20,8 @@ from mudg.data.city import CityWorld
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import SceneWriter, read_image, read_label, read_points, read_scene
 from mudg.data.scene.part import write_part
+from mudg.models.mdm import files as mdm_files
+from mudg.models.mdm.extended import extended
 from mudg.stages import fuse, ingest, render
 from mudg.stages.config import BenchConfig, FitConfig, FuseConfig, IngestConfig, RenderConfig, SynthesizeConfig
 
@@ -338,8 +340,10 @@ def test_the_command_compares_methods_under_every_protocol(made, city):
     assert page.count("data:image/jpeg;base64,") == 3 * (2 + 2 + 1 + 2) and 'src="city' not in page
 
 
-def test_finished_work_is_reused_and_a_method_can_be_added(made, city):
+def test_finished_work_is_reused_and_a_method_can_be_added(made, city, tmp_path):
     out, config = made
+    plain = mdm_files.load("embedded-tiny")
+    mdm_files.save(extended(plain, dataclasses.replace(plain.config, renders=True)), tmp_path / "model", "", {})
     watched = [
         out / "city" / "gap-1" / "fit" / "street_gaussians" / "run.json",
         out / "city" / "truth" / "lidar" / "run.json",
@@ -347,7 +351,7 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city):
     before = [path.stat().st_mtime_ns for path in watched]
     added = ("street_gaussians", "mudg_r+renders")
     more = dataclasses.replace(
-        config, methods=added, protocols=("gap-1", "gap-3"), model="embedded-tiny", variant=("rough=densify.kind:none,method:gs3d",)
+        config, methods=added, protocols=("gap-1", "gap-3"), model=str(tmp_path / "model"), variant=("rough=densify.kind:none,method:gs3d",)
     )  # fmt: skip
     real.run(more, [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
