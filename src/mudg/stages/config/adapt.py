@@ -29,7 +29,7 @@ class AdaptConfig:
     """Every n-th block of frames is kept for comparing the adapted model with the one it started from."""
     fit_iterations: int = Field(default=150, ge=1)
     """Optimisation steps of each of the fits that the clips are made with."""
-    steps: int = Field(default=60, ge=1)
+    steps: int = Field(default=40, ge=1)
     """Training steps."""
     batch_frames: int = Field(default=16, ge=1)
     """Frames per training step."""
