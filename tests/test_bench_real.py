@@ -478,9 +478,10 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
     monkeypatch.setattr(real.adapt, "run", fail)
     use = real.diffusion_use(job, "adapted")
     assert (use.sees, use.model) == ("renders", model) and "too short to adapt to, 1 clip" in use.note
-    without = dataclasses.replace(job, generator=SynthesizeConfig(model="embedded-tiny"))
-    use = real.diffusion_use(without, "adapted")
-    assert (use.sees, use.model) == ("points", "embedded-tiny") and "does not use renders" in use.note
+    plain = str(tmp_path / "plain")
+    mdm_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
+    use = real.diffusion_use(dataclasses.replace(job, generator=SynthesizeConfig(model=plain)), "adapted")
+    assert (use.sees, use.model) == ("points", plain) and "does not use renders" in use.note
     assert real.diffusion_use(job, "points") == real.DiffusionUse("points", model)
 
 

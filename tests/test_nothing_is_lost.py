@@ -59,6 +59,7 @@ from mudg.stages.config import (
 SMALL = MDMConfig(
     widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4, embed_width=16,
     codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(8, 16), refine_blocks=(1, 1), area_px=24576,
+    renders=True,
 )  # fmt: skip
 CITY = CityConfig(seed=3, n_frames=3, width=48, height=32, cameras=("front",), lidar_beams=8, lidar_azimuth_step_deg=4)
 

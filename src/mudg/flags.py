@@ -143,7 +143,8 @@ class Synthesize(Output):
     fused: Annotated[Path, arg(metavar="FOLDER")]
     """Point clouds written by fuse."""
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input."""
+    """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were
+    trained with renders."""
     settings: Annotated[stage_config.SynthesizeConfig, arg(name="")]
 
 

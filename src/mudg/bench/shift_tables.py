@@ -179,7 +179,8 @@ def markdown(doc: Mapping[str, Any]) -> str:
         f"# Off the recorded path: {logs_text(doc)} of the {settings['list']} list", "",
         f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
         f"frame held out; {settings['iterations']} iterations per fit, {further_of(settings)}; seed {settings['seed']}. Means over both "
-        "sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped codec, not LPIPS.", "",
+        "sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped "
+        "codec, not LPIPS.", "",
         *markdown_table(FACTS, [facts_of(entry) for entry in doc["logs"]]), "",
     ]  # fmt: skip
     headings = [heading for _, heading, _ in COLUMNS]

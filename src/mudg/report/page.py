@@ -54,15 +54,23 @@ class TrajectoryVideo:
         return shift_title(self.shift_m, self.name)
 
 
+@dataclass(frozen=True)
+class Adaptation:
+    """How the diffusion model was adapted: the content of ``adapt.json``, and pictures (title, data URI)."""
+
+    record: Mapping[str, Any]
+    pictures: Sequence[tuple[str, str]]
+
+
 def page(
     scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str, videos: Sequence[TrajectoryVideo],
-    columns: Sequence[str],
+    columns: Sequence[str], adaptation: Adaptation | None = None,
 ) -> str:  # fmt: skip
     """The text of the page.
 
     Args:
         scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
-        columns: panel columns in the order in which they stand in the videos.
+        columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if there was one.
     """
     scene = scores["scene"]
     heading, lead = headline(scores)
@@ -70,6 +78,8 @@ def page(
         "report.html.j2", title=f"{scene['id']}: mudg report", kicker=f"mudg report, {scene['id']} ({scene['dataset']})",
         heading=heading, lead=lead, scene=scene, facts=_facts(scores, ledger), rules=scores["rules"],
         methods=scores["methods"], settings=settings, provenance=_provenance(scores, ledger),
+        adaptation=None if adaptation is None else adaptation.record,
+        adaptation_pictures=() if adaptation is None else adaptation.pictures,
         **_player_values(scores, videos, columns), **_score_values(scores), **_time_values(ledger),
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from mudg.base import log, store
 from mudg.base.processes import computed_ahead
 from mudg.data.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
-from mudg.report.page import FPS, PANEL_ROWS, TrajectoryVideo, page
+from mudg.report.page import FPS, PANEL_ROWS, Adaptation, TrajectoryVideo, page
 from mudg.report.panels import panel_grid, panel_size
 
 PANEL_WIDTH: Final = 416
@@ -69,8 +69,18 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     ledger = store.read_json(out / "run.json")
     settings = out / "run.yaml"
     text = settings.read_text(encoding="utf-8") if settings.is_file() else ""
-    store.write_text(out / "report.html", page(scores, ledger, text, videos, list(_folders(out, scores))))
+    columns = list(_folders(out, scores))
+    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt")))
     return out / "report.html"
+
+
+def _adaptation(folder: Path) -> Adaptation | None:
+    """The adaptation in a finished folder of the verb adapt; None if there is no such folder."""
+    if not (folder / store.MANIFEST).is_file():
+        return None
+    names = (("Before", "before.png"), ("After", "after.png"))
+    pictures = [(title, _data_uri("image/png", (folder / name).read_bytes())) for title, name in names]
+    return Adaptation(store.read_json(folder / "adapt.json"), pictures)
 
 
 def _folders(out: Path, scores: Mapping[str, Any]) -> dict[str, dict[str, Path]]:

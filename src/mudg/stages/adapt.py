@@ -6,7 +6,7 @@ the `learn` verb, and the comparison on blocks of frames that were kept for it. 
     OUT/model/            the model to use: adapted, or the one started from if that is as good (same layout as `learn`'s)
     OUT/adapt.json        scores of both on the clips kept for scoring, and which was taken
     OUT/before.png, after.png   those clips: condition, generated and true colour, depth and classes, confidence
-    OUT/work/             fits, clips and training while it runs; removed at the end
+    OUT/work              fits, clips and training while it runs; removed at the end
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -
         frozen="denoiser" if config.trained == "refiner" else "nothing",
         data=LearnData(
             width=learnt.width_px, height=learnt.height_px, window=config.block, clips=str(clips), augment=config.augment, cities=train,
-            first_cities=train, clips_per_city=1, held_out=len(plan) - train, renders=True,
+            first_cities=train, clips_per_city=1, held_out=len(plan) - train, renders=False,  # the network is taken as it is
         ),
         optimizer=LearnOptimizer(
             batch_frames=config.batch_frames, lr=config.lr, full_window_share=1.0, warmup_steps=min(10, config.steps // 4),

@@ -34,7 +34,7 @@ class BenchConfig:
     """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
     1)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
+    """Number format of the diffusion model. auto: bfloat16 on CPUs with AMX or AVX-512 BF16, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
     """mdm, poses: number of torch threads."""
     seed: int = 0

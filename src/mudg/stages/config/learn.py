@@ -43,7 +43,8 @@ class LearnData:
     also learns five aspect ratios, all of about the area width x height. Cities for scoring stay plain."""
     renders: bool = True
     """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the condition, with patches
-    at the camera's resolution. Takes about half a minute per city."""
+    at the camera's resolution. Takes about half a minute per city. Not done for models that use no renders. Without it, or on recorded
+    logs, no model learns to use renders or gets a finisher."""
     textures: str = ""
     """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use (empty =
     none)."""
@@ -213,7 +214,7 @@ class LearnConfig:
     """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that
     mix frames. denoiser: train the refiner only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the computation. auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
+    """Number format of the computation. auto: bfloat16 on CPUs with AMX or AVX-512 BF16, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
     """Threads of the training process. Results are repeatable for the same number of threads."""
     data: LearnData = Field(default_factory=LearnData)

@@ -46,11 +46,12 @@ class SynthesizeConfig:
     width_px: int = Field(default=0, ge=0)
     """Image width in pixels at which the model works (0 = about the area it was trained at, in the camera's aspect ratio)."""
     full_size: bool = True
-    """Write views at the camera's size, with detail restored from warped recorded images. Off: at the size the model works at."""
+    """Write views at the camera's size: by the model's finisher, or, where it has none, with detail restored from warped recorded
+    images. Off: at the size the model works at."""
     held_out_images: bool = False
     """Also warp recorded images that are held out for scoring. Scores at those frames are then not meaningful."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 on CPUs with AMX, float32 elsewhere."""
+    """Number format of the diffusion model. auto: bfloat16 on CPUs with AMX or AVX-512 BF16, float32 elsewhere."""
     processes: int = Field(default=0, ge=0)
     """Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type models)."""
     guidance: float | None = Field(default=None, ge=1)

@@ -1,0 +1,186 @@
+"""Adapting the diffusion model to a log: lessons, clips, the choice at the end; what is held out stays unread."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mudg.base import palette, store
+from mudg.base.errors import InputError, UsageError
+from mudg.data.city import CityConfig, CityWorld
+from mudg.data.clips import shards
+from mudg.data.clips.from_city import HELD_OUT
+from mudg.data.scene import read_image, read_scene
+from mudg.models.mdm import files
+from mudg.models.mdm.extended import extended
+from mudg.stages import adapt, fit, fuse, ingest
+from mudg.stages.adapting import clips as adapt_clips
+from mudg.stages.adapting import lessons as adapt_lessons
+from mudg.stages.config import AdaptConfig, FitConfig, FuseConfig, IngestConfig
+from mudg.stages.fitting.storage import load_model
+
+SIZE = (96, 64)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A small drive, its cloud, a fit to it, and a tiny model that uses renders."""
+    root = tmp_path_factory.mktemp("adapt")
+    city = CityConfig(seed=5, n_frames=13, width=SIZE[0], height=SIZE[1], cameras=("front",))
+    ingest.run(IngestConfig(city=city, test_every=6), ingest.CITY, root / "scene")
+    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    fit.run(FitConfig(method="street_gaussians", iterations=30), root / "scene", root / "fuse", root / "fit")
+    before = files.load("embedded-tiny")
+    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+    files.save(extended(before, grown), root / "tiny", "", {})
+    return root
+
+
+def settings(log, **changes):
+    plain = AdaptConfig(model=str(log / "tiny"), shifts_m=(1.0,), block=2, held_out_every=3, fit_iterations=8, steps=3, batch_frames=4, lr=1e-3,
+                        precision="float32", processes=1)  # fmt: skip
+    return replace(plain, **changes)
+
+
+def adapted(log, out, **changes):
+    return adapt.run(settings(log, **changes), log / "scene", log / "fuse", log / "fit", out)
+
+
+@pytest.fixture(scope="module")
+def result(log, tmp_path_factory):
+    out = tmp_path_factory.mktemp("adapted") / "out"
+    adapted(log, out)
+    return out
+
+
+# lessons --------------------------------------------------------------------------------------------------------------
+
+
+def test_lessons_show_some_frames_and_ask_for_others(log):
+    scene = read_scene(log / "scene")
+    held_out = {f.id for f in scene.frames_in("test")}
+    found = {lesson.name: lesson for lesson in adapt_lessons.lessons_of(scene, settings(log))}
+    assert set(found) == {"shift+1", "gap0", "gap1"}
+    for lesson in found.values():
+        asked = {name for _, ids in lesson.truth for name in ids}
+        assert not held_out & (set(lesson.shown) | asked)
+        assert not lesson.shift_m or set(lesson.shown) >= asked
+        if not lesson.shift_m:
+            assert not set(lesson.shown) & asked
+    gaps = [{name for _, ids in found[n].truth for name in ids} for n in ("gap0", "gap1")]
+    assert not gaps[0] & gaps[1] and gaps[0] | gaps[1] == set(found["shift+1"].shown)
+
+
+def test_a_block_is_learned_or_scored_never_both(log):
+    scene, config = read_scene(log / "scene"), settings(log)
+    plan = adapt_clips.plan_clips(adapt_lessons.lessons_of(scene, config), config)
+    learned = {name for number, _, ids in plan if number < HELD_OUT for name in ids}
+    scored = {name for number, _, ids in plan if number >= HELD_OUT for name in ids}
+    assert learned and scored and not learned & scored
+    assert sorted(n for n, _, _ in plan if n < HELD_OUT) == list(range(sum(n < HELD_OUT for n, _, _ in plan)))
+
+
+def test_a_photograph_carried_nowhere_is_itself(log):
+    scene = read_scene(log / "scene")
+    frame = scene.frames[3]
+    photo = adapt_lessons.Photo(frame.view, read_image(scene, frame), None)
+    carried = adapt_lessons.carried(photo, frame.view, load_model(log / "fit"), 10_000)
+    assert np.abs(carried.rgb.astype(int) - photo.rgb).mean() < 1.0
+    assert np.array_equal(carried.view.world_from_cam, photo.view.world_from_cam)
+
+
+def test_a_photograph_carried_aside_is_nearer_to_the_truth_there(log):
+    scene = read_scene(log / "scene")
+    frame = scene.frames[3]
+    target = adapt_lessons.moved_view(scene, frame.view, 1.0)
+    photo = adapt_lessons.Photo(frame.view, read_image(scene, frame), None)
+    carried = adapt_lessons.carried(photo, target, load_model(log / "fit"), 10_000)
+    truth = CityWorld.from_source(scene.source).render(target).rgb * 255
+    assert np.abs(carried.rgb - truth).mean() < 0.8 * np.abs(photo.rgb - truth).mean()
+
+
+# clips ----------------------------------------------------------------------------------------------------------------
+
+
+def test_truth_is_photographs_measured_depth_and_the_models_own_guesses(log, tmp_path):
+    config = settings(log)
+    model = files.load(config.model)
+    learnt, lessons = adapt._open_log(config, model, log / "scene", log / "fuse", log / "fit")
+    lesson = lessons[0]
+    folder = adapt_lessons.fit_lesson(config, learnt, lesson, tmp_path / lesson.name)
+    clip = adapt_clips.ClipMaker(config, learnt, lesson, model, folder).make(lesson.truth[0][1], 0)
+    scene = read_scene(log / "scene")
+    photo = read_image(scene, next(f for f in scene.frames if f.id == lesson.truth[0][1][0]))
+    small = torch.from_numpy(adapt_clips.resize_area(photo, learnt.width_px, learnt.height_px)).permute(2, 0, 1) / 255
+    assert torch.allclose(clip.rgb[0], small.float())
+    measured, known = adapt_clips.measured_depth(scene, clip.condition.views[0])
+    assert known.any() and np.array_equal(clip.depth[0, 0].numpy()[known], measured[known])
+    assert clip.condition.renders is not None and clip.fine is not None
+    assert int(clip.semantics.max()) < palette.UNLABELLED  # classes are the model's own everywhere
+
+
+# the verb -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_model_is_ready_and_the_record_says_what_was_gained(log, result):
+    record = store.read_json(result / "adapt.json")
+    model = files.load(result / "model")
+    before = files.load(log / "tiny")
+    assert model.config == before.config
+    gain = record["after"]["psnr"] - record["before"]["psnr"]
+    assert record["adapted"] == (gain >= adapt.LEAST_GAIN_DB)
+    same = all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), before.state_dict().values(), strict=True))
+    assert same != record["adapted"]
+    assert not (result / "work").exists() and (result / "before.png").is_file() and (result / "after.png").is_file()
+
+
+def test_a_model_that_gains_nothing_is_not_taken(log, tmp_path):
+    adapted(log, tmp_path / "out", lr=1e-12, steps=1)
+    record = store.read_json(tmp_path / "out" / "adapt.json")
+    assert not record["adapted"]
+    assert store.sha256_file(tmp_path / "out" / "model" / "weights_00.safetensors") == store.sha256_file(log / "tiny" / "weights_00.safetensors")
+
+
+def test_held_out_frames_are_never_read(log, result, tmp_path):
+    damaged = tmp_path / "scene"
+    shutil.copytree(log / "scene", damaged)
+    (damaged / store.MANIFEST).unlink()
+    scene = read_scene(damaged)
+    for frame in scene.frames_in("test"):
+        (damaged / frame.image.path).write_bytes(b"not a picture")
+    again = adapt.run(settings(log), damaged, log / "fuse", log / "fit", tmp_path / "out")
+    for name in ("weights_00.safetensors",):
+        assert store.sha256_file(again / name) == store.sha256_file(result / "model" / name)
+
+
+def test_an_interrupted_adaptation_continues_to_the_same_model(log, result, tmp_path, monkeypatch):
+    write, made = shards.write_shard, []
+
+    def stop_after_two(folder, number, arrays):
+        write(folder, number, arrays)
+        made.append(number)
+        if len(made) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(adapt_clips, "write_shard", stop_after_two)
+    with pytest.raises(KeyboardInterrupt):
+        adapted(log, tmp_path / "out")
+    monkeypatch.setattr(adapt_clips, "write_shard", write)
+    again = adapted(log, tmp_path / "out")
+    for name in ("weights_00.safetensors",):
+        assert store.sha256_file(again / name) == store.sha256_file(result / "model" / name)
+
+
+def test_what_cannot_be_adapted_is_refused(log, tmp_path):
+    with pytest.raises(UsageError, match="renders"):
+        adapt.run(settings(log, model="embedded-tiny"), log / "scene", log / "fuse", log / "fit", tmp_path / "a")
+    with pytest.raises(InputError, match="too short|cannot be adapted"):
+        adapted(log, tmp_path / "b", block=20)
+    with pytest.raises(InputError, match="camera"):
+        adapted(log, tmp_path / "c", cameras=("rear",))
+    assert not json.loads((log / "tiny" / "model.json").read_text())["config"]["renders"] is False

@@ -1,0 +1,105 @@
+"""Short fits of training cities: the scene that is fitted, and the whole way from a city to a model that takes renders."""
+
+import json
+
+import numpy as np
+import pytest
+from toy_clips import tiny, with_settings
+
+from mudg import native
+from mudg.base.errors import UsageError
+from mudg.base.types import SweepPoints
+from mudg.core import metrics
+from mudg.data.clips import from_city
+from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.from_city import CityClipRules
+from mudg.data.scene import read_image, read_label, read_points, read_scene
+from mudg.models.mdm import files
+from mudg.stages import learn
+from mudg.stages.learning import city_fits
+from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning import models as learn_models
+
+pytestmark = pytest.mark.skipif(native.library() is None, reason="the native library is not built")
+RULES = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True)
+
+
+@pytest.mark.parametrize("realism", ["plain", "varied"])
+def test_the_scene_of_a_log_holds_what_its_clips_may_know(tmp_path, realism):
+    rules = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True, realism=realism)
+    log = from_city.make_log(rules, 3, 5)
+    images = from_city.given_images(rules, 3, log)
+    city_fits.write_scene(tmp_path / "scene", log, images)
+    scene = read_scene(tmp_path / "scene")
+    assert len(scene.frames) == len(images)
+    left = {(photo.view.camera.name, round(photo.view.time_s, 6)): photo for photo in images}
+    for frame in scene.frames:
+        photo = left.pop((frame.view.camera.name, round(frame.view.time_s, 6)))
+        assert np.array_equal(read_image(scene, frame), photo.rgb)
+        assert np.allclose(frame.view.world_from_cam, photo.view.world_from_cam)
+        assert frame.view.camera == photo.view.camera
+        if photo.semantics is not None:
+            assert np.array_equal(read_label(scene, frame, "semantics"), photo.semantics)
+    assert not left
+    assert {track.id for track in scene.tracks} == {track.id for track in log.tracks()}
+    assert len(scene.sweeps) == len(log.sweeps)
+    written = {(s.time_s, len(read_points(scene, s).xyz)) for s in scene.sweeps}
+    assert written == {(s.time_s, len(s.points.xyz)) for s in log.sweeps}
+    first = read_points(scene, scene.sweeps[0])
+    assert isinstance(first, SweepPoints)
+
+
+def test_a_model_that_uses_no_renders_needs_no_fits(tmp_path):
+    config = tiny(tmp_path)
+    assert learn_clips.clip_rules(config).fitted
+    assert not learn_clips.clip_rules(config, points_alone=True).fitted
+    assert not learn_clips.clip_rules(learn_clips.without_renders(config)).fitted
+
+
+def test_only_cities_with_renders_add_renders_and_a_finisher(tmp_path):
+    from_cities, _ = learn_models.starting_model(tiny(tmp_path))
+    assert from_cities.config.renders and from_cities.finisher is not None
+    model, _ = learn_models.starting_model(tiny(tmp_path, scenes=("log",)))
+    assert not model.config.renders and model.finisher is None
+    files.save(model, tmp_path / "plain", "", {})
+    files.save(from_cities, tmp_path / "rendered", "", {})
+    on_a_log = tiny(tmp_path, scenes=("log",), start=str(tmp_path / "plain"))
+    assert learn_models.starting_model(on_a_log)[1] == set()
+    kept, fresh = learn_models.starting_model(with_settings(on_a_log, start=str(tmp_path / "rendered")))
+    assert kept.config == from_cities.config and not fresh
+    grown, fresh = learn_models.starting_model(tiny(tmp_path, start=str(tmp_path / "plain")))
+    assert grown.config == from_cities.config and fresh == {"finisher"}
+
+
+def test_without_patches_a_finisher_keeps_its_weights(tmp_path):
+    model, fresh = learn_models.starting_model(tiny(tmp_path))
+    learn_models.hold_finisher(model, fresh, patches=True)
+    assert all(p.requires_grad for p in model.finisher.parameters())
+    with pytest.raises(UsageError, match="no patches"):
+        learn_models.hold_finisher(model, fresh, patches=False)
+    learn_models.hold_finisher(model, set(), patches=False)
+    assert not any(p.requires_grad for p in model.finisher.parameters())
+    assert all(p.requires_grad for p in model.net.parameters())
+
+
+@pytest.mark.slow
+def test_a_city_is_fitted_and_learnt_from(tmp_path, monkeypatch):
+    """From the generator over a short fit to a trained model with finisher; the renders resemble what they show."""
+    monkeypatch.setattr(city_fits, "FEWEST_STEPS", 60)
+    monkeypatch.setattr(city_fits, "MOST_STEPS", 100)
+    for city in (0, from_city.HELD_OUT):
+        assert city_fits.write_fitted_city(RULES, city, tmp_path / "clips") == (2 if city == 0 else len(from_city.shifts_of(RULES, city)))
+    shifted = clip_shards.read_clip(tmp_path / "clips", 0, 0, [0, 1])
+    shown = shifted.condition.renders
+    assert shifted.fine is not None and shifted.fine.clip.condition.renders is not None
+    assert float(metrics.psnr(shown.color, shifted.rgb)) > 12
+    assert float(shown.alpha.mean()) > 0.2 and float(shown.certainty.max()) > 0.1
+    assert bool((shown.certainty <= shown.alpha + 1 / 255).all())
+    solid = (shown.alpha > 0.9) & (shifted.depth < 60)
+    assert float(((shown.depth - shifted.depth).abs() / shifted.depth)[solid].median()) < 0.3
+    config = tiny(tmp_path / "clips", cities=1, first_cities=1, window=2, steps=2, batch_frames=2, seed=0)
+    made = learn.run(config, tmp_path / "run")
+    model = files.load(made)
+    assert model.finisher is not None and model.config.renders
+    assert "fine_rgb" in (tmp_path / "run" / "log.jsonl").read_text()
+    assert json.loads((made / "model.json").read_text())["facts"]["held_out"]["clips"] > 0
