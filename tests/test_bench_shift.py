@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from test_bench import SMALL
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
@@ -18,6 +19,8 @@ from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import LogRules
 from mudg.data.clips import from_city
 from mudg.data.observations import list_observation_sets, read_observations
+from mudg.models.mdm import files as mdm_files
+from mudg.models.mdm.model import MDM
 from mudg.stages import score_truth
 from mudg.stages.config import BenchConfig
 
@@ -221,6 +224,28 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     )  # fmt: skip
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
     assert [m["name"] for m in store.read_json(again / "bench.json")["methods"]] == ["street_gaussians", "still"]
+
+
+def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp_path):
+    out, config = made
+    torch.manual_seed(0)
+    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
+    log = out / str(city_logs.DEVELOPMENT[0])
+    variants = ("louder=virtual.color_weight:2", "flat=sh_degree:1")
+    bench_shift.run(
+        dataclasses.replace(config, methods=("mudg_s",), videos=False, model=str(tmp_path / "model"), variant=variants), out,
+        rules=TINY, distances_m=(3.0,), overwrite=True,
+    )  # fmt: skip
+    states = {name: store.read_json(log / "fit" / name / "run.json") for name in ("mudg_s", "louder", "flat")}
+    first = store.digest(log / "fit" / "street_gaussians")
+    assert states["mudg_s"]["inputs"]["start"] == states["louder"]["inputs"]["start"] == first
+    assert states["flat"]["inputs"]["start"] == store.digest(log / "start" / "flat") != first
+    assert not (log / "start" / "louder").exists()
+    for state in states.values():
+        assert state["summary"]["steps"] == 15
+    assert store.digest(log / "fit" / "louder" / "gaussians.safetensors") != store.digest(log / "fit" / "mudg_s" / "gaussians.safetensors")
+    assert store.read_json(log / "synthesize" / "run.json")["inputs"]["fitted"] == first
+    assert "generated with renders of that fit" in (out / "bench.md").read_text()
 
 
 def test_stored_truth_is_the_drawn_truth(made):

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
 
 Item = TypeVar("Item")
 
-Sink = Callable[[dict[str, Any]], None]
-"""Takes messages as JSON values: ``{"info": text}``, ``{"warn": text}`` or ``{"progress": text}``."""
-
 _quiet = False
 _said: set[str] = set()
-_sink: Sink | None = None
 
 
 def set_quiet(quiet: bool) -> None:
@@ -28,12 +24,6 @@ def is_quiet() -> bool:
     return _quiet
 
 
-def set_sink(sink: Sink | None) -> None:
-    """Hand all messages and progress to ``sink`` instead of writing them (a child process tells its parent); None = write."""
-    global _sink
-    _sink = sink
-
-
 def _console():
     from rich.console import Console
 
@@ -42,11 +32,7 @@ def _console():
 
 def info(message: str) -> None:
     """Say something worth knowing, once, on stderr."""
-    if _quiet:
-        return
-    if _sink is not None:
-        _sink({"info": message})
-    else:
+    if not _quiet:
         _console().print(message, markup=False)
 
 
@@ -59,10 +45,7 @@ def info_once(message: str) -> None:
 
 def warn(message: str) -> None:
     """Say that something is wrong but the work goes on."""
-    if _sink is not None:
-        _sink({"warn": message})
-    else:
-        _console().print(f"warning: {message}", markup=False, style="yellow")
+    _console().print(f"warning: {message}", markup=False, style="yellow")
 
 
 class ProgressTask:
@@ -76,7 +59,7 @@ class ProgressTask:
         self._progress = None
         self._id = None
         self._last_line_s = time.monotonic()
-        if _quiet or _sink is not None:
+        if _quiet:
             return
         console = _console()
         if console.is_terminal:
@@ -99,10 +82,6 @@ class ProgressTask:
         self._done += count
         if self._progress is not None and self._id is not None:
             self._progress.update(self._id, completed=self._done, text=self._text)
-        elif _sink is not None and not _quiet:
-            if time.monotonic() - self._last_line_s > 0.3:
-                self._last_line_s = time.monotonic()
-                _sink({"progress": f"{self._description}: {self._done}/{self._total} {self._text}".rstrip()})
         elif not _quiet and (time.monotonic() - self._last_line_s > 10.0):
             self._last_line_s = time.monotonic()
             info(f"{self._description}: {self._done}/{self._total} {self._text}")

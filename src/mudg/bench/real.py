@@ -6,8 +6,8 @@ hiding, the verbs of the chain are run with folders of their own. They are given
 
     OUT/<log>/scene                                         the whole log; read by truth and scores alone
     OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out frames
-    OUT/<log>/<split>/fuse virtual/<kind> fit/<method>      what methods make of it
-    OUT/<log>/<split>/nearest_fill mudg_r[+renders] render/<method>   the views to score
+    OUT/<log>/<split>/fuse adapt fit/<method> virtual/<sees>   what methods make of it; what the diffusion model sees
+    OUT/<log>/<split>/nearest_fill generated/<sees> render/<method>   the views to score
     OUT/<log>/truth/<protocol>  OUT/<log>/score/<protocol>/<method>
     OUT/bench.json  OUT/bench.md  OUT/page.html
 """
@@ -19,7 +19,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from mudg import native
 from mudg.base import config as configuration
@@ -29,6 +29,7 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, is_temporary, refuse_overlap
 from mudg.base.types import Scene
 from mudg.bench import real_measure, real_page, real_tables, real_truth
+from mudg.bench.chain import FitChain, learns_virtual, made
 from mudg.bench.real_protocols import (
     PROTOCOLS,
     SPLITS,
@@ -44,8 +45,10 @@ from mudg.data.scene import SCENE_FILES, read_scene
 from mudg.data.scene.part import write_part
 from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
-from mudg.stages import annotate, fit, fuse, ingest, render, score, synthesize
+from mudg.stages import adapt, annotate, fuse, ingest, render, score, synthesize
+from mudg.stages.adapting.clips import why_not
 from mudg.stages.config import (
+    AdaptConfig,
     AnnotateConfig,
     BenchConfig,
     FitConfig,
@@ -62,40 +65,45 @@ _PART: Final = VerbOutput("part of a scene", 1, SCENE_FILES)
 _NAME: Final = re.compile(r"[^A-Za-z0-9_.+-]+")
 
 
+Sees = Literal["points", "renders", "adapted"]
+"""How a method uses its diffusion model: with points and photographs alone, with renders of the first fit too, or this way and adapted
+to the log."""
+LESS: Final[dict[Sees, str]] = {"adapted": "", "renders": "-no-adapt", "points": "-no-renders"}
+"""Ending of the names of methods, by what they use of the chain."""
+_LESS_TITLES: Final[dict[Sees, str]] = {"adapted": "", "renders": ", model not adapted", "points": ", points alone"}
+
+
 @dataclass(frozen=True)
 class RealMethod:
     """A method to compare, as plain values.
 
     Args:
-        name: in tables and folders. fit: method of ``mudg fit``; empty for methods without a fit. renders: the diffusion model sees the
-            renders of a fit to recorded views. changes: settings of the fit beside those of all fits, as overrides.
+        name: in tables and folders. fit: method of ``mudg fit``; empty for methods without a fit. sees: how it uses the diffusion model,
+            as far as model and log allow; empty for methods without one. changes: settings of the fit in place of those of all fits.
     """
 
     name: str
     fit: str = ""
-    renders: bool = False
+    sees: Sees | Literal[""] = ""
     changes: FitConfig | None = None
 
     @property
     def title(self) -> str:
         """For tables."""
-        return title_of(self.name.partition("+")[0]) + (", renders as condition" if self.renders else "")
-
-    @property
-    def learns_virtual(self) -> bool:
-        """Whether its fit uses generated views."""
-        return (self.fit if self.changes is None else self.changes.method) == FULL
+        if not self.sees or self.changes is not None:
+            return title_of(self.name)
+        return title_of(self.name.removesuffix(LESS[self.sees])) + _LESS_TITLES[self.sees]
 
 
 METHOD_ROWS: Final[tuple[RealMethod, ...]] = (
     RealMethod(FILL),
     RealMethod("gs3d", "gs3d"),
     RealMethod(BASE, BASE),
-    RealMethod(DIFFUSION),
-    RealMethod(f"{DIFFUSION}+renders", renders=True),
-    RealMethod(FULL, FULL),
-    RealMethod(f"{FULL}+renders", FULL, renders=True),
+    *(RealMethod(DIFFUSION + ending, sees=sees) for sees, ending in LESS.items()),
+    *(RealMethod(FULL + ending, FULL, sees) for sees, ending in LESS.items()),
 )
+"""All methods; ``mudg_r`` and ``mudg_s`` are the chain of ``mudg run`` for recorded logs, the rows after each leave out parts of it."""
+ABLATION: Final = (BASE, *(row.name for row in METHOD_ROWS if row.sees))
 
 
 @dataclass(frozen=True)
@@ -107,8 +115,9 @@ class SplitJob:
     split: Split
     protocols: tuple[Protocol, ...]
     rows: tuple[RealMethod, ...]
-    plain: FitConfig
+    usual: FitConfig
     generator: SynthesizeConfig
+    adapt: AdaptConfig
     shown: tuple[str, ...]
     overwrite: bool
 
@@ -127,19 +136,15 @@ class SplitJob:
         """The clouds."""
         return self.folder / "fuse"
 
-    def made(self, make: Callable[[bool], Path]) -> Path:
-        """Make or reuse a folder; what other settings left there is replaced only if that was asked for."""
-        try:
-            return make(False)
-        except UsageError:
-            if not self.overwrite:
-                raise
-            return make(True)
+    @property
+    def fits(self) -> FitChain:
+        """The fits."""
+        return FitChain(self.folder, self.scene, self.fused, self.usual, self.overwrite)
 
 
 def run(
     config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: bool = False,
-    virtual_shifts_m: Sequence[float] = VIRTUAL_SHIFTS_M,
+    virtual_shifts_m: Sequence[float] = VIRTUAL_SHIFTS_M, adaptation: AdaptConfig | None = None,
 ) -> Path:  # fmt: skip
     """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
 
@@ -149,6 +154,7 @@ def run(
         out: what lies there of the same settings is reused; logs, protocols and methods may be added later.
         overwrite: replace what other settings left there.
         virtual_shifts_m: lateral shifts, metres, of the generated views that fits learn from.
+        adaptation: how the diffusion model is adapted to a log; its model, cameras, precision and seed are those of ``config``.
 
     Raises:
         UsageError: no log, an unknown method or protocol, two logs of one name, or ``out`` holds something else. Whatever a verb raises.
@@ -159,7 +165,10 @@ def run(
         out, {"model": mdm_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}}
     )
     _refuse_foreign(Path(out))
-    plain = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed)
+    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed)
+    training = replace(
+        adaptation or AdaptConfig(), model=config.model, precision=config.precision, processes=1, seed=config.seed
+    )
     generator = SynthesizeConfig(
         shifts_m=tuple(virtual_shifts_m), model=config.model, precision=config.precision, processes=1, seed=config.seed
     )
@@ -167,8 +176,8 @@ def run(
     splits = tuple(dict.fromkeys(protocol.split for protocol in protocols))
     jobs = [
         SplitJob(
-            Path(out) / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, plain, generator,
-            config.shown, overwrite,
+            Path(out) / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, usual, generator,
+            training, config.shown, overwrite,
         )
         for name, scene in scenes.items() for split in splits
     ]  # fmt: skip
@@ -198,11 +207,13 @@ def rows_of(config: BenchConfig) -> tuple[RealMethod, ...]:
     unknown = sorted(set(config.methods) - set(known))
     if unknown or not config.methods:
         raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
-    rows = [row for row in METHOD_ROWS if row.name in config.methods]
-    plain = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed)
+    wanted = {*config.methods, *(ABLATION if config.ablation else ())}
+    rows = [row for row in METHOD_ROWS if row.name in wanted]
+    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed)
     for text in config.variant:
-        made = variant_of(text, plain)
-        rows.append(RealMethod(made.name, FULL, changes=made.fit))
+        changed = variant_of(text, usual)
+        learns = changed.fit is not None and learns_virtual(changed.fit)
+        rows.append(RealMethod(changed.name, FULL, "adapted" if learns else "", changed.fit))
     names = [row.name for row in rows]
     if len(set(names)) < len(names):
         raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
@@ -257,7 +268,7 @@ def _scene_of(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> 
 
 def _row_values(row: RealMethod) -> dict[str, Any]:
     changes = None if row.changes is None else configuration.to_dict(row.changes)
-    return {"name": row.name, "title": row.title, "fit": row.fit, "renders": row.renders, "changes": changes}
+    return {"name": row.name, "title": row.title, "fit": row.fit, "sees": row.sees, "changes": changes}
 
 
 def settings_of(config: BenchConfig, virtual_shifts_m: Sequence[float]) -> dict[str, Any]:
@@ -307,6 +318,7 @@ def make_split(job: SplitJob) -> dict[str, Any]:
         return {
             "split": job.split.name,
             "held_out": {},
+            "diffusion": {},
             "protocols": {p.name: {"left_out": held.reason} for p in job.protocols},
         }
     write_seen(job, whole, held)
@@ -314,10 +326,11 @@ def make_split(job: SplitJob) -> dict[str, Any]:
     truths: dict[str, Path] = {}
     for protocol in job.protocols:
         folder = job.out / "truth" / protocol.name
-        truths[protocol.name] = job.made(
+        truths[protocol.name] = made(
             lambda o, p=protocol, f=folder: real_truth.write_targets(
                 p, job.source, job.scene, held.frames, cameras, f, overwrite=o
-            )
+            ),
+            job.overwrite,
         )
     found: dict[str, Any] = {}
     wanted = [p for p in job.protocols if len(real_truth.read_targets(truths[p.name]))]
@@ -326,18 +339,22 @@ def make_split(job: SplitJob) -> dict[str, Any]:
         left_out = {} if protocol in wanted else {"left_out": targets.reason}
         found[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}, **left_out}
     if wanted:
-        job.made(lambda o: fuse.run(FuseConfig(), job.scene, job.fused, overwrite=o))
+        made(lambda o: fuse.run(FuseConfig(), job.scene, job.fused, overwrite=o), job.overwrite)
+    used: dict[str, dict[str, str]] = {}
     for row in job.rows if wanted else ():
-        views = views_of(job, row, cameras)
+        views, use = views_of(job, row, cameras)
+        if use is not None:
+            used[row.name] = {"sees": use.sees, "note": use.note}
         for protocol in wanted:
             scored = job.out / "score" / protocol.name / row.name
-            job.made(
+            made(
                 lambda o, p=protocol, v=views, s=scored: real_measure.write_scores(
                     p, job.source, truths[p.name], v, s, overwrite=o
-                )
+                ),
+                job.overwrite,
             )
             found[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
-    return {"split": job.split.name, "held_out": dict(held.facts), "protocols": found}
+    return {"split": job.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": found}
 
 
 def write_seen(job: SplitJob, whole: Scene, held: HeldOut) -> None:
@@ -354,7 +371,7 @@ def write_seen(job: SplitJob, whole: Scene, held: HeldOut) -> None:
     labels = shown
     if not all(annotate.wanted_labels(settings) <= set(f.labels) for f in whole.frames if f.id in frames):
         labels = job.folder / "annotate"
-        job.made(lambda o: annotate.run(settings, shown, labels, overwrite=o))
+        made(lambda o: annotate.run(settings, shown, labels, overwrite=o), job.overwrite)
     labelled = read_scene(labels)
     inputs = {"shown": store.digest(labels), **inputs}
     _write(job, job.scene, inputs, lambda root: write_part(labelled, root, frames, sweeps, places))
@@ -373,7 +390,7 @@ def _write(job: SplitJob, out: Path, inputs: dict[str, str], write: Callable[[Pa
         folder.finish({"frames": len(scene.frames), "sweeps": len(scene.sweeps)})
         return folder.path
 
-    job.made(make)
+    made(make, job.overwrite)
 
 
 def _asked_cameras(job: SplitJob, whole: Scene, held: HeldOut) -> tuple[str, ...]:
@@ -387,42 +404,79 @@ def _asked_cameras(job: SplitJob, whole: Scene, held: HeldOut) -> tuple[str, ...
 # ---- methods ----
 
 
-def views_of(job: SplitJob, row: RealMethod, cameras: tuple[str, ...]) -> Path:
-    """The folder with a method's views at all places that are asked for, made if need be."""
+def views_of(job: SplitJob, row: RealMethod, cameras: tuple[str, ...]) -> tuple[Path, DiffusionUse | None]:
+    """The folder with a method's views at all places that are asked for, made if need be; and how it used the diffusion model."""
     places = job.folder / "asked" if (job.folder / "asked").is_dir() else job.scene
     drawn = RenderConfig(cameras=cameras, shifts_m=job.split.shifts_m, video=False)
     if row.name == FILL:
         paths = render.trajectories(read_scene(places), drawn)
-        return job.made(lambda o: write_fill(job.scene, job.fused, paths, job.folder / FILL, overwrite=o))
-    if not row.fit:
-        return generated(job, row, cameras, job.split.shifts_m, job.folder / row.name)
-    model, views = fitted(job, row), job.folder / "render" / row.name
-    return job.made(lambda o: render.run(drawn, places, model, views, overwrite=o))
+        fill = job.folder / FILL
+        return made(lambda o: write_fill(job.scene, job.fused, paths, fill, overwrite=o), job.overwrite), None
+    use = diffusion_use(job, row.sees) if row.sees else None
+    if use is not None and not row.fit:
+        return generated(job, use, cameras, job.split.shifts_m, job.folder / "generated" / use.sees), use
+    model, views = fitted(job, row, use), job.folder / "render" / row.name
+    return made(lambda o: render.run(drawn, places, model, views, overwrite=o), job.overwrite), use
 
 
-def fitted(job: SplitJob, row: RealMethod) -> Path:
+def fitted(job: SplitJob, row: RealMethod, use: DiffusionUse | None) -> Path:
     """The fit of a method, made if need be, with the generated views that it learns from."""
-    settings = row.changes or configuration.load(FitConfig, job.plain, overrides={"method": row.fit})
+    settings = row.changes or configuration.load(FitConfig, job.usual, overrides={"method": row.fit})
     virtual = None
-    if row.learns_virtual:
+    if use is not None:
         camera = first_camera(read_scene(job.scene), job.shown)
-        folder = job.folder / "virtual" / ("renders" if row.renders else "plain")
-        virtual = generated(job, row, (camera,), job.generator.shifts_m, folder)
-    out = job.folder / "fit" / row.name
-    return job.made(lambda o: fit.run(settings, job.scene, job.fused, out, observations=virtual, overwrite=o))
+        virtual = generated(job, use, (camera,), job.generator.shifts_m, job.folder / "virtual" / use.sees)
+    return job.fits.fitted(row.name, settings, virtual)
 
 
-def generated(job: SplitJob, row: RealMethod, cameras: tuple[str, ...], shifts_m: tuple[float, ...], out: Path) -> Path:
-    """Views of the diffusion model, made if need be; with ``renders`` on top of those of the fit without diffusion."""
-    settings = replace(job.generator, cameras=cameras, shifts_m=shifts_m, model=model_of(job, row))
-    below = next(r for r in METHOD_ROWS if r.name == BASE) if row.renders else None
-    model = None if below is None else fitted(job, below)
-    return job.made(lambda o: synthesize.run(settings, job.scene, job.fused, out, fitted=model, overwrite=o))
+@dataclass(frozen=True)
+class DiffusionUse:
+    """How a method uses the diffusion model on a log: what is left of what it asks for, the model, and a sentence about it."""
+
+    sees: Sees
+    model: str
+    note: str = ""
 
 
-def model_of(job: SplitJob, row: RealMethod) -> str:
-    """The diffusion model of a method."""
-    return job.generator.model
+def diffusion_use(job: SplitJob, asked: Sees) -> DiffusionUse:
+    """How the diffusion model is used where a method asks for ``asked``; adapted to what the method sees of the log if need be.
+
+    What the model or the log does not allow is left out, and the note says so.
+    """
+    given = job.generator.model
+    if asked == "points":
+        return DiffusionUse("points", given)
+    if not mdm_files.uses_renders(given):
+        return DiffusionUse("points", given, "the model does not use renders, so it sees points alone")
+    if asked == "renders":
+        return DiffusionUse("renders", given)
+    scene = read_scene(job.scene)
+    settings = replace(job.adapt, cameras=(first_camera(scene, job.shown),))
+    reason, folder = why_not(scene, settings), job.folder / "adapt"
+    if not reason:
+        first = job.fits.first()
+        try:
+            made(lambda o: adapt.run(settings, job.scene, job.fused, first, folder, overwrite=o), job.overwrite)
+        except InputError as error:
+            reason = f"{error.what}, {error.got}" if error.got else error.what
+    if reason:
+        return DiffusionUse("renders", given, f"the model was not adapted to the log: {reason}")
+    record = store.read_json(folder / "adapt.json")
+    numbers = f"{record['before']['psnr']:.2f} dB before, {record['after']['psnr']:.2f} dB after"
+    if not record["adapted"]:
+        return DiffusionUse("renders", given, f"adapting did not help ({numbers}), so the model was taken as it is")
+    return DiffusionUse("adapted", str(folder / "model"), f"the model was adapted ({numbers})")
+
+
+def generated(
+    job: SplitJob, use: DiffusionUse, cameras: tuple[str, ...], shifts_m: tuple[float, ...], out: Path
+) -> Path:
+    """Views of the diffusion model, made if need be; on top of renders of the first fit unless it sees points alone."""
+    settings = replace(job.generator, cameras=cameras, shifts_m=shifts_m, model=use.model)
+    first = None if use.sees == "points" else job.fits.first()
+    return made(
+        lambda o: synthesize.run(settings, job.scene, job.fused, out, fitted=first, overwrite=o), job.overwrite
+    )
 
 
 # ---- the document ----
@@ -437,5 +491,6 @@ def _entry_of(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[
     return {
         "log": name, "id": loaded.id, "dataset": loaded.source.dataset, "digest": store.digest(scene), "cameras": cameras,
         "sweeps": len(loaded.sweeps), "tracks": len(loaded.tracks), "held_out": {s["split"]: s["held_out"] for s in splits},
+        "diffusion": {s["split"]: s["diffusion"] for s in splits},
         "protocols": {protocol: found for s in splits for protocol, found in s["protocols"].items()},
     }  # fmt: skip

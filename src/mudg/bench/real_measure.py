@@ -1,13 +1,13 @@
 """Scores of ``mudg bench real``: the columns of its tables, and a method's values under a protocol.
 
 A column adds up arrays of numbers over the views of a place (a camera, or a distance beside the path); its value is read from the sum.
-The mean of a method is that of its places.
+A method's value on a log is the mean over its places; or, under a protocol that pools, the value of the sum over all places.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -37,7 +37,7 @@ from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, apart_m
 PERCEPTUAL_VIEWS: Final = 12
 """Views of each place at which the perceptual distance is computed, evenly spread."""
 _MOST_DB: Final = 100.0
-_OUTPUT: Final = VerbOutput("bench real score", 1, ("metrics.json", "pictures/*.jpg"))
+_OUTPUT: Final = VerbOutput("bench real score", 2, ("metrics.json", "pictures/*.jpg"))
 
 Sum = NDArray[np.float64]
 
@@ -106,13 +106,25 @@ def _photo(compare: Callable[[Tensor, Tensor, Tensor | None], float], name: str 
     return of
 
 
+def _squared_color(sight: Sight) -> Sum | None:
+    """The squared error of colour summed over the channels of the seen pixels."""
+    mask = sight.mask("seen")
+    if sight.photo is None or mask is None:
+        return None
+    apart = (sight.rgb - sight.photo)[:, mask[0]].double()
+    return np.array([float(apart.square().sum()), float(apart.numel())])
+
+
 def _perceptual(name: str = "") -> Callable[[Sight], Sum | None]:
+    """The perceptual distance of a view; of the part under a mask, with the number of its pixels as weight."""
+
     def of(sight: Sight) -> Sum | None:
         mask = sight.mask(name) if name else None
         if sight.distance is None or sight.photo is None or (mask is not None and not bool(mask.any())):
             return None
         found = sight.distance(metrics.Pair(sight.rgb, None, None, sight.photo, None, None, None, mask))
-        return None if found is None else np.array([found, 1.0])
+        weight = 1.0 if mask is None else float(mask.sum())
+        return None if found is None else np.array([found * weight, weight])
 
     return of
 
@@ -201,10 +213,10 @@ COLUMNS: Final[dict[str, Column]] = {
     "perceptual": Column("perceptual", 4, _perceptual(), _mean, lower=True, ratio=True),
     "psnr_dynamic": Column("PSNR of dynamic objects", 2, _photo(metrics.psnr, "dynamic"), _mean),
     "psnr_upper": Column("PSNR, upper third", 2, _photo(metrics.psnr, "upper"), _mean),
-    "psnr_seen": Column("PSNR dB, seen", 2, _photo(metrics.psnr, "seen"), _mean),
+    "psnr_seen": Column("PSNR dB, seen", 2, _squared_color, _decibels),
     "perceptual_seen": Column("perceptual, seen", 4, _perceptual("seen"), _mean, lower=True, ratio=True),
     "abs_rel": Column("AbsRel", 4, _depth(_relative), _mean, lower=True, ratio=True),
-    "abs_rel_seen": Column("AbsRel, seen", 4, _depth(_relative, "seen"), _mean, lower=True, ratio=True),
+    **{name: column for name, column in _depth_columns("seen").items() if not name.startswith("point_")},
     **_depth_columns("static"),
     **_depth_columns("dynamic"),
     "miou": Column("mIoU", 3, _confusion, _mean_iou),
@@ -261,18 +273,30 @@ def perceptual_views(targets: Targets) -> set[int]:
 
 
 def values_of(protocol: Protocol, sums: Mapping[str, Mapping[str, Sum]]) -> dict[str, Any]:
-    """Values by place and their mean, from the sums; a column without a number says so."""
-    places: dict[str, dict[str, float | str]] = {}
-    for place, found in sums.items():
-        closed = {name: COLUMNS[name].close(found[name]) if name in found else None for name in protocol.columns}
-        places[place] = {
-            name: "none" if value is None or math.isnan(value) else round(value, 6) for name, value in closed.items()
-        }
+    """Values by place, and their mean or that of all together, from the sums; a column without a number says so."""
+    places = {place: _closed(protocol, found) for place, found in sums.items()}
+    if protocol.pooled:
+        return {"mean": _closed(protocol, _added(sums.values())), "places": places}
     mean: dict[str, float | str] = {}
     for name in protocol.columns:
         numbers = [value for of in places.values() if not isinstance(value := of[name], str)]
         mean[name] = round(sum(numbers) / len(numbers), 6) if numbers else "none"
     return {"mean": mean, "places": places}
+
+
+def _closed(protocol: Protocol, found: Mapping[str, Sum]) -> dict[str, float | str]:
+    """The values of sums by column."""
+    closed = {name: COLUMNS[name].close(found[name]) if name in found else None for name in protocol.columns}
+    return {name: "none" if value is None or math.isnan(value) else round(value, 6) for name, value in closed.items()}
+
+
+def _added(parts: Iterable[Mapping[str, Sum]]) -> dict[str, Sum]:
+    """Sums by column of several places together."""
+    total: dict[str, Sum] = {}
+    for part in parts:
+        for name, found in part.items():
+            total[name] = total[name] + found if name in total else found
+    return total
 
 
 def sight_of(

@@ -55,12 +55,6 @@ class OwnedPoints:
         return OwnedPoints(self.xyz[chosen], self.owner[chosen], self.ids[chosen], self.gap_deg)
 
 
-def lidar_point_classes(scene: Scene, sweep: Sweep) -> NDArray[np.uint8] | None:
-    """Train ids u8[N] of the points of a sweep as the log gives them (255 = unlabelled), or None where it gives none."""
-    found = getattr(read_points(scene, sweep), "semantics", None)
-    return None if found is None else np.asarray(found, np.uint8)
-
-
 class LogPoints:
     """The LiDAR points of a log; sweeps are read once."""
 
@@ -107,7 +101,7 @@ class LogPoints:
             xyz = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
             for number, local in owned.items():
                 xyz[owner == number] = local
-            ids = lidar_point_classes(self.scene, sweep)
+            ids = points.classes
             known = np.full(len(xyz), palette.UNLABELLED, np.uint8) if ids is None else ids
             self._kept[sweep.id] = OwnedPoints(xyz, owner, known, largest_beam_gap(points.xyz))
         return self._kept[sweep.id]

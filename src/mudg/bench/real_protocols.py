@@ -40,6 +40,7 @@ class Protocol:
         name: in tables. family: as asked for with ``--protocols``. title: heading. split: name of a ``Split``.
         shifts_m: lateral shifts of the scored views. every: every n-th view of a camera counts, beginning with the second where n > 1.
         maps: what the truth of a view holds. columns: names in ``real_measure.COLUMNS``, in the order of the table.
+        pooled: a log's value is that of all its places together, so that a place weighs what it adds to the sums; else their mean.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Protocol:
     columns: tuple[str, ...]
     shifts_m: tuple[float, ...] = (0.0,)
     every: int = 1
+    pooled: bool = False
 
 
 SPLITS: Final[dict[str, Split]] = {
@@ -60,7 +62,7 @@ SPLITS: Final[dict[str, Split]] = {
     "all": Split("all", all_cameras=False, shifts_m=(0.0, 2.0, -2.0, 3.0, -3.0)),
 }
 _GAP: Final = ("psnr", "ssim", "perceptual", "psnr_dynamic", "psnr_upper", "abs_rel")
-_CAMERA: Final = ("psnr_seen", "perceptual_seen", "psnr", "perceptual", "abs_rel_seen", "abs_rel")
+_CAMERA: Final = ("psnr_seen", "perceptual_seen", "abs_rel_seen", "rmse_seen", "delta1_seen")
 _LIDAR: Final = (
     "abs_rel_static", "rmse_static", "delta1_static", "abs_rel_dynamic", "rmse_dynamic", "delta1_dynamic", "point_psnr_static",
     "point_abs_static", "point_psnr_dynamic", "point_abs_dynamic",
@@ -69,7 +71,7 @@ PROTOCOLS: Final[tuple[Protocol, ...]] = (
     Protocol("gap-1", "gap", "Single held-out frames", "gap-1", ("photo", "depth", "dynamic"), _GAP),
     Protocol("gap-3", "gap", "Blocks of 3 held-out frames", "gap-3", ("photo", "depth", "dynamic"), _GAP),
     Protocol("gap-5", "gap", "Blocks of 5 held-out frames", "gap-5", ("photo", "depth", "dynamic"), _GAP),
-    Protocol("camera", "camera", "Cameras that the methods never saw", "camera", ("photo", "depth", "seen"), _CAMERA, every=2),
+    Protocol("camera", "camera", "Cameras that the methods never saw", "camera", ("photo", "depth", "seen"), _CAMERA, every=2, pooled=True),
     Protocol("lidar", "lidar", "LiDAR beside the recorded path", "all", ("depth", "dynamic", "color"), _LIDAR, (2.0, -2.0, 3.0, -3.0)),
     Protocol("classes", "classes", "Classes of LiDAR points", "all", ("classes",), ("miou", "accuracy")),
 )  # fmt: skip

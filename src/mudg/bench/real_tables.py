@@ -98,14 +98,24 @@ def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
             words.append(f"held out of {held['moments']} frames: {blocks}")
         if "shown_cameras" in held:
             words.append("shown: " + ", ".join(held["shown_cameras"]))
-        words += [f"{share:.0%} of {place} was seen" for place, share in facts["seen_share"].items()]
+        words += [
+            f"{share:.0%} of {place} was seen, {facts['weight'].get(place, 0):.0%} of all seen pixels"
+            for place, share in facts["seen_share"].items()
+        ]
         words += [
             f"colour map of {place}: gain {' '.join(f'{g:.2f}' for g in of['gain'])}, offset {' '.join(f'{o:+.3f}' for o in of['offset'])}"
             for place, of in facts["color_maps"].items()
         ]
         words += [f"{place} is left out ({reason})" for place, reason in facts["left_out"].items()]
         lines.append(f"{name}: {'; '.join(words)}.")
+        lines += [f"{name}: {words}." for words in _uses(log["diffusion"].get(found["row"]["split"], {}))]
     return lines
+
+
+def _uses(diffusion: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """What is to be said of how methods used their diffusion model: ``mudg_r, mudg_s: the model was adapted (...)``."""
+    notes = dict.fromkeys(use["note"] for use in diffusion.values() if use["note"])
+    return [f"{', '.join(name for name, use in diffusion.items() if use['note'] == note)}: {note}" for note in notes]
 
 
 def heading_of(doc: Mapping[str, Any], protocol: str) -> str:
@@ -117,7 +127,8 @@ def summary_of(doc: Mapping[str, Any]) -> str:
     """One line about the whole."""
     settings, count = doc["settings"], len(doc["logs"])
     return (
-        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit, seed {settings['seed']}."
+        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit, under virtual views half as "
+        f"many more after the fit on recorded views; seed {settings['seed']}."
     )
 
 

@@ -33,13 +33,13 @@ from mudg.data.exporters.video import jpeg_bytes
 from mudg.data.scene import read_image, read_scene
 from mudg.models.labels.inputs import box_outline
 
-LEAST_SEEN: Final = 0.02
+LEAST_SEEN: Final = 0.05
 """Cameras of whose pixels the shown cameras saw less than this share are left out."""
 LEAST_POINTS: Final = 10
 """A dynamic object counts in a view that shows at least this many of its LiDAR points."""
 PICTURES: Final = 4
 SPLAT_SHARE: Final = 0.006
-_OUTPUT: Final = VerbOutput("bench real truth", 1, ("targets.json", "maps/*.safetensors", "pictures/*.jpg"))
+_OUTPUT: Final = VerbOutput("bench real truth", 2, ("targets.json", "maps/*.safetensors", "pictures/*.jpg"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,13 +123,16 @@ def read_targets(folder: Path) -> Targets:
     found = store.read_json(folder / "targets.json")
     maps = {name: ColorMap(tuple(m["gain"]), tuple(m["offset"]), m["pairs"]) for name, m in found["color_maps"].items()}
     places = dict.fromkeys(record["place"] for record in found["views"])
+    by_place = {place: [r for r in found["views"] if r["place"] == place] for place in places}
+    seen = {place: [r["seen_px"] for r in own if "seen_px" in r] for place, own in by_place.items()}
+    all_seen = sum(map(sum, seen.values()))
     facts = {
-        "views": {place: sum(r["place"] == place for r in found["views"]) for place in places},
+        "views": {place: len(own) for place, own in by_place.items()},
         "left_out": found["left_out"], "color_maps": found["color_maps"],
         "seen_share": {
-            place: round(float(np.mean([r["seen_share"] for r in found["views"] if r["place"] == place])), 4)
-            for place in places if any("seen_share" in r for r in found["views"])
+            place: round(float(np.mean([r["seen_share"] for r in own])), 4) for place, own in by_place.items() if seen[place]
         },
+        "weight": {place: round(sum(counts) / all_seen, 4) for place, counts in seen.items() if counts and all_seen},
     }  # fmt: skip
     return Targets(folder, tuple(found["views"]), maps, tuple(found["pictures"]), facts, found["reason"])
 
@@ -171,6 +174,7 @@ def _written(
                         "shift_m": shift_m,
                     }
                     if "seen" in maps:
+                        record["seen_px"] = int(maps["seen"].sum())
                         record["seen_share"] = round(float(maps["seen"].mean()), 4)
                     store.write_safetensors(out / "maps" / f"{len(records):06d}.safetensors", maps)
                     records.append(record)

@@ -1,10 +1,11 @@
 """``mudg bench shift``: whole methods beside the recorded path, on lists of generated logs, against exact truth.
 
 Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the ordinary
-verbs, so that whatever is finished is reused and another variant costs only itself. Results do not depend on how many logs
-are worked on at a time: each has one thread.
+verbs, so that whatever is finished is reused and another variant costs only itself. Fits under virtual views go on with the one on
+recorded views, as in ``mudg run`` (``bench/chain.py``). Results do not depend on how many logs are worked on at a time: each has
+one thread.
 
-    OUT/<log>/scene  fuse  synthesize  truth  nearest_fill  fit/<method>  render/<method>  score/<method>  film
+    OUT/<log>/scene  fuse  synthesize  truth  nearest_fill  fit/<method>  start/<method>  render/<method>  score/<method>  film
     OUT/bench.json   every number        OUT/bench.md   the tables        OUT/page.html   tables and videos
 """
 
@@ -13,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -28,15 +29,15 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, is_temporary, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
+from mudg.bench.chain import FitChain, learns_virtual, made
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
-from mudg.methods import METHODS
 from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
-from mudg.stages import fit, fuse, ingest, render, score, score_truth, synthesize
+from mudg.stages import fuse, ingest, render, score, score_truth, synthesize
 from mudg.stages.config import (
     BenchConfig,
     FitConfig,
@@ -46,6 +47,7 @@ from mudg.stages.config import (
     ScoreConfig,
     SynthesizeConfig,
 )
+from mudg.stages.run import CONTINUED_SHARE
 
 TEST_EVERY: Final = 4
 PERCEPTUAL_VIEWS: Final = 12
@@ -80,16 +82,23 @@ class Row:
 
 @dataclass(frozen=True)
 class LogJob:
-    """One log of the list, in terms that another process understands."""
+    """One log of the list, in terms that another process understands; ``renders``: whether the diffusion model uses those of a fit."""
 
     seed: int
     out: Path
     rules: LogRules
     shifts_m: tuple[float, ...]
     rows: tuple[Row, ...]
+    usual: FitConfig
     synthesize: SynthesizeConfig
+    renders: bool
     videos: bool
     overwrite: bool
+
+    @property
+    def fits(self) -> FitChain:
+        """The fits."""
+        return FitChain(self.out, self.out / "scene", self.out / "fuse", self.usual, self.overwrite)
 
 
 def run(
@@ -120,10 +129,11 @@ def run(
         processes=1,
         seed=config.seed,
     )
+    renders, usual = mdm_files.uses_renders(config.model), usual_fit(config)
     jobs = [
-        LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, painted, config.videos, overwrite)
+        LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, usual, painted, renders, config.videos, overwrite)
         for seed in seeds
-    ]
+    ]  # fmt: skip
     logs = _run_jobs(jobs, config.processes or os.cpu_count() or 1)
     document = shift_tables.document(logs, rows_as_values(rows), list(distances_m), settings_of(config, rules))
     store.write_json(Path(out) / "bench.json", document)
@@ -152,6 +162,11 @@ def _refuse_foreign(out: Path) -> None:
 # ---- what is compared ----
 
 
+def usual_fit(config: BenchConfig) -> FitConfig:
+    """The settings of fits, as ``mudg run`` takes them for the whole chain."""
+    return FitConfig(method=WITH, iterations=config.iterations, seed=config.seed)
+
+
 def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     """The methods, ablation rows and variants of a configuration, in the order of the tables.
 
@@ -163,7 +178,7 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     if not wanted or wanted - set(known):
         raise UsageError("unknown method", where="--methods", expected=", ".join(known),
             got=", ".join(sorted(wanted - set(known))))  # fmt: skip
-    plain = FitConfig(method=WITH, iterations=config.iterations, seed=config.seed)
+    plain = usual_fit(config)
     rows = [
         Row(name, title_of(name), None if name in GENERATED else configuration.load(FitConfig, plain, overrides={"method": name}))
         for name in known
@@ -208,6 +223,7 @@ def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
     """What was asked for, for JSON."""
     return {
         "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
+        "renders": mdm_files.uses_renders(config.model), "continued_share": CONTINUED_SHARE,
         "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
         "held_out_every": TEST_EVERY, "ablation": config.ablation,
     }  # fmt: skip
@@ -232,15 +248,16 @@ def make_log(job: LogJob) -> dict[str, Any]:
     out = job.out
     city = city_logs.log_config(job.seed, job.rules)
     scene = out / "scene"
-    _made(job, lambda o: ingest.run(IngestConfig(test_every=TEST_EVERY, city=city), ingest.CITY, scene, overwrite=o))
+    made(lambda o: ingest.run(IngestConfig(test_every=TEST_EVERY, city=city), ingest.CITY, scene, overwrite=o), job.overwrite)
     fused, painted = out / "fuse", out / "synthesize"
-    _made(job, lambda o: fuse.run(FuseConfig(), scene, fused, overwrite=o))
-    if any(row.name == DIFFUSION or (row.fit is not None and "virtual" in METHODS[row.fit.method].supervision) for row in job.rows):
-        _made(job, lambda o: synthesize.run(job.synthesize, scene, fused, painted, overwrite=o))
+    made(lambda o: fuse.run(FuseConfig(), scene, fused, overwrite=o), job.overwrite)
+    if any(row.name == DIFFUSION or (row.fit is not None and learns_virtual(row.fit)) for row in job.rows):
+        first = job.fits.first() if job.renders else None
+        made(lambda o: synthesize.run(job.synthesize, scene, fused, painted, fitted=first, overwrite=o), job.overwrite)
     drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False)
     paths = render.trajectories(read_scene(scene), drawn)
     truth = out / "truth"
-    _made(job, lambda o: score_truth.write_truth(scene, paths, truth, overwrite=o))
+    made(lambda o: score_truth.write_truth(scene, paths, truth, overwrite=o), job.overwrite)
     found: dict[str, Any] = {}
     views: dict[str, Path] = {}
     for row in job.rows:
@@ -250,7 +267,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
     if job.videos:
         shown = {"truth": truth, **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN}}
         # With another method the old films are out of date, whatever was asked.
-        _made(replace(job, overwrite=True), lambda o: shift_page.film(shown, paths, out / "film", overwrite=o))
+        made(lambda o: shift_page.film(shown, paths, out / "film", overwrite=o), overwrite=True)
         films = [path.name for path in paths]
     facts = city_logs.facts(job.seed, job.rules)
     return {
@@ -260,38 +277,27 @@ def make_log(job: LogJob) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _made(job: LogJob, make: Callable[[bool], Path]) -> Path:
-    """Make or reuse a folder; what other settings left there is replaced only if that was asked for."""
-    try:
-        return make(False)
-    except UsageError:
-        if not job.overwrite:
-            raise
-        return make(True)
-
-
 def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajectory]) -> Path:
     """The folder with a method's views, made if need be."""
     scene, fused, painted = job.out / "scene", job.out / "fuse", job.out / "synthesize"
     if row.name == DIFFUSION:
         return painted
     if row.name == FILL:
-        return _made(job, lambda o: write_fill(scene, fused, paths, job.out / FILL, overwrite=o))
+        return made(lambda o: write_fill(scene, fused, paths, job.out / FILL, overwrite=o), job.overwrite)
     settings = row.fit
     if settings is None:
         raise UsageError("a method without views", got=row.name)
-    model, views = job.out / "fit" / row.name, job.out / "render" / row.name
     if row.name == EXACT:
-        painted = _made(job, lambda o: write_exact(job.out / "truth", paths, job.out / EXACT, overwrite=o))
-    _made(job, lambda o: fit.run(settings, scene, fused, model, observations=painted, overwrite=o))
-    return _made(job, lambda o: render.run(drawn, scene, model, views, overwrite=o))
+        painted = made(lambda o: write_exact(job.out / "truth", paths, job.out / EXACT, overwrite=o), job.overwrite)
+    model, views = job.fits.fitted(row.name, settings, painted), job.out / "render" / row.name
+    return made(lambda o: render.run(drawn, scene, model, views, overwrite=o), job.overwrite)
 
 
 def _scores_of(job: LogJob, row: Row, views: Path) -> dict[str, Any]:
     """A method's values by distance, from a score of its own against the common truth."""
     settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS)
     scene, truth, scored = job.out / "scene", job.out / "truth", job.out / "score" / row.name
-    _made(job, lambda o: score.run(settings, scene, {row.name: views}, scored, truth=truth, overwrite=o))
+    made(lambda o: score.run(settings, scene, {row.name: views}, scored, truth=truth, overwrite=o), job.overwrite)
     return {
         f"{entry['distance_m']:g}": entry["values"] for entry in store.read_json(scored / "metrics.json")["by_distance"]
     }

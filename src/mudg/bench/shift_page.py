@@ -84,7 +84,7 @@ def page(doc: Mapping[str, Any]) -> str:
     return html.render(
         "shift.html.j2", title=f"Off the recorded path: {tables.logs_text(doc)}, {settings['list']} list", kicker="mudg bench shift",
         lead=f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {settings['iterations']} iterations "
-        "per fit. Means over logs and both sides of the path.",
+        f"per fit, {tables.further_of(settings)}. Means over logs and both sides of the path.",
         comparisons=[[c["title"], *tables.compared_text(c), c["kind"], c["logs"]] for c in doc["comparisons"]],
         score_heads=["method", *(heading for _, heading, _ in tables.COLUMNS)],
         places=[

@@ -165,6 +165,12 @@ def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[
 # ---- text ----
 
 
+def further_of(settings: Mapping[str, Any]) -> str:
+    """What fits under virtual views do, as part of a sentence."""
+    seen = " with renders of that fit" if settings.get("renders") else " without renders"
+    return f"under virtual views half as many more after the fit on recorded views; generated{seen}"
+
+
 def markdown(doc: Mapping[str, Any]) -> str:
     """The tables for people."""
     settings = doc["settings"]
@@ -172,8 +178,9 @@ def markdown(doc: Mapping[str, Any]) -> str:
     lines = [
         f"# Off the recorded path: {logs_text(doc)} of the {settings['list']} list", "",
         f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
-        f"frame held out; {settings['iterations']} iterations per fit, seed {settings['seed']}. Means over both sides and all logs, +- the "
-        "standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped codec, not LPIPS.", "",
+        f"frame held out; {settings['iterations']} iterations per fit, {further_of(settings)}; seed {settings['seed']}. Means over both "
+        "sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped "
+        "codec, not LPIPS.", "",
         *markdown_table(FACTS, [facts_of(entry) for entry in doc["logs"]]), "",
     ]  # fmt: skip
     headings = [heading for _, heading, _ in COLUMNS]

@@ -17,7 +17,7 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.run_folder import is_temporary, refuse_overlap
 from mudg.base.versions import environment, version
-from mudg.stages.config import RunConfig
+from mudg.stages.config import FitConfig, RunConfig
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
@@ -25,6 +25,12 @@ DIFFUSION = "mudg_r"
 WITH_DIFFUSION = "mudg_s"
 CONTINUED_SHARE = 0.5
 """Further steps of the fit with diffusion, as a share of those of the fit that it continues."""
+
+
+def fits_of(config: FitConfig) -> tuple[FitConfig, FitConfig]:
+    """Settings of the chain's two fits: the one on recorded views, and the one under virtual views that goes on with it."""
+    further = max(1, round(CONTINUED_SHARE * config.iterations))
+    return replace(config, method=WITHOUT_DIFFUSION), replace(config, method=WITH_DIFFUSION, iterations=further)
 
 
 @dataclass(frozen=True)
@@ -174,8 +180,7 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
 
     fused, virtual = out / "fuse", out / "synthesize"
     diffusion = _diffusion_of(config, scene)
-    plain = replace(config.fit, method=WITHOUT_DIFFUSION)
-    guided = replace(config.fit, method=WITH_DIFFUSION, iterations=max(1, round(CONTINUED_SHARE * config.fit.iterations)))
+    plain, guided = fits_of(config.fit)
     models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     renders = {name: out / "render" / name for name in models}
 

@@ -1,7 +1,8 @@
 """A part of a scene as a scene of its own: some frames and sweeps as they are, and frames of which only the place is told.
 
 For measurements on held-out frames. What is held out is not in the files: an image is replaced by a black one, labels and sweeps are
-left out, and so is the recipe by which a generated city could be drawn again. Whatever reads the part cannot have seen more.
+left out, and so are the classes of LiDAR points, which are truth that is scored, and the recipe by which a generated city could be
+drawn again. Whatever reads the part cannot have seen more.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from mudg.data.scene.write import SceneWriter
 def write_part(
     scene: Scene, root: Path, frames: Collection[str], sweeps: Collection[str], places: Sequence[Frame] = ()
 ) -> Scene:
-    """Write some frames and sweeps of a scene, with all tracks and the whole ego path.
+    """Write some frames and sweeps of a scene, with all tracks and the whole ego path, without classes of points.
 
     Args:
         scene: what is copied, byte by byte where its manifest allows.
@@ -34,7 +35,7 @@ def write_part(
         scene, cameras=ordered, split={}, sweeps=tuple(sweep for sweep in scene.sweeps if sweep.id in sweeps)
     )
     with SceneWriter(root, scene.id, replace(scene.source, recipe=None)) as writer:
-        writer.copy_all_but_frames(base)
+        writer.copy_all_but_frames(base, point_classes=False)
         for frame in shown:
             writer.copy_frame(scene, frame)
         for frame in places:

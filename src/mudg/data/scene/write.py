@@ -212,17 +212,24 @@ class SceneWriter:
                 array = given[name] if ref is None else read_label(scene, frame, name)
                 self.add_label(frame.id, name, array)
 
-    def copy_all_but_frames(self, scene: Scene) -> None:
-        """Add everything of another scene but its frames: cameras, sweeps (as in ``copy_frame``), tracks, ego path, split."""
+    def copy_all_but_frames(self, scene: Scene, point_classes: bool = True) -> None:
+        """Add everything of another scene but its frames: cameras, sweeps (as in ``copy_frame``), tracks, ego path, split.
+
+        Args:
+            point_classes: whether the classes of LiDAR points are kept.
+        """
         files = open_files(scene.root)
         for camera in scene.cameras.values():
             self.add_camera(camera)
         for sweep in log.progress(scene.sweeps, len(scene.sweeps), "copying sweeps"):
-            if sweep.points == _sweep_ref(sweep.id) and files.is_hashed(sweep.points.path):
+            points = None if point_classes else read_points(scene, sweep)
+            if points is not None and points.classes is not None:
+                points = replace(points, classes=None)
+            elif sweep.points == _sweep_ref(sweep.id) and files.is_hashed(sweep.points.path):
                 self._add_sweep_file(sweep, files.read(sweep.points.path))
-            else:
-                points = read_points(scene, sweep)
-                self.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, points)
+                continue
+            points = read_points(scene, sweep) if points is None else points
+            self.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, points)
         for track in scene.tracks:
             self.add_track(track)
         self.set_ego(scene.ego)

@@ -44,16 +44,16 @@ class BenchConfig:
     logs: int = Field(default=8, ge=1, le=8)
     """shift: number of logs taken from the list, 1 to 8 (the development list has 4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
-    """shift, real: methods to compare, out of the five of the default. real also has mudg_r+renders and mudg_s+renders, whose
-    diffusion model sees the renders of a fit."""
+    """shift, real: methods to compare, out of the five of the default. real also has mudg_r-no-adapt, mudg_r-no-renders,
+    mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone in its input."""
     iterations: int = Field(default=1000, ge=1)
-    """shift, real: optimisation steps of every fit."""
+    """shift, real: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more."""
     ablation: bool = False
     """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact
-    views instead of generated ones."""
+    views instead of generated ones. real: add the rows without adaptation and without renders."""
     variant: tuple[str, ...] = ()
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such
-    as virtual.start."""
+    as virtual.color_weight. Both of its fits have them."""
     processes: int = Field(default=0, ge=0)
     """shift, real: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per
     core). Results do not depend on it."""
