@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mudg import native
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
@@ -28,8 +29,8 @@ from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages import learn
-from mudg.stages.adapting.clips import Plan, plan_clips, why_not, write_clips
-from mudg.stages.adapting.lessons import LearntLog, Lesson, cameras_of, fit_lesson, lessons_of
+from mudg.stages.adapting.clips import CLIPS, Plan, make_lesson, plan_clips, why_not
+from mudg.stages.adapting.lessons import LearntLog, Lesson, cameras_of, lessons_of
 from mudg.stages.config import AdaptConfig, LearnConfig
 from mudg.stages.config.learn import LearnCompute, LearnData, LearnOptimizer, LearnScore
 from mudg.stages.learning import score as learn_score
@@ -71,11 +72,11 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
                          remedy="smaller --block, or use the model as it is")  # fmt: skip
     plan = plan_clips(lessons, config)
     work = directory.path / "work"
-    folders = _fit_lessons(config, learnt, lessons, work)
+    made = _make_lessons(config, learnt, lessons, plan, work)
     base = model_of_window(model, config.block)
-    log.info(f"adapt: {write_clips(config, learnt, plan, base, folders, work / 'clips')} clips made")
-    adapted = learn.run(_training(config, learnt, plan, work / "clips"), work / "learn")
-    record = _choose(config, base, adapted, plan, work / "clips", directory.path)
+    log.info(f"adapt: {len(plan)} clips, {made} of them made now")
+    adapted = learn.run(_training(config, learnt, plan, work / CLIPS), work / "learn")
+    record = _choose(config, base, adapted, plan, work / CLIPS, directory.path)
     chosen = mdm_files.load(adapted) if record["adapted"] else model
     facts = {**mdm_files.facts(config.model), "adapted": record}
     mdm_files.save(model_of_window(chosen, model.config.window), directory.path / "model", _card(config, record), facts)
@@ -98,22 +99,23 @@ def _open_log(config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted:
     return LearntLog(scene, fused, fitted, width, height, scale), lessons_of(loaded, config)
 
 
-def _fit_lessons(config: AdaptConfig, learnt: LearntLog, lessons: list[Lesson], work: Path) -> dict[str, Path]:
-    """The folder of each lesson's fit, several made at a time."""
-    jobs = [(config, learnt, lesson, work / lesson.name) for lesson in lessons]
-    found: dict[str, Path] = {}
-    with log.task("fits of the lessons", len(jobs)) as bar:
-        for index, folder in run_in_processes(fit_lesson, jobs, min(config.processes or os.cpu_count() or 1, len(jobs))):
-            found[lessons[index].name] = folder
+def _make_lessons(config: AdaptConfig, learnt: LearntLog, lessons: list[Lesson], plan: Plan, work: Path) -> int:
+    """Fits and clips of all lessons, several made at a time; returns the number of clips made."""
+    jobs = [(config, learnt, lesson, [row for row in plan if row[1].name == lesson.name], work) for lesson in lessons]
+    made = 0
+    with log.task("lessons", len(jobs)) as bar:
+        for _, clips in run_in_processes(make_lesson, jobs, min(config.processes or os.cpu_count() or 1, len(jobs))):
+            made += clips
             bar.advance()
-    return found
+    return made
 
 
 def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -> LearnConfig:
     """The settings of the training, in terms of `learn`."""
     train = sum(number < HELD_OUT for number, _, _ in plan)
     return LearnConfig(
-        seed=config.seed, start=config.model, steps=config.steps, precision=config.precision, threads=config.threads,
+        seed=config.seed, start=config.model, steps=config.steps, precision=config.precision,
+        threads=config.threads or native.default_threads(),
         frozen="denoiser" if config.trained == "refiner" else "nothing",
         data=LearnData(
             width=learnt.width_px, height=learnt.height_px, window=config.block, clips=str(clips), augment=config.augment, cities=train,

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import torch
 
+from mudg import native
 from mudg.base import seeds
+from mudg.base.processes import one_torch_thread
 from mudg.base.types import Clip, Condition, Photo, Scene, View
 from mudg.core.pictures import resize_area
 from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions, image_tensor
@@ -22,12 +24,15 @@ from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest
+from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
-from mudg.stages.adapting.lessons import LearntLog, Lesson, lessons_of
+from mudg.stages.adapting.lessons import LearntLog, Lesson, fit_lesson, lessons_of
 from mudg.stages.config import AdaptConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model
+from mudg.stages.learning.models import model_of_window
 
+CLIPS = "clips"
 Plan = list[tuple[int, Lesson, tuple[str, ...]]]
 """Number of the shard, lesson, and ids of the frames of every clip."""
 
@@ -55,17 +60,18 @@ def why_not(scene: Scene, config: AdaptConfig) -> str:
     return f"it is too short: {len(plan)} clips of {config.block} frames, {scored} of them to score"
 
 
-def write_clips(config: AdaptConfig, log: LearntLog, plan: Plan, model: MDM, folders: dict[str, Path], out: Path) -> int:
-    """Write the shards of a plan that are not there yet; returns how many were made. `folders`: that of each lesson's fit."""
-    made = 0
-    for name in dict.fromkeys(lesson.name for _, lesson, _ in plan):
-        rows = [row for row in plan if row[1].name == name and not shard_path(out, row[0]).is_file()]
-        if rows:
-            maker = ClipMaker(config, log, rows[0][1], model, folders[name])
-            for number, _, frames in rows:
-                write_shard(out, number, pack_clips([maker.make(frames, number)]))
-                made += 1
-    return made
+def make_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, rows: Plan, work: Path) -> int:
+    """Fit a lesson and write its shards of a plan into `work`/clips, those that are not there yet; returns how many were made. One
+    lesson needs nothing of another, so this may run in a process of its own."""
+    missing = [row for row in rows if not shard_path(work / CLIPS, row[0]).is_file()]
+    if not missing:
+        return 0
+    with native.one_thread(), one_torch_thread():
+        folder = fit_lesson(config, log, lesson, work / lesson.name)
+        maker = ClipMaker(config, log, lesson, model_of_window(mdm_files.load(config.model), config.block), folder)
+        for number, _, frames in missing:
+            write_shard(work / CLIPS, number, pack_clips([maker.make(frames, number)]))
+    return len(missing)
 
 
 class ClipMaker:

@@ -45,7 +45,7 @@ class AdaptConfig:
     """Number format of the diffusion model. auto: bfloat16 where the CPU multiplies in it, float32 elsewhere."""
     processes: int = Field(default=0, ge=0)
     """Number of fits made at the same time, with one thread each (0 = one per core). The result does not depend on it."""
-    threads: int = Field(default=1, ge=1)
-    """Threads of the training. Results are repeatable for the same number of threads."""
+    threads: int = Field(default=0, ge=0)
+    """Threads of the training (0 = one per core). Results are repeatable for the same number of threads."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
