@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,14 @@ from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.report import run_report
-from mudg.stages import annotate, fit, fuse, ingest, render, run, score, synthesize
+from mudg.stages import adapt, annotate, fit, fuse, ingest, render, run, score, synthesize
 from mudg.stages.config import RunConfig, run_preset, with_seed
 
 
 @pytest.fixture
 def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Stand-ins that note their calls and write a folder; ``trouble[verb]`` is raised once by that verb."""
-    seen: dict[str, Any] = {"calls": [], "trouble": {}, "labelled": True}
+    seen: dict[str, Any] = {"calls": [], "trouble": {}, "labelled": True, "teaches": (True, "")}
 
     def stand_in(name: str) -> Callable[..., Path]:
         def act(*arguments: Any, **named: Any) -> Path:
@@ -41,11 +42,12 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return act
 
     for module, name in (
-        (ingest, "ingest"), (annotate, "annotate"), (fuse, "fuse"), (synthesize, "synthesize"), (fit, "fit"),
+        (ingest, "ingest"), (annotate, "annotate"), (fuse, "fuse"), (adapt, "adapt"), (synthesize, "synthesize"), (fit, "fit"),
         (render, "render"), (score, "score"),
     ):  # fmt: skip
         monkeypatch.setattr(module, "run", stand_in(name))
     monkeypatch.setattr(run, "_has_semantics", lambda _scene: seen["labelled"])
+    monkeypatch.setattr(run, "_teaches", lambda _config, _scene: seen["teaches"])
     monkeypatch.setattr(score, "summary_table", lambda _out: "table")
 
     def film(_out: Path) -> list[Any]:
@@ -84,6 +86,38 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "complete"
     assert all(step["state"] == "complete" for step in ledger["steps"].values())
+
+
+def test_a_recorded_log_is_adapted_to(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    verbs["teaches"] = (False, "")
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+    assert verbs["calls"] == [*CHAIN[:3], "adapt", *CHAIN[3:]]
+    settings, *paths = verbs["adapt"][0]
+    fitted = tmp_path / "out" / "fit" / "street_gaussians"
+    assert settings.model == "embedded" and settings.cameras == RunConfig().synthesize.cameras and fitted in paths
+    assert verbs["synthesize"][0][0].model == str(tmp_path / "out" / "adapt" / "model")
+    assert verbs["synthesize"][1]["fitted"] == fitted
+
+
+@pytest.mark.parametrize(("when", "teaches", "model", "renders"), [
+    ("off", (False, ""), "embedded", True), ("auto", (True, ""), "embedded", True), ("auto", (False, "too short"), "embedded", True),
+    ("auto", (False, ""), "embedded-tiny", False),
+])  # fmt: skip
+def test_no_adaptation_where_it_is_not_wanted_or_not_possible(
+    tmp_path: Path, verbs: dict[str, Any], when: Any, teaches: tuple[bool, str], model: str, renders: bool
+) -> None:
+    verbs["teaches"] = teaches
+    plain = RunConfig(adaptation=when)
+    run.run_chain(replace(plain, synthesize=replace(plain.synthesize, model=model)), "city", tmp_path / "out")
+    assert verbs["calls"] == CHAIN
+    assert verbs["synthesize"][0][0].model == model
+    assert (verbs["synthesize"][1]["fitted"] is not None) == renders
+
+
+def test_adaptation_that_is_asked_for_but_not_possible_is_refused(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    verbs["teaches"] = (False, "too short")
+    with pytest.raises(UsageError, match="adapted"):
+        run.run_chain(RunConfig(adaptation="on"), "city", tmp_path / "out")
 
 
 def test_a_repeat_makes_no_second_report_unless_it_was_touched(tmp_path: Path, verbs: dict[str, Any]) -> None:

@@ -36,6 +36,7 @@ from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages.config import BenchConfig, SynthesizeConfig
 from mudg.stages.learning import score as learn_score
+from mudg.stages.learning.city_fits import fit_city
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
@@ -79,8 +80,9 @@ def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     request = SampleRequest(1, config.seed, sampler=config.sampler, eta=config.eta, bf16=bf16)
     MDM.check_request(request)
     model = mdm_files.load(config.model)
-    cities, rules = from_city.LISTS[config.cities][: config.count], CityClipRules(window=model.config.window)
-    from_city.write_missing(rules, cities, out / "clips")
+    cities = from_city.LISTS[config.cities][: config.count]
+    rules = CityClipRules(window=model.config.window, fitted=model.config.renders)
+    from_city.write_missing(rules, cities, out / "clips", fit_city if rules.fitted else None)
     result: dict[str, Any] = {"cities": list(cities), "model": mdm_files.digest(config.model), "bf16": bf16, "rows": []}
     lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
     with log.task("scoring", 2 * len(config.steps)) as bar:

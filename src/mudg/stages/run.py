@@ -156,23 +156,29 @@ def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
     Raises:
         UsageError: adaptation is asked for, but the model cannot be adapted or the log is too short.
     """
-    from mudg.data.scene import read_scene
     from mudg.models.mdm.files import uses_renders
-    from mudg.stages.adapting.clips import why_not
 
     renders = uses_renders(config.synthesize.model)
     if config.adaptation == "off" or (config.adaptation == "auto" and not renders):
         return _DiffusionUse(renders, False)
-    loaded = read_scene(scene)
-    if config.adaptation == "auto" and loaded.source.recipe is not None:
-        return _DiffusionUse(renders, False)  # a generated city: what the model was trained on
-    cameras = config.synthesize.cameras
-    reason = why_not(loaded, replace(config.adapt, cameras=cameras)) if renders else "the model does not use renders"
+    generated, reason = _teaches(config, scene)
+    if config.adaptation == "auto" and generated:
+        return _DiffusionUse(renders, False)  # what the model was trained on
+    reason = reason if renders else "the model does not use renders"
     if reason and config.adaptation == "on":
         raise UsageError("the diffusion model cannot be adapted to this log", where="--adaptation", got=reason, remedy="leave it at auto")
     if reason:
         log.info(f"adapt: left out, {reason}")
     return _DiffusionUse(renders, not reason)
+
+
+def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
+    """Whether a scene is a generated city, and why the diffusion model cannot be adapted to it (empty: it can)."""
+    from mudg.data.scene import read_scene
+    from mudg.stages.adapting.clips import why_not
+
+    loaded = read_scene(scene)
+    return loaded.source.recipe is not None, why_not(loaded, replace(config.adapt, cameras=config.synthesize.cameras))
 
 
 def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[Step, ...]:

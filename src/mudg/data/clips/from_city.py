@@ -292,11 +292,11 @@ def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
     return Clip(condition, rgb.float(), depth, torch.isfinite(depth), ids)
 
 
-def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path) -> None:
-    """Make the shards of those cities that have none in `folder` yet, one after another."""
+def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path, fit: FitCity | None = None) -> None:
+    """Make the shards of those cities that have none in `folder` yet, one after another (`fit`: with `rules.fitted`)."""
     missing = [city for city in cities if not shard_path(folder, city).is_file()]
     for city in progress(missing, len(missing), "generating cities"):
-        write_city(rules, city, folder)
+        write_city(rules, city, folder, fit)
 
 
 FitCity = Callable[[CityClipRules, int, CityLog], RenderAt]
