@@ -1,6 +1,7 @@
 """The last stage of the small models: tiles, what it starts as, what it copies, what it learns from."""
 
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from mudg.models import diffusion
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import finisher as finishing
 from mudg.models.mdm import model as mdm
-from mudg.models.mdm.finisher import Finisher, Made, finish_in_tiles
+from mudg.models.mdm.finisher import Finisher, Made, finish_in_tiles, with_detail
 from mudg.models.mdm.model import BatchPart, LossSettings
 from mudg.models.mdm.network import ConditionPixels, Refined
 from mudg.stages.learning.models import draw_weights
@@ -276,3 +277,19 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch):
     assert torch.allclose(made.rgb[:, 0, :, 0], (6 + (torch.arange(24) + 0.5) / 2).expand(frames, 24), atol=1e-3)
     assert torch.allclose(made.rgb[:, 1, 0], (10 + (torch.arange(24) + 0.5) / 2).expand(frames, 24), atol=1e-3)
     assert bool((made.rgb[:, 2] == 1).all())
+
+
+def test_detail_comes_from_a_warped_image_that_agrees_and_from_nothing_else():
+    generator = torch.Generator().manual_seed(4)
+    sharp = torch.rand(1, 3, 12, 16, generator=generator) * 0.02
+    flat = torch.full_like(sharp, 0.01)
+    one = torch.ones(1, 1, 12, 16)
+
+    def given(color, seen):
+        return SimpleNamespace(color=color, valid=torch.zeros_like(one), warped=seen)
+
+    taken = with_detail(flat, given(sharp, one))
+    assert (taken - taken.mean()).abs().mean() > 0.5 * (sharp - sharp.mean()).abs().mean()
+    assert torch.equal(with_detail(flat, given(sharp, torch.zeros_like(one))), flat)  # nothing was warped
+    assert torch.equal(with_detail(flat, given(sharp + 0.5, one)), flat)  # another surface
+    assert torch.allclose(with_detail(sharp, given(sharp, one)), sharp, atol=1e-6)

@@ -50,7 +50,7 @@ from mudg.models.mdm.codec import (
     code_to_depth,
     semantic_shares,
 )  # fmt: skip
-from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles
+from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles, with_detail
 from mudg.models.mdm.network import (
     ConditionPixels,
     MDMConfig,
@@ -480,7 +480,7 @@ class MDM(nn.Module):
         made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             made = finish_in_tiles(self.finisher, made, given)
-        decoded = self._decoded(made)
+        decoded = self._decoded(replace(made, rgb=with_detail(made.rgb, given)))
         confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
         depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
         return replace(
