@@ -219,7 +219,7 @@ class DemoOwn(Output):
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("mudg_demo")
     """Folder to write. Repeat the same command to resume an interrupted demo."""
     fast: FlagCreatePairsOff[bool] = False
-    """Use smaller images, fewer frames and fewer iterations: about 90 seconds instead of 5 minutes on 2 cores."""
+    """Use smaller images, fewer frames and fewer iterations: about 90 seconds instead of 6 minutes on 2 cores."""
     seed: Annotated[int | None, arg(metavar="INT")] = None
     """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     shifts_m: tuple[float, ...] = ()
