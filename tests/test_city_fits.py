@@ -14,6 +14,7 @@ from mudg.data.clips import from_city
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_city import CityClipRules
 from mudg.data.scene import read_image, read_label, read_points, read_scene
+from mudg.data.scene.photos import write_photos
 from mudg.models.mdm import files
 from mudg.stages import learn
 from mudg.stages.learning import city_fits
@@ -29,7 +30,8 @@ def test_the_scene_of_a_log_holds_what_its_clips_may_know(tmp_path, realism):
     rules = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True, realism=realism)
     log = from_city.make_log(rules, 3, 5)
     images = from_city.given_images(rules, 3, log)
-    city_fits.write_scene(tmp_path / "scene", log, images)
+    sweeps = city_fits.placed_sweeps(log)
+    write_photos(tmp_path / "scene", log.world.source(), log.world.ego_path(), log.tracks(), images, sweeps)
     scene = read_scene(tmp_path / "scene")
     assert len(scene.frames) == len(images)
     left = {(photo.view.camera.name, round(photo.view.time_s, 6)): photo for photo in images}

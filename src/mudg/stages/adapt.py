@@ -29,7 +29,7 @@ from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages import learn
-from mudg.stages.adapting.clips import CLIPS, Plan, make_lesson, plan_clips, why_not
+from mudg.stages.adapting.clips import CLIPS, Plan, make_lesson, plan_clips, why_too_short
 from mudg.stages.adapting.lessons import LearntLog, Lesson, cameras_of, lessons_of
 from mudg.stages.config import AdaptConfig, LearnConfig
 from mudg.stages.config.learn import LearnCompute, LearnData, LearnOptimizer, LearnScore
@@ -66,11 +66,11 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
     if directory.complete:
         return directory.reused() / "model"
     learnt, lessons = _open_log(config, model, Path(scene), Path(fused), Path(fitted))
-    reason = why_not(read_scene(scene), config)
+    plan = plan_clips(lessons, config)
+    reason = why_too_short(plan, config)
     if reason:
         raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
                          remedy="smaller --block, or use the model as it is")  # fmt: skip
-    plan = plan_clips(lessons, config)
     work = directory.path / "work"
     made = _make_lessons(config, learnt, lessons, plan, work)
     base = model_of_window(model, config.block)

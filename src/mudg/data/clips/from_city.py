@@ -183,7 +183,10 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
 
 def given_images(rules: CityClipRules, city: int, log: CityLog) -> tuple[Photo, ...]:
     """The recorded images that the clips of a city may know: all, or as in a log whose every fourth moment is held out."""
-    rng = seeds.numpy_rng(rules.seed, city, "clips")
+    return _known(rules, city, log, seeds.numpy_rng(rules.seed, city, "clips"))
+
+
+def _known(rules: CityClipRules, city: int, log: CityLog, rng: np.random.Generator) -> tuple[Photo, ...]:
     if city >= HELD_OUT and rules.fitted:
         times = sorted({photo.view.time_s for photo in log.recorded})
         return tuple(photo for photo in log.recorded if photo.view.time_s not in times[4::4])
@@ -207,9 +210,7 @@ def make_clips(
     tracks = log.tracks()
     clips = []
     sources: dict[int, WarpSource] = {}
-    known = given_images(rules, city, log)
-    if city < HELD_OUT and rng.random() < 0.5:  # the draws of given_images
-        rng.integers(4)
+    known = _known(rules, city, log, rng)
     for number, shift_m in enumerate(shifts_of(rules, city)):
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
         given, cache = known, sources

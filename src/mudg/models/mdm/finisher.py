@@ -14,11 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
-from mudg.models.mdm.codec import ChannelNorm, DecoderBlock
-from mudg.models.mdm.network import ConditionPixels, one_hot
+from mudg.models.mdm.network import CellNet, ConditionPixels, one_hot
 
 TILE_PX = 320
 """Longest side of a tile's core."""
@@ -74,8 +73,8 @@ def _sampled(image: Tensor, grid: Tensor, mode: str) -> Tensor:
     return functional.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=False)
 
 
-class Finisher(nn.Module):
-    """See the module text. `widths`: channels at half and at a quarter of the resolution; `blocks`: residual blocks there."""
+class Finisher(CellNet):
+    """See the module text. `widths`: channels at half and at a quarter of the resolution; `blocks`: residual blocks there (`CellNet`)."""
 
     SOURCES = 4
     """Of colour: the enlarged clip, images warped in, the backdrop, the render. Of depth and class: the clip, the measured or
@@ -89,17 +88,7 @@ class Finisher(nn.Module):
     are that of the clip; the scale."""
 
     def __init__(self, widths: tuple[int, int], blocks: tuple[int, int]) -> None:
-        super().__init__()
-        fine, coarse = widths
-        self.enter = nn.Conv2d(self.PLANES, fine, 1)
-        self.before = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
-        self.shrink = nn.Conv2d(fine, coarse, 2, stride=2)
-        self.middle = nn.ModuleList(DecoderBlock(coarse) for _ in range(blocks[1]))
-        self.grow = nn.Conv2d(coarse, 4 * fine, 1)
-        self.join = nn.Conv2d(2 * fine, fine, 1)
-        self.after = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
-        self.norm = ChannelNorm(fine)
-        self.leave = nn.Conv2d(fine, sum(self.SIZES), 1)
+        super().__init__(self.PLANES, sum(self.SIZES), widths, blocks, reach=1)
         self.reset()
 
     @property
@@ -130,17 +119,7 @@ class Finisher(nn.Module):
         planes = [fold(colors.flatten(1, 2)), fold(depths.flatten(1, 2)), *(fold(m) for m in masks), fold(made.log_error)]  # type: ignore[arg-type]
         planes.append(functional.avg_pool2d(agree, 2))
         planes.append(scale.log2().view(-1, 1, 1, 1).expand(-1, 1, *planes[0].shape[-2:]))
-        x = self.enter(torch.cat(planes, 1).contiguous(memory_format=torch.channels_last))
-        for block in self.before:
-            x = block(x, frames)
-        y = self.shrink(x)
-        for block in self.middle:
-            y = block(y, frames)
-        y = functional.pixel_shuffle(self.grow(y), 2)
-        x = self.join(torch.cat([x, y], 1).contiguous(memory_format=torch.channels_last))
-        for block in self.after:
-            x = block(x, frames)
-        out = functional.pixel_shuffle(self.leave(functional.silu(self.norm(x))).float(), 2)
+        out = self.pixels(torch.cat(planes, 1), frames)
         of_color, of_depth, of_class, more, change = out.split([size // 4 for size in self.SIZES], 1)
         rgb = (of_color.softmax(1).unsqueeze(2) * colors).sum(1) + 0.2 * more
         depth = (of_depth.softmax(1).unsqueeze(2) * depths).sum(1)

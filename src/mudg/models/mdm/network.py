@@ -331,7 +331,46 @@ def shares(ids: Tensor) -> Tensor:
     return functional.avg_pool2d(one_hot(ids), 2)
 
 
-class Refiner(nn.Module):
+class CellNet(nn.Module):
+    """What refiner and finisher have in common: residual blocks on cells of 2x2 pixels, around others on cells of 4x4.
+
+    Args:
+        inside, outside: channels that go in and come out, per cell of 2x2 pixels.
+        widths: channels in the outer and the inner blocks; blocks: how many before and after, and within.
+        reach: side of the first convolution, cells.
+    """
+
+    def __init__(
+        self, inside: int, outside: int, widths: tuple[int, int], blocks: tuple[int, int], reach: int
+    ) -> None:
+        super().__init__()
+        fine, coarse = widths
+        self.enter = nn.Conv2d(inside, fine, reach, padding=reach // 2)
+        self.before = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
+        self.shrink = nn.Conv2d(fine, coarse, 2, stride=2)
+        self.middle = nn.ModuleList(DecoderBlock(coarse) for _ in range(blocks[1]))
+        self.grow = nn.Conv2d(coarse, 4 * fine, 1)
+        self.join = nn.Conv2d(2 * fine, fine, 1)
+        self.after = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
+        self.norm = ChannelNorm(fine)
+        self.leave = nn.Conv2d(fine, outside, 1)
+
+    def pixels(self, planes: Tensor, frames: int) -> Tensor:
+        """[N,inside,h,w] -> f32[N,outside/4,2h,2w]; `frames` neighbouring ones belong together."""
+        x = self.enter(planes.contiguous(memory_format=torch.channels_last))
+        for block in self.before:
+            x = block(x, frames)
+        y = self.shrink(x)
+        for block in self.middle:
+            y = block(y, frames)
+        y = functional.pixel_shuffle(self.grow(y), 2)
+        x = self.join(torch.cat([x, y], 1).contiguous(memory_format=torch.channels_last))
+        for block in self.after:
+            x = block(x, frames)
+        return functional.pixel_shuffle(self.leave(functional.silu(self.norm(x))).float(), 2)
+
+
+class Refiner(CellNet):
     """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks there.
 
     With `renders` it also reads what a fitted scene shows.
@@ -347,20 +386,10 @@ class Refiner(nn.Module):
     RENDER_PLANES = 12 + 4 + 4 + 4 + CLASSES
 
     def __init__(self, channels: int, widths: tuple[int, int], blocks: tuple[int, int], renders: bool = False) -> None:
-        super().__init__()
-        fine, coarse = widths
-        self.renders = renders
-        self.sizes = self.SIZES + (self.RENDER_SIZES if renders else ())
+        sizes = self.SIZES + (self.RENDER_SIZES if renders else ())
         inside = channels + 12 + 4 + 12 + 12 + 4 + 4 + 4 + 2 * CLASSES + (self.RENDER_PLANES if renders else 0)
-        self.enter = nn.Conv2d(inside, fine, 3, padding=1)
-        self.before = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
-        self.shrink = nn.Conv2d(fine, coarse, 2, stride=2)
-        self.middle = nn.ModuleList(DecoderBlock(coarse) for _ in range(blocks[1]))
-        self.grow = nn.Conv2d(coarse, 4 * fine, 1)
-        self.join = nn.Conv2d(2 * fine, fine, 1)
-        self.after = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
-        self.norm = ChannelNorm(fine)
-        self.leave = nn.Conv2d(fine, sum(self.sizes), 1)
+        super().__init__(inside, sum(sizes), widths, blocks, reach=3)
+        self.renders, self.sizes = renders, sizes
         self.reset()
 
     def take_back(self, class_weights: Tensor) -> None:
@@ -388,17 +417,7 @@ class Refiner(nn.Module):
                   shares(given.backdrop_ids)]  # fmt: skip
         if self.renders:
             planes += [*(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)), shares(given.render_ids)]
-        x = self.enter(torch.cat([p.to(rgb.dtype) for p in planes], 1).contiguous(memory_format=torch.channels_last))
-        for block in self.before:
-            x = block(x, frames)
-        y = self.shrink(x)
-        for block in self.middle:
-            y = block(y, frames)
-        y = functional.pixel_shuffle(self.grow(y), 2)
-        x = self.join(torch.cat([x, y], 1).contiguous(memory_format=torch.channels_last))
-        for block in self.after:
-            x = block(x, frames)
-        out = functional.pixel_shuffle(self.leave(functional.silu(self.norm(x))).float(), 2)
+        out = self.pixels(torch.cat([p.to(rgb.dtype) for p in planes], 1), frames)
         parts = out.split([size // 4 for size in self.sizes], 1)
         more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[: len(self.SIZES)]
         if self.renders:

@@ -53,7 +53,11 @@ def plan_clips(lessons: list[Lesson], config: AdaptConfig) -> Plan:
 
 def why_not(scene: Scene, config: AdaptConfig) -> str:
     """Why a log cannot be adapted to; empty if it can."""
-    plan = plan_clips(lessons_of(scene, config), config)
+    return why_too_short(plan_clips(lessons_of(scene, config), config), config)
+
+
+def why_too_short(plan: Plan, config: AdaptConfig) -> str:
+    """Why a plan leaves nothing to learn or nothing to score; empty if it does not."""
     scored = sum(number >= HELD_OUT for number, _, _ in plan)
     if scored and scored < len(plan):
         return ""

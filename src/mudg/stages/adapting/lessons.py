@@ -26,12 +26,13 @@ from mudg.base.types import Frame, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.data.clips.condition import ConditionRules, WarpSource, image_tensor, warp
-from mudg.data.scene import SceneWriter, read_image, read_points, read_scene, read_trusted_classes
+from mudg.data.scene import read_image, read_points, read_scene, read_trusted_classes
+from mudg.data.scene.photos import write_photos
 from mudg.models.scene.model import SceneModel
 from mudg.stages import fit, fuse
-from mudg.stages.config import AdaptConfig, FitConfig, FuseConfig
-from mudg.stages.config.fit import DensifyConfig, StartConfig
+from mudg.stages.config import AdaptConfig, FuseConfig
 from mudg.stages.fitting.planes import render_planes
+from mudg.stages.fitting.short import short_fit
 from mudg.stages.fitting.storage import load_model
 
 
@@ -63,12 +64,6 @@ class LearntLog:
     width_px: int
     height_px: int
     scale: int
-
-
-FIT_WIDTHS = 2
-"""Lessons are fitted at this many times the width of the clips,"""
-MOST_GAUSSIANS, VOXEL_M = 40_000, 0.25
-"""with so many Gaussians at most, started from one point per cube of this size in metres."""
 
 
 def cameras_of(scene: Scene, config: AdaptConfig) -> tuple[str, ...]:
@@ -156,33 +151,11 @@ def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path
     scene, cloud = read_scene(log.scene), log.fused
     if not (folder / "scene" / "scene.json").is_file():
         photos = shown_photos(scene, lesson, config, load_model(log.fitted), log.width_px * log.scale)
-        write_scene(folder / "scene", scene, photos)
+        sweeps = ((s.sensor, s.time_s, s.world_from_lidar, read_points(scene, s)) for s in scene.sweeps)
+        write_photos(folder / "scene", scene.source, scene.ego, scene.tracks, photos, sweeps)
     if not lesson.shift_m:
         cloud = fuse.run(FuseConfig(), folder / "scene", folder / "fuse")
-    settings = FitConfig(
-        method="street_gaussians", iterations=config.fit_iterations, seed=config.seed, preview_every=1_000_000,
-        width_px=min(log.width_px * FIT_WIDTHS, next(iter(scene.cameras.values())).width),
-        start=StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M), densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
-    )  # fmt: skip
+    camera = next(iter(scene.cameras.values()))
+    settings = short_fit(config.fit_iterations, log.width_px, camera.width, config.seed)
     fit.run(settings, folder / "scene", cloud, folder / "fit")
     return folder
-
-
-def write_scene(folder: Path, scene: Scene, photos: Sequence[Photo]) -> None:
-    """A scene of these photographs, with the boxes, the vehicle's path and the sweeps of the log they come from."""
-    with SceneWriter(folder, scene.id, scene.source) as writer:
-        for photo in {photo.view.camera.name: photo for photo in photos}.values():
-            writer.add_camera(photo.view.camera)
-        if scene.ego is not None:
-            writer.set_ego(scene.ego)
-        for track in scene.tracks:
-            writer.add_track(track)
-        counts: dict[str, int] = {}
-        for photo in photos:
-            name = photo.view.camera.name
-            number = counts[name] = counts.get(name, -1) + 1
-            labels = {} if photo.semantics is None else {"semantics": photo.semantics}
-            writer.add_frame(f"{name}/{number:06d}", photo.view, photo.rgb, labels)
-        for sweep in scene.sweeps:
-            writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, read_points(scene, sweep))
-        writer.finish()
