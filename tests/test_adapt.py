@@ -185,5 +185,10 @@ def test_what_cannot_be_adapted_is_refused(log, tmp_path):
         adapt.run(settings(log, model="embedded-tiny"), log / "scene", log / "fuse", log / "fit", tmp_path / "a")
     with pytest.raises(InputError, match="too short|cannot be adapted"):
         adapted(log, tmp_path / "b", block=20)
+    assert not (tmp_path / "b").exists()
+    other = tmp_path / "other"
+    ingest.run(IngestConfig(city=CityConfig(seed=6, n_frames=13, width=96, height=64, cameras=("front",))), ingest.CITY, other)
+    with pytest.raises(InputError, match="another log"):
+        adapt.run(settings(log), other, log / "fuse", log / "fit", tmp_path / "d")
     with pytest.raises(InputError, match="camera"):
         adapted(log, tmp_path / "c", cameras=("rear",))

@@ -33,6 +33,7 @@ from mudg.stages.adapting.clips import CLIPS, Plan, make_lesson, plan_clips, why
 from mudg.stages.adapting.lessons import LearntLog, Lesson, cameras_of, lessons_of
 from mudg.stages.config import AdaptConfig, LearnConfig
 from mudg.stages.config.learn import LearnCompute, LearnData, LearnOptimizer, LearnScore
+from mudg.stages.fitting.storage import model_of_scene
 from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.models import model_of_window
 from mudg.stages.learning.precision import choose_bf16
@@ -40,6 +41,8 @@ from mudg.stages.learning.precision import choose_bf16
 _OUTPUT = VerbOutput("adapt", 1, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/"))
 MOST_SCALE = 4
 """Patches are at most this many times finer than the clips."""
+SCORED_STEPS = 2
+"""Denoising steps of the samples that are compared."""
 LEAST_GAIN_DB = 0.05
 """An adapted model that gains less than this on the clips kept for scoring is not taken."""
 
@@ -61,22 +64,22 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
                          remedy="choose another model; `embedded` is one that was")  # fmt: skip
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "fitted": store.digest(fitted),
               "model": mdm_files.digest(config.model)}  # fmt: skip
-    settings = {name: value for name, value in to_dict(config).items() if name != "processes"}
-    directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
-    if directory.complete:
-        return directory.reused() / "model"
     learnt, lessons = _open_log(config, model, Path(scene), Path(fused), Path(fitted))
     plan = plan_clips(lessons, config)
     reason = why_too_short(plan, config)
     if reason:
         raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
                          remedy="smaller --block, or use the model as it is")  # fmt: skip
+    settings = {name: value for name, value in to_dict(config).items() if name != "processes"}
+    directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
+    if directory.complete:
+        return directory.reused() / "model"
     work = directory.path / "work"
     made = _make_lessons(config, learnt, lessons, plan, work)
     base = model_of_window(model, config.block)
     log.info(f"adapt: {len(plan)} clips, {made} of them made now")
     adapted = learn.run(_training(config, learnt, plan, work / CLIPS), work / "learn")
-    record = _choose(config, base, adapted, plan, work / CLIPS, directory.path)
+    record = _choose(config, base, plan, work, directory.path)
     chosen = mdm_files.load(adapted) if record["adapted"] else model
     facts = {**mdm_files.facts(config.model), "adapted": record}
     mdm_files.save(model_of_window(chosen, model.config.window), directory.path / "model", _card(config, record), facts)
@@ -88,6 +91,7 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
 
 def _open_log(config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted: Path) -> tuple[LearntLog, list[Lesson]]:
     loaded = read_scene(scene)
+    model_of_scene(fitted, loaded)
     names = cameras_of(loaded, config)
     unknown = [name for name in names if name not in loaded.cameras]
     if unknown or not names:
@@ -125,18 +129,22 @@ def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -
             batch_frames=config.batch_frames, lr=config.lr, full_window_share=1.0, warmup_steps=min(10, config.steps // 4),
             average_decay=0.95,
         ),
-        score=LearnScore(every=1_000_000, watched=1), compute=LearnCompute(workers=0, checkpoint_every=20, log_every=10),
+        score=LearnScore(every=1_000_000, watched=len(plan) - train, steps=SCORED_STEPS),
+        compute=LearnCompute(workers=0, checkpoint_every=20, log_every=10),
     )  # fmt: skip
 
 
-def _choose(config: AdaptConfig, base: MDM, adapted: Path, plan: Plan, clips: Path, out: Path) -> dict[str, Any]:
-    """Score both models on the clips kept for it; the record of the comparison."""
+def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -> dict[str, Any]:
+    """Compare the model started from with the one that `learn` left, on the clips kept for it; the record of the comparison."""
     kept = [number for number, _, _ in plan if number >= HELD_OUT]
-    request = SampleRequest(2, config.seed, bf16=choose_bf16(config.precision))
-    scores: dict[str, Mapping[str, Any]] = {}
-    for name, model in (("before", base), ("after", mdm_files.load(adapted))):
-        found = learn_score.score(model, kept, clips, request, picture=out / f"{name}.png")
-        scores[name] = {"psnr": _mean_psnr(found), **{k: v for k, v in found.items() if k != "clips"}}
+    request = SampleRequest(SCORED_STEPS, config.seed, bf16=choose_bf16(config.precision))
+    found = {
+        "before": learn_score.score(base, kept, work / CLIPS, request, picture=out / "before.png"),
+        "after": store.read_json(work / "learn" / "metrics.json"),
+    }
+    picture = work / "learn" / "samples" / f"{config.steps:07d}.png"
+    store.atomic_write(out / "after.png", store.read_bytes(picture))
+    scores = {name: {"psnr": _mean_psnr(row), **{k: v for k, v in row.items() if k != "clips"}} for name, row in found.items()}
     gain = scores["after"]["psnr"] - scores["before"]["psnr"]
     verdict = "" if gain >= LEAST_GAIN_DB else "; the model is kept as it was"
     log.info(f"adapt: {_in_db(scores)}, on {len(kept)} clips not learned from{verdict}")

@@ -41,8 +41,8 @@ from mudg.models.diffusion import GeneratedClip
 from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of
 from mudg.stages.config import SynthesizeConfig
-from mudg.stages.fit import load_model
 from mudg.stages.fitting.planes import render_planes
+from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.learning import loading
 from mudg.stages.learning.precision import choose_bf16
 
@@ -70,12 +70,13 @@ def run(
     refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "model": folder_of(config.model)})
     config = loading.check_config(config, fitted is not None)
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": digest(config.model)}
+    loaded = read_scene(scene)
     if fitted is not None:
         inputs["fitted"] = store.digest(fitted)
+        model_of_scene(fitted, loaded)
     directory = RunDir.open(out, _OUTPUT, to_dict(config), inputs, overwrite)
     if directory.complete:
         return directory.reused()
-    loaded = read_scene(scene)
     cameras = config.cameras or tuple(loaded.cameras)[:1]
     if not cameras or not config.shifts_m:
         raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")

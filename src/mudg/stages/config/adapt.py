@@ -36,7 +36,7 @@ class AdaptConfig:
     lr: float = Field(default=1e-4, gt=0)
     """Largest learning rate."""
     trained: Literal["all", "refiner"] = "all"
-    """Parts that are trained. refiner: refiner and finisher only, which takes half the time."""
+    """Parts that are trained. refiner: refiner and finisher only."""
     augment: bool = True
     """Vary the training clips in colour, and mirror them."""
     label_confidence: float = Field(default=0.5, ge=0, le=1)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.types import Scene
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.model import SceneModel
 
@@ -35,6 +36,19 @@ def load_appearance(folder: Path) -> Appearance:
         return Appearance({})
     names = store.read_json(folder / "appearance.json")["names"]
     return Appearance.from_state(names, store.read_tensors(folder / "appearance.safetensors"))
+
+
+def model_of_scene(folder: Path, scene: Scene) -> SceneModel:
+    """Read a scene fitted to `scene`.
+
+    Raises:
+        InputError: it was fitted to another one. As `load_model`.
+    """
+    model = load_model(folder)
+    if model.facts.get("scene", scene.id) != scene.id:
+        raise InputError("this scene was fitted to another log", where=str(folder), expected=scene.id, got=str(model.facts["scene"]),
+                         remedy="give the fit of this scene")  # fmt: skip
+    return model
 
 
 def load_model(folder: Path) -> SceneModel:
