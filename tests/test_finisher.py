@@ -286,7 +286,7 @@ def test_detail_comes_from_a_warped_image_that_agrees_and_from_nothing_else():
     one = torch.ones(1, 1, 12, 16)
 
     def given(color, seen):
-        return SimpleNamespace(color=color, valid=torch.zeros_like(one), warped=seen)
+        return SimpleNamespace(color=color, valid=one, warped=seen)
 
     taken = with_detail(flat, given(sharp, one))
     assert (taken - taken.mean()).abs().mean() > 0.5 * (sharp - sharp.mean()).abs().mean()

@@ -140,7 +140,7 @@ def with_detail(rgb: Tensor, given: ConditionPixels) -> Tensor:
     coarse = lambda x: functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)  # noqa: E731
     mine, theirs = coarse(rgb), coarse(given.color)
     apart = (mine - theirs).abs().amax(1, keepdim=True)
-    weight = (1 - apart / DETAIL_APART).clamp(0, 1) * torch.maximum(given.valid, given.warped)
+    weight = (1 - apart / DETAIL_APART).clamp(0, 1) * given.warped
     return rgb + weight * ((given.color - theirs) - (rgb - mine))
 
 
