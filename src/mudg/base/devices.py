@@ -1,0 +1,93 @@
+"""Which device computes: chosen once per verb from its `--device`, checked, and said aloud.
+
+    auto      the first CUDA device if there is one, else the CPU
+    cpu       the CPU
+    cuda, cuda:N   the first CUDA device, or number N; refused if it is not there
+    mps       Apple's GPU, for networks only; refused for what has no kernels there
+
+Numpy arrays stay on the CPU. A stage moves tensors to the device in one place, and results back in one place.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Final
+
+from pydantic import StringConstraints
+
+from mudg.base import log
+from mudg.base.errors import ResourceError, UsageError
+
+if TYPE_CHECKING:
+    import torch
+
+DevicePattern: Final = r"^(auto|[a-z]+(:\d+)?)$"
+DeviceName = Annotated[str, StringConstraints(pattern=DevicePattern)]
+"""A setting's type: `auto`, or a kind of device with or without its number."""
+REMEDY: Final = "--device cpu works everywhere; `mudg doctor` lists the devices of this machine"
+
+
+def _cuda_problem(index: int) -> str:
+    import torch
+
+    if not torch.cuda.is_available():
+        return "this torch is a build for the CPU" if torch.version.cuda is None else "torch finds no CUDA device"
+    count = torch.cuda.device_count()
+    return "" if index < count else f"there are {count}: cuda:0 to cuda:{count - 1}"
+
+
+def _mps_problem(index: int) -> str:
+    import torch
+
+    return "" if torch.backends.mps.is_available() and index == 0 else "torch finds no MPS device"
+
+
+PROBLEMS: Final[dict[str, Callable[[int], str]]] = {"cpu": lambda _: "", "cuda": _cuda_problem, "mps": _mps_problem}
+"""Kind of device -> why the one of this number cannot be used, or ""."""
+SAME_CODE: Final[dict[str, str]] = {}
+"""Kinds that other packages add to torch -> the kind above whose code runs on them."""
+
+
+def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "cuda")) -> torch.device:
+    """The device that a verb computes on. Says which, once per purpose.
+
+    Args:
+        wanted: a `DeviceName`.
+        purpose: what runs there, for messages ("fit", "diffusion model").
+        kinds: kinds of devices that this purpose has an implementation for.
+
+    Raises:
+        UsageError: a kind that is not known, or not implemented for this purpose. ResourceError: it is not on this machine.
+    """
+    import torch
+
+    name = wanted
+    if wanted == "auto":
+        name = "cuda" if "cuda" in kinds and not _cuda_problem(0) else "cpu"
+    kind, _, number = name.partition(":")
+    if kind not in PROBLEMS or not re.match(DevicePattern, wanted):
+        raise UsageError(
+            "unknown device", where="--device", expected=f"auto, {', '.join(PROBLEMS)} or cuda:N", got=wanted
+        )
+    if SAME_CODE.get(kind, kind) not in kinds:
+        raise UsageError(f"{purpose}: not implemented on this device", where="--device", expected=f"auto, {', '.join(kinds)}", got=wanted,
+                         remedy=REMEDY)  # fmt: skip
+    problem = PROBLEMS[kind](int(number or 0))
+    if problem:
+        raise ResourceError(
+            f"{purpose}: this device cannot be used", where="--device", expected=wanted, got=problem, remedy=REMEDY
+        )
+    chosen = torch.device("cpu") if kind == "cpu" else torch.device(kind, int(number or 0))
+    log.info_once(f"{purpose}: {described(chosen)}")
+    return chosen
+
+
+def described(device: torch.device) -> str:
+    """The device in words: a CUDA card with its name and free memory."""
+    import torch
+
+    if device.type != "cuda":
+        return {"cpu": "on the CPU"}.get(device.type, f"on {device}")
+    free, total = torch.cuda.mem_get_info(device)
+    return f"on {device} ({torch.cuda.get_device_name(device)}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free)"
