@@ -8,6 +8,7 @@ device. What it cannot tell: kernels that exist only there, speed, memory, race 
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import torch
 from torch.utils import _pytree as pytree
@@ -113,6 +114,37 @@ class Pretend(torch.Tensor):
 COPIES = {"aten::_to_copy", "aten::copy_", "aten::to", "aten::_copy_from"}
 
 
+@dataclass
+class Copies:
+    """Sizes, in elements, of the tensors that were copied from one device to the other, in order."""
+
+    to_device: list[int] = field(default_factory=list)
+    to_host: list[int] = field(default_factory=list)
+
+
+_COUNTING: list[Copies] = []
+
+
+@contextmanager
+def copies():
+    """Within: every copy between the CPU and the pretend device is noted. Reading a single number (`float(x)`) is none."""
+    noted = Copies()
+    _COUNTING.append(noted)
+    try:
+        yield noted
+    finally:
+        _COUNTING.remove(noted)
+
+
+def _note(name, args, to_there):
+    if name not in COPIES:
+        return
+    source = args[1] if name == "aten::copy_" else args[0]
+    if isinstance(source, torch.Tensor) and isinstance(source, Pretend) != to_there:
+        for noted in _COUNTING:
+            (noted.to_device if to_there else noted.to_host).append(source.numel())
+
+
 def run(func, args, kwargs):
     """Run an operation on the values, after looking at where its operands say they are."""
     name = func._schema.name
@@ -132,6 +164,7 @@ def run(func, args, kwargs):
         kwargs = {**kwargs, "device": torch.device("cpu")}
     if name == "aten::copy_":
         to_there = isinstance(args[0], Pretend)
+    _note(name, args, to_there)
     if (
         "generator" in kwargs
         and kwargs["generator"] is not None

@@ -45,6 +45,8 @@ def _mps_problem(index: int) -> str:
 
 PROBLEMS: Final[dict[str, Callable[[int], str]]] = {"cpu": lambda _: "", "cuda": _cuda_problem, "mps": _mps_problem}
 """Kind of device -> why the one of this number cannot be used, or ""."""
+NETWORK_KINDS: Final = ("cpu", "cuda", "mps")
+"""Kinds of devices for networks that are plain torch."""
 SAME_CODE: Final[dict[str, str]] = {}
 """Kinds that other packages add to torch -> the kind above whose code runs on them."""
 

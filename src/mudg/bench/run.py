@@ -22,6 +22,7 @@ import torch
 
 from mudg.base import log, store
 from mudg.base.config import to_dict
+from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.bench import poses as bench_poses
@@ -31,7 +32,7 @@ from mudg.core import flicker
 from mudg.data.clips import from_city
 from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 from mudg.data.clips.from_city import CityClipRules
-from mudg.models.diffusion import SampleRequest
+from mudg.models.diffusion import SampleRequest, generated
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages.config import BenchConfig, SynthesizeConfig
@@ -76,10 +77,11 @@ def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = 
 
 
 def _mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    bf16 = choose_bf16(config.precision)
+    device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
+    bf16 = choose_bf16(config.precision, device)
     request = SampleRequest(1, config.seed, sampler=config.sampler, eta=config.eta, bf16=bf16)
     MDM.check_request(request)
-    model = mdm_files.load(config.model)
+    model = mdm_files.load(config.model).to(device)
     cities = from_city.LISTS[config.cities][: config.count]
     rules = CityClipRules(window=model.config.window, fitted=model.config.renders)
     from_city.write_missing(rules, cities, out / "clips", fit_city if rules.fitted else None)
@@ -129,7 +131,7 @@ def seam(model: MDM, config: BenchConfig, bf16: bool) -> dict[str, Any]:
         )[0]
         shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
-        made = model.sample(condition, SampleRequest(usual.steps, config.seed, number, known=known, bf16=bf16))
+        made = generated(model, condition, SampleRequest(usual.steps, config.seed, number, known=known, bf16=bf16))
         frames += list(made.rgb[shared if tail else 0 :])
         tail = dict(made.latents)
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])

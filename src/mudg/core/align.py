@@ -52,28 +52,35 @@ def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) 
         raise InputError("depth, measured depth and its mask differ in shape",
             got=f"{tuple(depth.shape)}, {tuple(measured.shape)}, {tuple(valid.shape)}")  # fmt: skip
     known = valid & torch.isfinite(depth) & torch.isfinite(measured) & (measured > 0)
-    x, y = depth[known].double(), measured[known].double()
+    x, y = _exactly(depth[known]), _exactly(measured[known])
     if len(x) == 0:
         return DepthFit(1.0, 0.0, float("nan"), float("nan"), False)
-    before = float((x / y - 1).abs().median())
+    off = (x / y - 1).abs().median()
     if len(x) < MIN_POINTS:
+        before = float(off)
         return DepthFit(1.0, 0.0, before, before, False)
     rows = torch.stack([x / y, 1 / y], 1)
     found = torch.stack([(y / x.clamp(min=0.1)).median(), x.new_zeros(())])  # a start that outliers do not move
-    scale, shift = _reweighted(rows, found, rounds).tolist()
-    after = float((((scale * x + shift) / y) - 1).abs().median())
+    found = _reweighted(rows, found, rounds)
+    still = (((found[0] * x + found[1]) / y) - 1).abs().median()
+    scale, shift, before, after = torch.stack([*found, off, still]).cpu().tolist()  # all four numbers leave the device at once
     used = MIN_SCALE <= scale <= MAX_SCALE and after < before
     return DepthFit(scale, shift, after if used else before, before, used)
+
+
+def _exactly(x: Tensor) -> Tensor:
+    """The numbers in float64, where they are if their device has it."""
+    return (x.cpu() if x.device.type == "mps" else x).double()
 
 
 def _reweighted(rows: Tensor, found: Tensor, rounds: int) -> Tensor:
     """`rows` f64[N,2] @ result f64[2] near 1, by least squares reweighted with Tukey's function, from a start `found`."""
     for _ in range(rounds):
         error = (rows @ found - 1).abs()
-        reach = 4.685 * max(1.4826 * float(error.median()), 1e-6)
+        reach = 4.685 * (1.4826 * error.median()).clamp(min=1e-6)
         weight = (1 - (error / reach).square()).clamp(min=0).square()
         normal = rows.T @ (weight[:, None] * rows)
-        normal = normal + 1e-9 * normal.diagonal().mean() * torch.eye(2, dtype=torch.float64)
+        normal = normal + 1e-9 * normal.diagonal().mean() * torch.eye(2, dtype=torch.float64, device=rows.device)
         found = torch.linalg.solve(normal, rows.T @ weight)
     return found
 

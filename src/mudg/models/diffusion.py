@@ -1,15 +1,19 @@
 """The interface that the two diffusion models share: requests, generated clips, and their confidence.
 
 `MDM` (`models/mdm/model.py`) and `PublishedMDM` (`models/published/model.py`) have the same methods: `check_request`, `check_clip`,
-`image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`.
+`image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`, both on the model's device.
+
+Conditions are made on the CPU, and clips are used there: `generated` is the border to the model's device. It takes a clip's condition
+over once and brings back the finished clip; in between only noise, drawn on the CPU so that it is the same for every device, and
+latents of the window before go over.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -77,6 +81,53 @@ class GeneratedClip:
     latents: dict[Modality, Tensor] = field(repr=False)
     depth_fits: tuple[DepthFit, ...] = ()
     log_error: Tensor | None = field(default=None, repr=False)
+
+    def to(self, device: torch.device) -> GeneratedClip:
+        """The same clip with its tensors on a device."""
+        own = {f.name: x.to(device) for f in fields(self) if isinstance(x := getattr(self, f.name), Tensor)}
+        return replace(self, **own, latents={m: z.to(device) for m, z in self.latents.items()})
+
+
+# the border to the device ---------------------------------------------------------------------------------------------
+
+
+class Sampling(Protocol):
+    """What `generated` asks of a model."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights lie."""
+        ...
+
+    def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
+        """Generate one clip."""
+        ...
+
+
+class Finishing(Sampling, Protocol):
+    """What `generated_and_finished` asks of a model."""
+
+    def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip:
+        """A generated clip at the size of `fine`."""
+        ...
+
+
+CPU = torch.device("cpu")
+
+
+def generated(model: Sampling, condition: Condition, request: SampleRequest) -> GeneratedClip:
+    """A clip generated on the model's device; condition and clip are on the CPU."""
+    return model.sample(condition.to(model.device), request).to(CPU)
+
+
+def generated_and_finished(
+    model: Finishing, condition: Condition, fine: Condition, request: SampleRequest
+) -> tuple[GeneratedClip, GeneratedClip]:
+    """As `generated`, and the same clip at the size of `fine`, made by the model's finisher."""
+    clip = model.sample(condition.to(model.device), request)
+    finished = model.finish(clip, fine.to(model.device), bf16=request.bf16)
+    clip = clip.to(CPU)
+    return clip, replace(finished, latents=clip.latents).to(CPU)
 
 
 def check_image_size(height: int, width: int, multiple: int) -> None:

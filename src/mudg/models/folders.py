@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mudg.base import store
+from mudg.base.devices import NETWORK_KINDS, DeviceName, choose_device
 from mudg.base.errors import InputError, ResourceError
 
 _REMEDY: Final = "pip install 'mudg[models]'"
@@ -29,20 +30,18 @@ _REMEDY: Final = "pip install 'mudg[models]'"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Device of a network, and whether its convolutions and matrix products are computed in bfloat16."""
+    """Device of a network, one that `choose_device` accepts, and whether its convolutions and matrix products are computed in bfloat16."""
 
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: DeviceName = "cpu"
     bf16: bool = False
 
     def ready(self) -> torch.device:
-        """The device; ResourceError where there is none of the kind."""
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ResourceError("no CUDA device here", where="--device cuda", remedy="leave the flag out")
-        return torch.device(self.device)
+        """The device; UsageError, ResourceError where there is none of the kind."""
+        return choose_device(self.device, "networks of annotate", NETWORK_KINDS)
 
     def autocast(self) -> torch.autocast:
         """Context in which a network shall run."""
-        return torch.autocast(self.device, torch.bfloat16, enabled=self.bf16)
+        return torch.autocast(self.device.partition(":")[0], torch.bfloat16, enabled=self.bf16)
 
 
 CPU: Final = Place()

@@ -14,12 +14,16 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from mudg import native
 from mudg.base import log, store
 from mudg.base.config import to_dict
+from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
@@ -58,6 +62,7 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
         InputError: the log is too short, inputs malformed. UsageError: a model that does not use renders.
     """
     refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "model": mdm_files.folder_of(config.model)})
+    config = replace(config, device=str(choose_device(config.device, "diffusion model", NETWORK_KINDS)))
     model = mdm_files.load(config.model)
     if not mdm_files.uses_renders(config.model):
         raise UsageError("this model was not trained with renders of a fitted scene", where="--model", got=config.model,
@@ -70,7 +75,7 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
     if reason:
         raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
                          remedy="smaller --block, or use the model as it is")  # fmt: skip
-    settings = {name: value for name, value in to_dict(config).items() if name != "processes"}
+    settings = {name: value for name, value in to_dict(config).items() if name not in ("processes", "device")}
     directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if directory.complete:
         return directory.reused() / "model"
@@ -107,8 +112,9 @@ def _make_lessons(config: AdaptConfig, learnt: LearntLog, lessons: list[Lesson],
     """Fits and clips of all lessons, several made at a time; returns the number of clips made."""
     jobs = [(config, learnt, lesson, [row for row in plan if row[1].name == lesson.name], work) for lesson in lessons]
     made = 0
+    processes = config.processes or (os.cpu_count() if config.device == "cpu" else 1) or 1
     with log.task("lessons", len(jobs)) as bar:
-        for _, clips in run_in_processes(make_lesson, jobs, min(config.processes or os.cpu_count() or 1, len(jobs))):
+        for _, clips in run_in_processes(make_lesson, jobs, min(processes, len(jobs))):
             made += clips
             bar.advance()
     return made
@@ -130,16 +136,17 @@ def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -
             average_decay=0.95,
         ),
         score=LearnScore(every=1_000_000, watched=len(plan) - train, steps=SCORED_STEPS),
-        compute=LearnCompute(workers=0, checkpoint_every=20, log_every=10),
+        compute=LearnCompute(device=config.device, workers=0, checkpoint_every=20, log_every=10),
     )  # fmt: skip
 
 
 def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -> dict[str, Any]:
     """Compare the model started from with the one that `learn` left, on the clips kept for it; the record of the comparison."""
     kept = [number for number, _, _ in plan if number >= HELD_OUT]
-    request = SampleRequest(SCORED_STEPS, config.seed, bf16=choose_bf16(config.precision))
+    device = torch.device(config.device)
+    request = SampleRequest(SCORED_STEPS, config.seed, bf16=choose_bf16(config.precision, device))
     found = {
-        "before": learn_score.score(base, kept, work / CLIPS, request, picture=out / "before.png"),
+        "before": learn_score.score(base.to(device), kept, work / CLIPS, request, picture=out / "before.png"),
         "after": store.read_json(work / "learn" / "metrics.json"),
     }
     picture = work / "learn" / "samples" / f"{config.steps:07d}.png"

@@ -27,6 +27,7 @@ from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Scene
 from mudg.data.scene import SCENE_FILES, SceneWriter, read_image, read_scene
+from mudg.models.folders import CPU
 from mudg.models.labels.ground import driven_path
 from mudg.models.labels.inputs import LabelInput, Labels
 from mudg.models.labels.labellers import labeller
@@ -39,6 +40,8 @@ from mudg.stages.labelling.points import NearbyReturns
 
 _STAGING = "labelled"
 _OUTPUT = VerbOutput("annotate", 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", f"{_STAGING}/"))
+_SHARING = 4
+"""Processes that share a device with the shipped network: each holds a context of some hundred megabytes there."""
 _FRAMES_PER_PROCESS = 8
 """Fewer frames than this are not worth the start of a process."""
 
@@ -56,7 +59,8 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     """
     refuse_overlap(out, {"scene": scene, **annotate_depth.folders(config)})
     settings = to_dict(config)
-    settings.pop("processes")  # changes no result
+    for name in ("processes", "device"):  # where is computed, not what
+        settings.pop(name)
     inputs = inputs_of(config, scene)
     folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if folder.complete:
@@ -132,7 +136,7 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
     todo = [frame.id for frame in missing if not staged_labels(staging, frame.id).is_file()]
     if len(todo) < len(missing):
         log.info(f"annotate: {len(missing) - len(todo)} frames are labelled already")
-    most = config.processes or (1 if config.device == "cuda" else os.cpu_count()) or 1
+    most = config.processes or _usual_processes(config)
     processes = min(most, len(todo) // _FRAMES_PER_PROCESS)
     with log.task("labelling frames", len(missing), len(missing) - len(todo)) as bar:
         if processes <= 1:
@@ -148,6 +152,16 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
             bar.advance(labelled)
 
 
+def _usual_processes(config: AnnotateConfig) -> int:
+    """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with the shipped one,
+    whose evidence is gathered on the CPU meanwhile."""
+    cores = os.cpu_count() or 1
+    uses_network = config.labeller != "geometry" or bool(config.depth_network)
+    if not uses_network or annotate_depth.place(config).device == "cpu":
+        return cores
+    return 1 if config.labeller == "network" or config.depth_network else min(cores, _SHARING)
+
+
 def _label_in_process(config: AnnotateConfig, path: Path, ids: list[str], staging: Path) -> int:
     return sum(1 for _ in label_into_staging(config, read_scene(path), ids, staging))
 
@@ -156,7 +170,7 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
     """Label these frames one after the other, write each to ``staging``, and name it when it is there."""
     if not ids:
         return
-    label = labeller(config.labeller, config.weights, annotate_depth.place(config))
+    label = labeller(config.labeller, config.weights, annotate_depth.place(config) if config.labeller != "geometry" else CPU)
     network = annotate_depth.load(config)
     returns = NearbyReturns(scene, config.sweeps)
     path = driven_path(scene.ego.world_from_ego)

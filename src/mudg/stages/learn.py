@@ -116,7 +116,7 @@ def _refuse_overlap(config: LearnConfig, out: Path, sources: Sequence[from_log.L
 def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
     """Clips, codec, network, scores. From logs, `config` is rewritten in terms of shards: `given` is what the user said."""
     out, given, kind = directory.path, config, kind_of(model)
-    bf16 = choose_bf16(config.precision)
+    bf16 = choose_bf16(config.precision, ranks.device)
     folder = Path(config.data.clips) if config.data.clips else out / "clips"
     about_data = ""
     if isinstance(model, MDM) and not model.config.renders:
@@ -134,7 +134,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         config = learn_clips.of_one_size(config)
     with making:
         if "codec" in fresh and isinstance(model, MDM):
-            ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16))
+            ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16, ranks.device))
             learn_codec.load_trained_codec(model.codec, out, ranks)
             draw_weights(model.net, config.seed, "weights")
         for name in ("refiner", "finisher"):

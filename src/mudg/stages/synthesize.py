@@ -37,9 +37,10 @@ from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, buil
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
-from mudg.models.diffusion import GeneratedClip
+from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
 from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of
+from mudg.models.mdm.model import MDM
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model, model_of_scene
@@ -50,6 +51,8 @@ SOURCE = "mudg_r"
 SKY = palette.ID["sky"]
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
+COMPUTE = ("device", "offload", "compiled")
+"""Settings that say where and how is computed, not what: a result may be resumed and reused under others."""
 _OUTPUT = VerbOutput("synthesize", 1, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
 
 
@@ -74,7 +77,8 @@ def run(
     if fitted is not None:
         inputs["fitted"] = store.digest(fitted)
         model_of_scene(fitted, loaded)
-    directory = RunDir.open(out, _OUTPUT, to_dict(config), inputs, overwrite)
+    settings = {name: value for name, value in to_dict(config).items() if name not in COMPUTE}
+    directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if directory.complete:
         return directory.reused()
     cameras = config.cameras or tuple(loaded.cameras)[:1]
@@ -84,10 +88,11 @@ def run(
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
-    choose_bf16(config.precision)
+    choose_bf16(config.precision, torch.device(config.device))
     started = time.monotonic()
     jobs = [(config, Path(scene), Path(fused), directory.path, path, fitted) for path in paths]
-    frames = _run_jobs(jobs, names, config.processes or os.cpu_count() or 1)
+    usual = os.cpu_count() if config.device == "cpu" else 1
+    frames = _run_jobs(jobs, names, config.processes or usual or 1)
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
@@ -215,7 +220,7 @@ class ViewMaker:
         self._rules, self._full_size = rules, config.full_size
         self._render_at = render_at
         self._sources: dict[int, WarpSource] = {}
-        self._request = loading.request_of(config, choose_bf16(config.precision))
+        self._request = loading.request_of(config, choose_bf16(config.precision, model.device))
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
@@ -228,8 +233,7 @@ class ViewMaker:
         condition, fine = build_conditions(
             self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources, self._render_at
         )
-        sample = self._model.sample(condition, replace(self._request, index=number, known=known))
-        made, made_views = self._finished(sample, condition, fine, views)
+        sample, made, made_views = self._generated(condition, fine, views, replace(self._request, index=number, known=known))
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
         if self._model.points_alone and not recorded_at_pose(views[0], self._recorded):
             usable[0] = False
@@ -240,17 +244,21 @@ class ViewMaker:
         ]
         return sample, condition, observations
 
-    def _finished(
-        self, sample: GeneratedClip, condition: Condition, fine: Condition, views: Sequence[View]
-    ) -> tuple[GeneratedClip, tuple[View, ...]]:
-        """The clip and its views at the size that is written, without depth in the sky."""
+    def _generated(
+        self, condition: Condition, fine: Condition, views: Sequence[View], request: SampleRequest
+    ) -> tuple[GeneratedClip, GeneratedClip, tuple[View, ...]]:
+        """The clip at the size the model works at; it and its views at the size that is written, without depth in the sky."""
+        model = self._model
+        if self._full_size and isinstance(model, MDM) and model.finisher is not None:
+            sample, finished = generated_and_finished(model, condition, fine, request)
+            return sample, without_sky_depth(finished, fine), tuple(views)
+        sample = generated(model, condition, request)
+        made = without_sky_depth(sample, condition)
         if not self._full_size:
-            return without_sky_depth(sample, condition), condition.views
-        if not self._model.points_alone and self._model.config.finish_widths:
-            return without_sky_depth(self._model.finish(sample, fine, bf16=self._request.bf16), fine), tuple(views)
+            return sample, made, condition.views
         size = views[0].camera.height, views[0].camera.width
-        conditions = None if self._model.points_alone else (condition, fine)
-        return enlarge(without_sky_depth(sample, condition), size, conditions), tuple(views)
+        conditions = None if model.points_alone else (condition, fine)
+        return sample, enlarge(made, size, conditions), tuple(views)
 
 
 def without_sky_depth(clip: GeneratedClip, condition: Condition) -> GeneratedClip:

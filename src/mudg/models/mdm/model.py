@@ -181,6 +181,11 @@ class MDM(nn.Module):
             (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
             self.finisher = Finisher((fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights lie."""
+        return self.codec.rgb_mean.device
+
     # inputs -----------------------------------------------------------------------------------------------------------
 
     def check_size(self, height: int, width: int) -> None:
@@ -433,8 +438,8 @@ class MDM(nn.Module):
     def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
         """Generate one clip (see `SampleRequest`).
 
-        The condition has T views; H and W are multiples of `config.pixel_multiple`. Frames of which `request.known` has latents
-        keep them. Measured depth (`condition.valid`) replaces generated depth.
+        Condition and clip are on the model's device. The condition has T views; H and W are multiples of `config.pixel_multiple`.
+        Frames of which `request.known` has latents keep them. Measured depth (`condition.valid`) replaces generated depth.
         """
         self.check_request(request)
         encoded = self.encode_condition(condition)
@@ -447,7 +452,7 @@ class MDM(nn.Module):
         if request.n_samples > 1:
             change = torch.stack([d["rgb"] for d in drawn]).std(0).mean(2, keepdim=True) * 2
         latents = {m: z[0] for m, z in drawn[0].items()}
-        with torch.autocast("cpu", torch.bfloat16, enabled=request.bf16):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=request.bf16):
             if self.refiner is None:
                 decoded = self.codec.decode(latents)
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
@@ -478,7 +483,7 @@ class MDM(nn.Module):
         given = self._pixels_of(_Stacked.of([fine]))
         code = self.codec.linear_depth_code(clip.depth)
         made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
             made = finish_in_tiles(self.finisher, made, given)
         decoded = self._decoded(replace(made, rgb=with_detail(made.rgb, given)))
         confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
@@ -496,15 +501,17 @@ class MDM(nn.Module):
         lead, cell = encoded.planes.shape[:2], encoded.planes.shape[-2:]
         sizes = [self.codec.channels[m] for m in MODALITIES]
         generator = torch.Generator().manual_seed(seeds.key(request.seed, request.index * 64 + number, "sample"))
-        draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, self.config.shared_noise)  # noqa: E731
-        known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None]
+        device, shared = encoded.planes.device, self.config.shared_noise
+        draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)  # noqa: E731
+        known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None].to(device)
 
         def denoise(x: Tensor, t: int) -> Tensor:
-            stated, _ = self.predict(dict(zip(MODALITIES, x.split(sizes, 2))), encoded, torch.full((lead[0],), t))
+            at = torch.full((lead[0],), t, device=device)
+            stated, _ = self.predict(dict(zip(MODALITIES, x.split(sizes, 2))), encoded, at)
             out = torch.cat([stated[m].float() for m in MODALITIES], 2)
             return out if known is None else torch.cat([known, out[:, known.shape[1] :]], 1)
 
-        with torch.autocast("cpu", torch.bfloat16, enabled=request.bf16):  # around all steps: the weights are converted once
+        with torch.autocast(device.type, torch.bfloat16, enabled=request.bf16):  # around all steps: the weights are converted once
             x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
         color = lambda z: z[:, :, : sizes[0]]  # noqa: E731
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))

@@ -396,7 +396,8 @@ class Refiner(CellNet):
         """Undo what class weights f32[19] in the loss did to the scores: each class loses the logarithm of its weight."""
         first = sum(self.SIZES[:5])
         with torch.no_grad():
-            self.leave.bias[first : first + 4 * CLASSES] -= class_weights.log().repeat_interleave(4)  # type: ignore[index]
+            bias = self.leave.bias[first : first + 4 * CLASSES]  # type: ignore[index]
+            bias -= class_weights.log().repeat_interleave(4).to(bias.device)
 
     def reset(self) -> None:
         """Output that adds nothing and copies little, whatever the other weights are."""

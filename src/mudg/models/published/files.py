@@ -52,7 +52,7 @@ def save(
         store.sync_tree(partial)
 
 
-def load(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> PublishedMDM:
+def load(folder: Path, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> PublishedMDM:
     """Read a model folder; weights are mapped from the files and converted to `dtype` (None: as stored).
 
     Raises:

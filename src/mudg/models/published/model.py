@@ -41,6 +41,7 @@ from mudg.models.published.clip import IMAGE_TOWER, TEXT_TOKENS, TEXT_TOWER, Ima
 from mudg.models.published.kl_vae import Autoencoder, AutoencoderConfig
 from mudg.models.published.resampler import Resampler, ResamplerConfig
 from mudg.models.published.video_unet import (
+    ContextKeys,
     SeededDropout,
     TemporalConv,
     TemporalTransformer,
@@ -129,6 +130,19 @@ class WorkSplit:
     guidance_together: bool = True
     frames_at_once: int = 16
     """Frames per pass of the autoencoder."""
+    offload: bool = False
+    """Keep the image tower on the CPU, except while it reads a reference."""
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What the network is told beside the latents: modality labels i64[N], caption tokens [N,77,D], image tokens [N,T,16,D], and keys
+    and values of both in every layer if they are needed more than once."""
+
+    label: Tensor
+    text: Tensor
+    tokens: Tensor
+    keys: list[ContextKeys] | None
 
 
 @dataclass(frozen=True)
@@ -242,10 +256,18 @@ class PublishedMDM(nn.Module):
         planes = torch.cat(
             [self._encode(color * 2 - 1, generator), self._encode(self.codec.depth_image(depth), generator)], 2
         )
-        images = torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])])
+        features = self._features(torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])]))
+        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
+
+    def _features(self, images: Tensor) -> Tensor:
+        """What the image tower, which lies on the CPU if `split` says so, makes of images on the model's device."""
+        if self.split.offload:
+            self.image.to(self.device)
         with torch.no_grad():
             features = self.image(images)
-        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
+        if self.split.offload:
+            self.image.to("cpu")
+        return features
 
     def encode_truth(
         self, rgb: Tensor, depth: Tensor, semantics: Tensor, generator: torch.Generator | None = None
@@ -278,10 +300,19 @@ class PublishedMDM(nn.Module):
 
         planes [N,T,8,h,w]; text [N,77,D]; tokens [N,T,16,D].
         """
-        label = torch.tensor([LABELS[m] for m in names], device=x.device)
+        return self._velocity(x, planes, t, self._told(names, text, tokens))
+
+    def _told(self, names: Sequence[Modality], text: Tensor, tokens: Tensor, *, ahead: bool = False) -> _Told:
+        """What the network is told beside the latents; `ahead`: with keys and values of caption and image tokens, for many steps."""
+        text, tokens = text.to(self.dtype), tokens.to(self.dtype)
+        label = torch.tensor([LABELS[m] for m in names], device=text.device)
+        return _Told(label, text, tokens, self.net.context_keys(text, tokens) if ahead else None)
+
+    def _velocity(self, x: Tensor, planes: Tensor, t: Tensor, told: _Told) -> Tensor:
+        """As `predict`."""
         inputs = torch.cat([x, planes], 2).to(self.dtype)
         fps = torch.full_like(t, self.config.fps)
-        return self.net(inputs, t, label, fps, text.to(self.dtype), tokens.to(self.dtype)).float()
+        return self.net(inputs, t, told.label, fps, told.text, told.tokens, told.keys).float()
 
     # training ---------------------------------------------------------------------------------------------------------
 
@@ -409,7 +440,7 @@ class PublishedMDM(nn.Module):
 
     @torch.no_grad()
     def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
-        """Generate one clip of exactly `config.window` frames (see `SampleRequest`).
+        """Generate one clip of exactly `config.window` frames (see `SampleRequest`). Condition and clip are on the model's device.
 
         Steps run from the noisiest one down. Of frames whose latents are known, the decoded colour takes the place of the sparse
         colour: the published way to continue a video. Depth and semantics are not continued. Without `align`, depth is
@@ -437,13 +468,12 @@ class PublishedMDM(nn.Module):
             if request.n_samples > 1:
                 change = torch.stack([d["rgb"] for d in drawn]).std(0).mean(1, keepdim=True) * 2
             decoded = self.codec.decode(latents, frames_at_once)
-        confidence = confidence_of(encoded.seen[0].cpu(), change.cpu(), self.codec.factor)
-        rgb, depth, ids = (y.cpu() for y in (decoded.rgb, decoded.depth, decoded.semantics))
-        fits: list[DepthFit] = []
+        confidence = confidence_of(encoded.seen[0], change, self.codec.factor)
+        depth, fits = decoded.depth, list[DepthFit]()
         if request.align:
             depth, fits = align_depth(depth, condition.depth, condition.valid)
             confidence = confidence * depth_agreement(depth, condition)
-        return GeneratedClip(rgb, depth, ids, confidence, {m: z.cpu() for m, z in latents.items()}, tuple(fits))
+        return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits))
 
     def _denoise(
         self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest, number: int
@@ -464,28 +494,28 @@ class PublishedMDM(nn.Module):
     def _guided(
         self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest
     ) -> noise.Denoise:
-        """The denoiser for `names` in one batch: velocity with classifier-free guidance."""
+        """The denoiser for `names` in one batch: velocity with classifier-free guidance.
+
+        What is the same at every step is computed here, once: the condition's planes, and keys and values of caption and image.
+        """
         guidance = GUIDANCE if request.guidance is None else request.guidance
         rescale = GUIDANCE_RESCALE if request.guidance_rescale is None else request.guidance_rescale
-        count = len(names)
+        count, both = len(names), slice(0, 1 if guidance == 1 else 2)  # 0: with caption and reference, 1: without
+        halves = [both] if self.split.guidance_together or guidance == 1 else [slice(0, 1), slice(1, 2)]
+        told = [
+            self._told(names * len(self.text[half]), self.text[half].repeat_interleave(count, 0),
+                       tokens[half].repeat_interleave(count, 0), ahead=True)
+            for half in halves
+        ]  # fmt: skip
 
-        def passed(x: Tensor, t: int, kinds: Sequence[int]) -> Tensor:
-            """Velocities [K*N,...] with (0) and without (1) caption and reference."""
-            n = len(kinds)
-            return self.predict(
-                x.repeat(n, 1, 1, 1, 1), encoded.planes.expand(n * count, -1, -1, -1, -1),
-                torch.full((n * count,), t, device=x.device), names * n,
-                self.text[list(kinds)].repeat_interleave(count, 0), tokens[list(kinds)].repeat_interleave(count, 0),
-            )  # fmt: skip
+        def passed(x: Tensor, t: int, about: _Told) -> Tensor:
+            n = len(about.label)
+            planes, at = encoded.planes.expand(n, -1, -1, -1, -1), torch.full((n,), t, device=x.device)
+            return self._velocity(x.repeat(n // count, 1, 1, 1, 1), planes, at, about)
 
         def velocity(x: Tensor, t: int) -> Tensor:
-            if guidance == 1:
-                return passed(x, t, [0])
-            if self.split.guidance_together:
-                with_context, without = passed(x, t, [0, 1]).chunk(2)
-            else:
-                with_context, without = passed(x, t, [0]), passed(x, t, [1])
-            return noise.guide(with_context, without, guidance, rescale)
+            found = [half for about in told for half in passed(x, t, about).split(count)]
+            return found[0] if guidance == 1 else noise.guide(*found, guidance, rescale)
 
         return velocity
 

@@ -13,7 +13,9 @@ Source: paper of MuDG, section on the multi-modal diffusion model; architecture 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -93,6 +95,22 @@ def attend(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
     return mixed.transpose(1, 2).flatten(2)
 
 
+class Context(NamedTuple):
+    """What cross-attention looks at: caption tokens [B,77,D] and image tokens [B*T,16,D]."""
+
+    text: Tensor
+    image: Tensor
+
+
+class ContextKeys(NamedTuple):
+    """Keys and values of a context in one layer: of caption tokens [B,77,C], of image tokens [B*T,16,C]."""
+
+    key: Tensor
+    value: Tensor
+    image_key: Tensor
+    image_value: Tensor
+
+
 class Attention(nn.Module):
     """Multi-head attention; with `image`, a second attention over image tokens is added before the output projection."""
 
@@ -107,18 +125,21 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
         self.dropout = SeededDropout(dropout)
 
-    def forward(self, tokens: Tensor, text: Tensor | None = None, image: Tensor | None = None) -> Tensor:
-        """`tokens` [N,L,C]; `text` [N/T,77,D] or None for self-attention; `image` [N,16,D] -> [N,L,C]."""
+    def forward(self, tokens: Tensor, context: Context | ContextKeys | None = None) -> Tensor:
+        """`tokens` [N,L,C]; `context` of the same clips, None for self-attention -> [N,L,C]."""
         query = self.query(tokens)
-        if text is None:
-            mixed = attend(query, self.key(tokens), self.value(tokens), self.heads)
-        else:
-            repeats = len(tokens) // len(text)
-            key, value = (p(text).repeat_interleave(repeats, 0) for p in (self.key, self.value))
-            mixed = attend(query, key, value, self.heads)
-        if image is not None and self.image_key is not None and self.image_value is not None:
-            mixed = mixed + attend(query, self.image_key(image), self.image_value(image), self.heads)
+        if context is None:
+            return self.dropout(self.out(attend(query, self.key(tokens), self.value(tokens), self.heads)))
+        seen = self.keys(context) if isinstance(context, Context) else context
+        repeats = len(tokens) // len(seen.key)
+        key, value = (x.repeat_interleave(repeats, 0) for x in (seen.key, seen.value))
+        mixed = attend(query, key, value, self.heads) + attend(query, seen.image_key, seen.image_value, self.heads)
         return self.dropout(self.out(mixed))
+
+    def keys(self, context: Context) -> ContextKeys:
+        """Keys and values of a context; of layers that have those of an image."""
+        text, image = context
+        return ContextKeys(self.key(text), self.value(text), self.image_key(image), self.image_value(image))  # type: ignore[misc]
 
 
 class GatedFeedForward(nn.Module):
@@ -146,10 +167,10 @@ class TransformerBlock(nn.Module):
         self.attention2 = Attention(width, context_width or width, heads, context_width is not None, dropout)
         self.feed = GatedFeedForward(width, dropout)
 
-    def forward(self, x: Tensor, text: Tensor | None = None, image: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, context: Context | ContextKeys | None = None) -> Tensor:
         """`x` [N,L,C] -> the same."""
         x = x + self.attention1(self.norm1(x))
-        x = x + self.attention2(self.norm2(x), text, image)
+        x = x + self.attention2(self.norm2(x), context)
         return x + self.feed(self.norm3(x))
 
 
@@ -169,10 +190,10 @@ class SpatialTransformer(nn.Module):
         self.block = TransformerBlock(width, width // config.head_width, config.context_width, config.dropout)
         self.out = _zero(nn.Linear(width, width))
 
-    def forward(self, x: Tensor, text: Tensor, image: Tensor) -> Tensor:
-        """`x` [B*T,C,h,w], `text` [B,77,D], `image` [B*T,16,D] -> [B*T,C,h,w]."""
+    def forward(self, x: Tensor, context: Context | ContextKeys) -> Tensor:
+        """`x` [B*T,C,h,w] -> the same."""
         tokens = self.enter(self.norm(x).flatten(2).transpose(1, 2))
-        tokens = self.out(self.block(tokens, text, image))
+        tokens = self.out(self.block(tokens, context))
         return x + tokens.transpose(1, 2).unflatten(2, x.shape[2:])
 
 
@@ -253,14 +274,14 @@ class Stage(nn.Module):
         self.temporal = TemporalTransformer(outside, outside, heads, config.dropout) if attention else None
         self.grow = nn.Conv2d(outside, outside, 3, padding=1) if grow else None
 
-    def forward(self, x: Tensor, embedding: Tensor, text: Tensor, image: Tensor, frames: int) -> Tensor:
+    def forward(self, x: Tensor, embedding: Tensor, context: Context | ContextKeys, frames: int) -> Tensor:
         """`x` [B*T,inside,h,w] -> [B*T,outside,h',w']."""
         if self.conv is not None:
             return self.conv(x)
         if self.res is not None:
             x = self.res(x, embedding, frames)
         if self.spatial is not None and self.temporal is not None:
-            x = self.temporal(self.spatial(x, text, image), frames)
+            x = self.temporal(self.spatial(x, context), frames)
         if self.grow is not None:
             x = self.grow(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
         return x
@@ -276,9 +297,9 @@ class Middle(nn.Module):
         self.temporal = TemporalTransformer(width, width, width // config.head_width, config.dropout)
         self.res2 = ResBlock(width, width, 4 * config.width, config.dropout)
 
-    def forward(self, x: Tensor, embedding: Tensor, text: Tensor, image: Tensor, frames: int) -> Tensor:
+    def forward(self, x: Tensor, embedding: Tensor, context: Context | ContextKeys, frames: int) -> Tensor:
         """[B*T,C,h,w] -> the same."""
-        x = self.temporal(self.spatial(self.res1(x, embedding, frames), text, image), frames)
+        x = self.temporal(self.spatial(self.res1(x, embedding, frames), context), frames)
         return self.res2(x, embedding, frames)
 
 
@@ -322,13 +343,23 @@ class VideoUNet(nn.Module):
         self.norm = nn.GroupNorm(GROUPS, inside)
         self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))
 
-    def forward(self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor) -> Tensor:
+    def context_keys(self, text: Tensor, image: Tensor) -> list[ContextKeys]:
+        """Keys and values of caption tokens [B,77,D] and image tokens [B,T,16,D] in every layer that looks at them, in the order of
+        `forward`. They are the same at every noise step."""
+        spatial = [stage.spatial for stage in (*self.down, self.middle, *self.up) if stage.spatial is not None]
+        context = Context(text, image.flatten(0, 1))
+        return [layer.block.attention2.keys(context) for layer in spatial]  # type: ignore[union-attr, operator]
+
+    def forward(
+        self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor, keys: Sequence[ContextKeys] | None = None
+    ) -> Tensor:
         """One denoiser pass.
 
         Args:
             x: [B,T,channels_in,h,w], noisy latent, latent of the colour condition, latent of the depth condition.
             t: i64[B] noise step. label: i64[B] modality. fps: i64[B] frames per second.
             text: [B,77,D] caption tokens. image: [B,T,16,D] image tokens of each frame.
+            keys: `context_keys` of text and image, where they are computed already.
 
         Returns:
             Velocity [B,T,channels_out,h,w].
@@ -337,20 +368,22 @@ class VideoUNet(nn.Module):
         wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)  # noqa: E731
         embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
         embedding = embedding.repeat_interleave(frames, 0)
-        image = image.flatten(0, 1)
+        context = Context(text, image.flatten(0, 1))
+        ready = iter(keys or ())
+        seen = lambda stage: context if keys is None or stage.spatial is None else next(ready)  # noqa: E731
         h = x.flatten(0, 1)
         skips = []
         for number, stage in enumerate(self.down):
-            h = self._run(stage, h, embedding, text, image, frames)
+            h = self._run(stage, h, embedding, seen(stage), frames)
             if number == 0:
                 h = self.first(h, frames)
             skips.append(h)
-        h = self._run(self.middle, h, embedding, text, image, frames)
+        h = self._run(self.middle, h, embedding, seen(self.middle), frames)
         for stage in self.up:
-            h = self._run(stage, torch.cat([h, skips.pop()], 1), embedding, text, image, frames)
+            h = self._run(stage, torch.cat([h, skips.pop()], 1), embedding, seen(stage), frames)
         return self.leave(functional.silu(self.norm(h))).unflatten(0, (batch, frames))
 
-    def _run(self, stage: nn.Module, *inputs: Tensor | int) -> Tensor:
+    def _run(self, stage: nn.Module, *inputs: Tensor | Context | ContextKeys | int) -> Tensor:
         """A stage, kept for the backward pass or not. Dropout draws the same numbers when it is computed again."""
         if not (self.checkpointing and self.training and torch.is_grad_enabled()):
             return stage(*inputs)

@@ -14,6 +14,7 @@ import torch
 
 from mudg import native
 from mudg.base import seeds
+from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.processes import one_torch_thread
 from mudg.base.types import Clip, Condition, Photo, Scene, View
 from mudg.core.pictures import resize_area
@@ -23,7 +24,7 @@ from mudg.data.clips.from_log import measured_depth
 from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
-from mudg.models.diffusion import GeneratedClip, SampleRequest
+from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages.adapting.lessons import LearntLog, Lesson, fit_lesson, lessons_of
@@ -72,7 +73,9 @@ def make_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, rows: Plan,
         return 0
     with native.one_thread(), one_torch_thread():
         folder = fit_lesson(config, log, lesson, work / lesson.name)
-        maker = ClipMaker(config, log, lesson, model_of_window(mdm_files.load(config.model), config.block), folder)
+        device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
+        model = model_of_window(mdm_files.load(config.model), config.block).to(device)
+        maker = ClipMaker(config, log, lesson, model, folder)
         for number, _, frames in missing:
             write_shard(work / CLIPS, number, pack_clips([maker.make(frames, number)]))
     return len(missing)
@@ -102,8 +105,11 @@ class ClipMaker:
             lambda view: render_planes(self._fitted, view),
         )  # fmt: skip
         images = [read_image(self._scene, f) for f in chosen]
-        sample = self._model.sample(condition, SampleRequest(1, self._config.seed, number))
-        finished = self._model.finish(sample, fine) if self._model.finisher is not None else None
+        request, finished = SampleRequest(1, self._config.seed, number), None
+        if self._model.finisher is None:
+            sample = generated(self._model, condition, request)
+        else:
+            sample, finished = generated_and_finished(self._model, condition, fine, request)
         clip = self._clip(condition, images, sample)
         if finished is not None:
             rng = seeds.numpy_rng(self._config.seed, number, "patch")

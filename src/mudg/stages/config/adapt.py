@@ -8,6 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -42,9 +43,12 @@ class AdaptConfig:
     label_confidence: float = Field(default=0.5, ge=0, le=1)
     """Labels of recorded images with a confidence below this, 0 to 1, are not given to the model."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 where the CPU multiplies in it, float32 elsewhere."""
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
+    device: DeviceName = "auto"
+    """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     processes: int = Field(default=0, ge=0)
-    """Number of fits made at the same time, with one thread each (0 = one per core). The result does not depend on it."""
+    """Number of fits made at the same time, with one thread each (0 = one per core; one where the diffusion model is not on the CPU). The
+    result does not depend on it."""
     threads: int = Field(default=0, ge=0)
     """Threads of the training (0 = one per core). Results are repeatable for the same number of threads."""
     seed: int = 0

@@ -9,6 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -34,7 +35,9 @@ class BenchConfig:
     """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
     1)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 on CPUs with AMX or AVX-512 BF16, float32 elsewhere."""
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
+    device: DeviceName = "auto"
+    """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
     threads: int = Field(default=1, ge=1)
     """mdm, poses: number of torch threads."""
     seed: int = 0

@@ -8,6 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 
 BelowOne = Annotated[float, Field(ge=0, lt=1)]
 
@@ -156,9 +157,9 @@ class LearnCompute:
     """How the training is computed and logged. These settings do not change the result; a run may be resumed with other
     values."""
 
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Device on which the network is trained. Clips are made on the CPU; scoring also runs there, except for published-type
-    models."""
+    device: DeviceName = "auto"
+    """Device on which the networks are trained and scored: auto (CUDA if there is one), cpu, cuda, cuda:N, mps. Under torchrun cuda is
+    one device for each process. Clips are made on the CPU."""
     parallel: Literal["ddp", "fsdp"] = "ddp"
     """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state."""
     accumulate: int = Field(default=1, ge=1)
@@ -214,7 +215,7 @@ class LearnConfig:
     """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that
     mix frames. denoiser: train the refiner only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the computation. auto: bfloat16 on CPUs with AMX or AVX-512 BF16, float32 elsewhere."""
+    """Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
     """Threads of the training process. Results are repeatable for the same number of threads."""
     data: LearnData = Field(default_factory=LearnData)

@@ -8,6 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 from mudg.data.city.config import CityConfig
 
 
@@ -65,8 +66,8 @@ class AnnotateConfig:
     """Marigold: use LiDAR in every denoising step (slower). Off: only align the result to LiDAR."""
     depth_steps: int = Field(default=0, ge=0)
     """Marigold and DepthLab: denoising steps (0 = as in the model folder, or 50 for Marigold guided by LiDAR)."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the networks of labeller and `depth_network`."""
+    device: DeviceName = "auto"
+    """Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4 percent."""
     sweeps: int = Field(default=6, ge=1, le=100)
@@ -77,7 +78,7 @@ class AnnotateConfig:
     """Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet
     is visible."""
     processes: int = Field(default=0, ge=0)
-    """Number of frames labelled at the same time (0 = one per core)."""
+    """Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another device)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

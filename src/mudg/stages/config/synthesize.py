@@ -9,6 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -51,14 +52,24 @@ class SynthesizeConfig:
     held_out_images: bool = False
     """Also warp recorded images that are held out for scoring. Scores at those frames are then not meaningful."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 on CPUs with AMX or AVX-512 BF16, float32 elsewhere."""
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere
+    (published-type models on older CUDA devices: float16)."""
+    device: DeviceName = "auto"
+    """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     processes: int = Field(default=0, ge=0)
-    """Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type models)."""
+    """Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type models, and where
+    the diffusion model is not on the CPU)."""
     guidance: float | None = Field(default=None, ge=1)
     """Published-type models: scale of classifier-free guidance; 1 = none, which halves the work (not given: 7.5)."""
     guidance_rescale: float | None = Field(default=None, ge=0, le=1)
     """Published-type models: guidance rescale, 0 (off) to 1; limits overexposure by guidance (not given: 0.7)."""
     memory_budget_gb: float = Field(default=0.0, ge=0)
-    """Published-type models: memory in GB; the work is split to fit into it (0 = do not split). The result stays the same."""
+    """Published-type models: memory in GB; the work is split to fit into it (0 = what is free on a CUDA device; elsewhere do not split).
+    The result stays the same."""
+    offload: bool = False
+    """Published-type models: keep the image tower (1.3 GB in bfloat16) on the CPU except while it reads a reference. Done without being
+    asked where a memory budget needs it."""
+    compiled: bool = False
+    """Published-type models: compile the denoising network (torch.compile). The first step then takes minutes, further ones less."""
     seed: int = 0
     """Seed of the noise."""

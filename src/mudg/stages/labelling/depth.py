@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from mudg.base import log, store
+from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import ResourceError, UsageError
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import visible_depth
@@ -31,7 +32,8 @@ _FILLED: Final = ".filled.json"
 
 def place(config: AnnotateConfig) -> Place:
     """Where the networks of a configuration compute."""
-    return Place(config.device, config.precision == "bfloat16")
+    device = choose_device(config.device, "networks of annotate", NETWORK_KINDS)
+    return Place(str(device), config.precision == "bfloat16")
 
 
 def folders(config: AnnotateConfig) -> dict[str, Path]:

@@ -21,32 +21,30 @@ from mudg.stages.learning.models import draw_weights
 from mudg.stages.learning.parallel import Ranks, agreed_terms
 from mudg.stages.learning.state import TrainingState, mean_of, newest_checkpoint, read_rows
 
-ALONE = Ranks(0, 1, torch.device("cpu"))
+CPU = torch.device("cpu")
 LEARNING_RATE = 2e-3
 FIT_IMAGES = 8
 
 
-def train_codec(codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool) -> None:
-    """Fit the linear parts on the first cities of `folder`, then train the decoder on noisy latents."""
-    steps, out = config.codec.steps, run_dir.path / "codec"
+def train_codec(
+    codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool, device: torch.device = CPU
+) -> None:
+    """Fit the linear parts on the first cities of `folder`, on the CPU, then train the decoder on noisy latents, on a device."""
+    steps, out, alone = config.codec.steps, run_dir.path / "codec", Ranks(0, 1, device)
+    codec.to(device)
     optimizer = torch.optim.AdamW(codec.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.99), weight_decay=1e-3)
     state = TrainingState(nn.ModuleDict({"codec": codec}), optimizer, None)
-    if not state.resume(out, ALONE):
-        draw_weights(codec, config.seed, "codec weights")
-        batches = [draw_clips(config, folder, n, FIT_IMAGES, 1, "codec fit") for n in range(config.codec.fit_batches)]
-        images = [clip for batch in batches for clip in batch]
-        height, width = (min(clip.rgb.shape[axis] for clip in images) for axis in (-2, -1))  # steps may differ in size
-        codec.fit_color(torch.cat([clip.rgb[..., :height, :width] for clip in images]))
-        codec.fit_depth(torch.cat([clip.depth[..., :height, :width] for clip in images]))
+    if not state.resume(out, alone):
+        codec.load_state_dict(_fitted(codec, config, folder).state_dict())
     recent: list[dict[str, float]] = []
     with log.task("codec", steps, state.step) as bar:
         for step in range(state.step, steps):
             warm, left = min(1.0, (step + 1) / 50), 1 - step / steps
             optimizer.param_groups[0]["lr"] = LEARNING_RATE * warm * min(1.0, left / 0.6)
-            clips = draw_clips(config, folder, step, config.codec.batch, 1, "codec batch")
-            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            clips = [clip.to(device) for clip in draw_clips(config, folder, step, config.codec.batch, 1, "codec batch")]
+            with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
                 loss, terms = codec_loss(codec, clips, seeds.torch_generator(config.seed, step, "codec noise"))
-            terms, _ = agreed_terms(ALONE, terms, 1, step, "codec")
+            terms, _ = agreed_terms(alone, terms, 1, step, "codec")
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(codec.parameters(), 1.0)
@@ -59,7 +57,19 @@ def train_codec(codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder:
                 run_dir.log(codec_step=done, **mean_of(recent))
                 recent = []
             if done % 200 == 0 or done == steps:
-                state.save(out, ALONE, {})
+                state.save(out, alone, {})
+
+
+def _fitted(like: PatchCodec, config: LearnConfig, folder: Path) -> PatchCodec:
+    """A codec on the CPU with weights drawn and its linear parts fitted."""
+    codec = PatchCodec(like.config)
+    draw_weights(codec, config.seed, "codec weights")
+    batches = [draw_clips(config, folder, n, FIT_IMAGES, 1, "codec fit") for n in range(config.codec.fit_batches)]
+    images = [clip for batch in batches for clip in batch]
+    height, width = (min(clip.rgb.shape[axis] for clip in images) for axis in (-2, -1))  # steps may differ in size
+    codec.fit_color(torch.cat([clip.rgb[..., :height, :width] for clip in images]))
+    codec.fit_depth(torch.cat([clip.depth[..., :height, :width] for clip in images]))
+    return codec
 
 
 def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
@@ -72,7 +82,7 @@ def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
 
 
 def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-    """Reconstruction loss of the decoder on latents with a little noise; modalities are left out at random.
+    """Reconstruction loss of the decoder on latents with a little noise, drawn on the CPU; modalities are left out at random.
 
     L1 + half squared error and L1 of gradients for colour, L1 for the depth code, cross-entropy for classes.
     """
@@ -83,10 +93,10 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
         latents: dict[Modality, Tensor] = {
             "rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth), "semantics": codec.encode_semantics(ids)
         }  # fmt: skip
-        amount = 0.15 * torch.rand(len(rgb), 1, 1, 1, generator=generator)
-        keep = (torch.rand(3, len(rgb), 1, 1, 1, generator=generator) > 0.15).float()
+        amount = 0.15 * torch.rand(len(rgb), 1, 1, 1, generator=generator).to(rgb.device)
+        keep = (torch.rand(3, len(rgb), 1, 1, 1, generator=generator) > 0.15).float().to(rgb.device)
         noisy: dict[Modality, Tensor] = {
-            m: (z + amount * torch.randn(z.shape, generator=generator)) * k for (m, z), k in zip(latents.items(), keep)
+            m: (z + amount * torch.randn(z.shape, generator=generator).to(z.device)) * k for (m, z), k in zip(latents.items(), keep)
         }
         target = codec.linear_depth_code(depth)
     made_rgb, made_depth, scores = codec.decode_raw(noisy)

@@ -45,11 +45,11 @@ class ModelKind:
 
 
 def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
-    """A copy of a model on the CPU, ready for use, whose trained part has these weights."""
+    """A copy of a model where it was trained, ready for use, whose trained part has these weights."""
     made = MDM(model.config)
     frozen = {name: value for name, value in model.state_dict().items() if name not in weights}
     made.load_state_dict({**frozen, **weights})
-    return made.eval()
+    return made.to(model.device).eval()
 
 
 KINDS: dict[type[nn.Module], ModelKind] = {

@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as recomputed
 
 from mudg.base import log
+from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import MudgError, NumericsError, ResourceError, UsageError
 from mudg.base.processes import error_from_record, error_record
 
@@ -133,19 +134,20 @@ class Ranks:
 
 
 @contextlib.contextmanager
-def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
+def join_processes(wanted: str) -> Iterator[Ranks]:
     """This process's place among those that `torchrun` started; alone if it was not started by it.
 
     A process group that exists already is used and left open. Only the leader's messages are shown.
 
+    Args:
+        wanted: a `DeviceName`. Several processes compute on the CPU, or on one CUDA device each.
+
     Raises:
-        ResourceError: `device` is cuda and there is none.
-        UsageError: the launcher's variables are not numbers.
+        ResourceError: there is no such device. UsageError: it has no implementation, or is one for several processes; the launcher's
+            variables are not numbers.
     """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ResourceError("no CUDA device was found", where="--compute.device cuda", remedy="leave the flag out")
     if dist.is_available() and dist.is_initialized():
-        yield _ranks_on_device(dist.get_rank(), dist.get_world_size(), device)
+        yield _ranks_on_device(dist.get_rank(), dist.get_world_size(), wanted)
         return
     try:
         size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
@@ -153,10 +155,10 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         raise UsageError("the launcher's variables are not numbers", where="WORLD_SIZE, RANK",
             got=str(error)) from error  # fmt: skip
     if size == 1:
-        yield _ranks_on_device(0, 1, device)
+        yield _ranks_on_device(0, 1, wanted)
         return
-    place = _ranks_on_device(rank, size, device)
-    dist.init_process_group("nccl" if device == "cuda" else "gloo", timeout=PATIENCE)
+    place = _ranks_on_device(rank, size, wanted)
+    dist.init_process_group("nccl" if place.device.type == "cuda" else "gloo", timeout=PATIENCE)
     was_quiet = log.is_quiet()
     log.set_quiet(was_quiet or rank > 0)
     try:
@@ -167,12 +169,20 @@ def join_processes(device: Literal["cpu", "cuda"]) -> Iterator[Ranks]:
         time.sleep(PARTING_S)
 
 
-def _ranks_on_device(rank: int, size: int, device: str) -> Ranks:
-    if device == "cuda":
-        chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+def _ranks_on_device(rank: int, size: int, wanted: str) -> Ranks:
+    purpose = "training"
+    if size == 1:
+        chosen = choose_device(wanted, purpose, NETWORK_KINDS)
+    else:
+        if ":" in wanted:
+            raise UsageError("several processes cannot share a device", where="--compute.device",
+                             expected="auto, cpu or cuda: one for each", got=wanted)  # fmt: skip
+        chosen = choose_device(wanted, purpose)
+        if chosen.type != "cpu":
+            chosen = choose_device(f"{chosen.type}:{os.environ.get('LOCAL_RANK', '0')}", purpose)
+    if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
-        return Ranks(rank, size, chosen)
-    return Ranks(rank, size, torch.device("cpu"))
+    return Ranks(rank, size, chosen)
 
 
 # the network over the processes ---------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from mudg.core import metrics
 from mudg.core.flicker import TrueFrame, flicker
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.data.clips import shards as clip_shards
-from mudg.models.diffusion import GeneratedClip, SampleRequest
+from mudg.models.diffusion import GeneratedClip, SampleRequest, generated
 from mudg.models.mdm.model import MDM
 from mudg.models.published.model import PublishedMDM
 from mudg.report import html
@@ -63,7 +63,7 @@ def score(
             frames = range(model.config.window)
             clip = clip_shards.read_clip(folder, city, number, frames)
             clip = clip if prepare is None else prepare(clip)
-            sample = model.sample(clip.condition, replace(request, index=city * 16 + number))
+            sample = generated(model, clip.condition, replace(request, index=city * 16 + number))
             name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
             row, matrix = score_clip(clip, sample)
             rows.setdefault(name, []).append(row)
