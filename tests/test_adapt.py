@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pretend_device import pretend_device
 
 from mudg.base import palette, store
 from mudg.base.errors import InputError, UsageError
@@ -143,6 +144,16 @@ def test_the_model_is_ready_and_the_record_says_what_was_gained(log, result):
     same = all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), before.state_dict().values(), strict=True))
     assert same != record["adapted"]
     assert not (result / "work").exists() and (result / "before.png").is_file() and (result / "after.png").is_file()
+
+
+@pytest.mark.slow
+def test_adapting_on_a_device_is_adapting(log, result, tmp_path):
+    with pretend_device():
+        adapted(log, tmp_path / "out", device="pretend")
+    here, there = (store.read_json(folder / "adapt.json") for folder in (result, tmp_path / "out"))
+    assert here["adapted"] == there["adapted"] and here["clips"] == there["clips"]
+    for name in ("before", "after"):
+        assert there[name]["psnr"] == pytest.approx(here[name]["psnr"], abs=0.02)
 
 
 def test_a_model_that_gains_nothing_is_not_taken(log, tmp_path):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def write_shards(
     folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None = None
 ) -> dict[str, str]:
-    """Write tensors as `weights_NN.safetensors` of at most about `shard_bytes` each; returns file name -> sha256.
+    """Write tensors, on any device, as `weights_NN.safetensors` of at most about `shard_bytes` each; returns file name -> sha256.
 
     Args:
         folder: a tree under a temporary name (`store.atomic_directory`).
@@ -45,7 +45,7 @@ def write_shards(
         if size + nbytes > shard_bytes:
             flush()
         # a copy of its own: safetensors refuses tensors that share memory, and a mapped file must not be written through
-        shard[name] = value.detach().to(dtype if wide else value.dtype, copy=True).contiguous()
+        shard[name] = value.detach().to("cpu", dtype if wide else value.dtype, copy=True).contiguous()
         size += nbytes
     flush()
     return files

@@ -1,0 +1,315 @@
+"""Diffusion models, their training and the networks of annotate on a device: the same numbers, and nothing crosses on the way."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import tiny_networks
+import torch
+from pretend_device import copies, pretend_device
+from test_published import some_condition
+from toy_clips import HEIGHT, WIDTH, made_up_clip, tiny, with_settings, write_clips
+from toy_published import TINY, published_settings, tiny_checkpoint, tiny_model
+from toy_scene import ToyStreet
+
+from mudg.base import log, store
+from mudg.base.errors import ResourceError, UsageError
+from mudg.base.types import Condition
+from mudg.core.align import fit_depth
+from mudg.data.observations import read_observations
+from mudg.data.scene import read_label, read_scene
+from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
+from mudg.models.labels import street_net
+from mudg.models.mdm import files
+from mudg.models.mdm.model import MDM
+from mudg.models.published import files as published_files
+from mudg.models.published.model import WorkSplit
+from mudg.stages import annotate, convert, fuse, learn, synthesize
+from mudg.stages.config import AnnotateConfig, ConvertConfig, FuseConfig, SynthesizeConfig
+from mudg.stages.learning import loading, parallel, precision
+from mudg.stages.learning.models import model_config
+
+NEAR = 1e-4
+"""Relative to the largest value: attention sums in another order there. Measured: 1e-7 for the small model, 2e-5 with guidance 7.5."""
+
+
+def far_apart(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Largest difference of two tensors, as a share of the largest value; NaN must be in the same places."""
+    a, b = one.double(), other.double()
+    assert torch.equal(a.isnan(), b.isnan()) and not a.isinf().any()
+    a, b = a.nan_to_num(), b.nan_to_num()
+    return float((a - b).abs().max() / a.abs().max().clamp(min=1e-12))
+
+
+def check_same_clip(one: GeneratedClip, other: GeneratedClip) -> None:
+    for name in ("rgb", "depth", "confidence", "log_error"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a is None) == (b is None)
+        assert a is None or (type(b) is torch.Tensor and far_apart(a, b) < NEAR), name
+    assert (one.semantics != other.semantics).float().mean() < 1e-3
+    assert all(far_apart(z, other.latents[m]) < NEAR for m, z in one.latents.items())
+    assert [f.used for f in one.depth_fits] == [f.used for f in other.depth_fits]
+
+
+def tensors_of(condition: Condition) -> Iterator[torch.Tensor]:
+    for owner in (condition, condition.renders):
+        for field in fields(owner) if owner is not None else ():
+            if isinstance(value := getattr(owner, field.name), torch.Tensor):
+                yield value
+
+
+def enlarged(condition: Condition, scale: int = 2) -> Condition:
+    """The condition at a higher resolution."""
+    larger = lambda x: x.repeat_interleave(scale, -1).repeat_interleave(scale, -2)  # noqa: E731
+    views = tuple(v.resized(v.camera.width * scale, v.camera.height * scale) for v in condition.views)
+    assert condition.renders is not None
+    own = {f.name: larger(x) for f in fields(condition) if isinstance(x := getattr(condition, f.name), torch.Tensor)}
+    return replace(condition, views=views, renders=condition.renders.map(larger), **own)
+
+
+@pytest.fixture
+def small():
+    """A small model with refiner, finisher and renders, every weight moved off its start."""
+    torch.manual_seed(0)
+    model = MDM(model_config(tiny("unused"))).eval()
+    with torch.no_grad():
+        for value in model.parameters():
+            value.add_(0.05 * torch.randn(value.shape))
+    return model
+
+
+# sampling -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(small):
+    condition = made_up_clip(1).condition
+    fine, request = enlarged(condition), SampleRequest(3, 5, 2)
+    clip, finished = generated_and_finished(small, condition, fine, request)
+    with pretend_device() as there:
+        small.to(there)
+        with copies() as crossed:
+            clip_there, finished_there = generated_and_finished(small, condition, fine, request)
+    check_same_clip(clip, clip_there)
+    check_same_clip(finished, finished_there)
+    noise = [sum(clip.latents[m].numel() for m in clip.latents)] * 3  # a draw at the start and one between steps
+    assert sorted(crossed.to_device) == sorted([*(x.numel() for c in (condition, fine) for x in tensors_of(c)), *noise])
+    names = ("rgb", "depth", "semantics", "confidence", "log_error")
+    back = [getattr(c, name).numel() for c in (clip, finished) for name in names] + [z.numel() for z in clip.latents.values()]
+    fits = [4] * len(clip.depth_fits)
+    assert sorted(crossed.to_host) == sorted(back + fits)
+
+
+@pytest.mark.parametrize("changes", [{"n_samples": 2}, {"sampler": "dpm_solver", "steps": 4}, {"align": False}])
+def test_other_requests_and_a_second_window_too(small, changes):
+    condition = made_up_clip(2).condition
+    first = generated(small, condition, SampleRequest(1, 5))
+    known = {m: z[-2:] for m, z in first.latents.items()}
+    request = replace(SampleRequest(2, 5, 1, known=known), **changes)
+    here = generated(small, condition, request)
+    with pretend_device() as there:
+        check_same_clip(here, generated(small.to(there), condition, request))
+    assert far_apart(known["rgb"], here.latents["rgb"][:2]) < NEAR
+
+
+@pytest.mark.parametrize("guidance", [1.0, 7.5])
+def test_a_clip_of_the_published_kind_is_the_same_on_a_device_and_crosses_once(guidance):
+    model, condition, request = tiny_model(), some_condition(), SampleRequest(3, 5, guidance=guidance)
+    here = generated(model, condition, request)
+    with pretend_device() as there:
+        model.to(there)
+        with copies() as crossed:
+            made = generated(model, condition, request)
+        check_same_clip(here, made)
+        model.split = WorkSplit(guidance_together=False, frames_at_once=1, offload=True)
+        model.image.to("cpu")
+        check_same_clip(here, generated(model, condition, request))
+        assert model.image.whole.device.type == "cpu"  # the tower went back
+    latent = here.latents["rgb"].numel()
+    large = [n for n in crossed.to_device if n > 64]  # besides: labels, statistics of colours
+    posterior, noise = [latent] * 2, [3 * latent] * 4  # of both planes; at the start and after each step
+    palette = [19 * 3]
+    given = [x.numel() for x in tensors_of(condition)]
+    assert sorted(large) == sorted(n for n in given + posterior + noise + palette if n > 64)
+    back = [x.numel() for x in (here.rgb, here.depth, here.semantics, here.confidence, *here.latents.values())]
+    assert sorted(n for n in crossed.to_host if n > 4) == sorted(back)
+
+
+def test_depth_is_fitted_alike_on_a_device():
+    generator = torch.Generator().manual_seed(3)
+    measured = 5 + 40 * torch.rand(1, 20, 30, generator=generator)
+    made = 1.3 * measured + 2 + torch.randn(measured.shape, generator=generator)
+    made[:, :3] = 70.0
+    valid = torch.rand(measured.shape, generator=generator) > 0.3
+    here = fit_depth(made, measured, valid)
+    with pretend_device() as there:
+        fit = fit_depth(made.to(there), measured.to(there), valid.to(there))
+    assert (fit.scale, fit.shift_m) == pytest.approx((here.scale, here.shift_m), rel=1e-9)
+    assert fit.used and fit.residual == pytest.approx(here.residual, rel=1e-9)
+
+
+# training -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return write_clips(tmp_path_factory.mktemp("clips"))
+
+
+def losses_in(out):
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return [row["total"] for row in rows if "total" in row]
+
+
+def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path, monkeypatch):
+    """Codec, network, refiner, finisher and scores; stopped after two steps and continued."""
+    config = tiny(clips, device="cpu", log_every=1)
+    here = learn.run(config, tmp_path / "here")
+    draw = learn.draw_clips
+
+    def stopped_by_the_user(config, folder, step, count, frames, purpose, *rest):
+        if step == 1 and purpose == "batch":
+            signal.raise_signal(signal.SIGINT)
+        return draw(config, folder, step, count, frames, purpose, *rest)
+
+    with pretend_device():
+        there = with_settings(config, device="pretend")
+        monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
+        with pytest.raises(KeyboardInterrupt):
+            learn.run(there, tmp_path / "there")
+        monkeypatch.setattr(learn, "draw_clips", draw)
+        made = learn.run(there, tmp_path / "there")
+    assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
+    a, b = (files.load(folder).state_dict() for folder in (here, made))
+    assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 2e-3  # kept in 16 bits
+    assert store.read_json(tmp_path / "there" / "metrics.json")["average"]["psnr"] == pytest.approx(
+        store.read_json(tmp_path / "here" / "metrics.json")["average"]["psnr"], abs=0.02
+    )
+
+
+def test_a_published_type_model_learns_on_a_device(tmp_path):
+    points = write_clips(tmp_path / "clips", 32, 32, points=True)
+    torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512.ckpt")
+    steady = replace(TINY, net=replace(TINY.net, dropout=0.0))  # dropout draws where it computes
+    convert.convert_file(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "model", steady)
+    config = published_settings(tmp_path / "model", points, steps=1, batch_frames=4, device="cpu", score_steps=1)
+    here = learn.run(config, tmp_path / "here")
+    with pretend_device():
+        there = learn.run(with_settings(config, device="pretend"), tmp_path / "there")
+    assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
+    a, b = (published_files.load(folder).state_dict() for folder in (here, there))
+    assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 1e-3
+
+
+# verbs ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    root = tmp_path_factory.mktemp("street")
+    ToyStreet(times=[0.1 * n for n in range(5)]).write(root / "scene", labels=False, width=WIDTH, height=HEIGHT)
+    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    return root
+
+
+def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
+    files.save(small, tmp_path / "model", "", {})
+    config = SynthesizeConfig(shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1)
+    here = synthesize.run(config, street / "scene", street / "fuse", tmp_path / "here")
+    with pretend_device():
+        elsewhere = replace(config, device="pretend", processes=0)
+        there = synthesize.run(elsewhere, street / "scene", street / "fuse", tmp_path / "there")
+        with pytest.raises(UsageError, match="one process makes all trajectories"):
+            synthesize.run(replace(elsewhere, processes=2), street / "scene", street / "fuse", tmp_path / "more")
+        again = synthesize.run(replace(elsewhere, processes=1), street / "scene", street / "fuse", tmp_path / "here")
+    assert again == here  # where a result was computed is no part of what it is
+    for name in ("front_shift+1.0", "front_shift-1.0"):
+        a, b = read_observations(here / name), read_observations(there / name)
+        assert len(a) == len(b) == 5
+        for i in range(5):
+            assert far_apart(a[i].rgb, b[i].rgb) < 1.01 / 255
+            assert (a[i].semantics != b[i].semantics).float().mean() < 1e-2
+
+
+def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_path):
+    config = AnnotateConfig(device="cpu", processes=1, depth=False)
+    scenes = [read_scene(annotate.run(config, street / "scene", tmp_path / "here"))]
+    with pretend_device(), copies() as crossed:
+        scenes.append(read_scene(annotate.run(replace(config, device="pretend"), street / "scene", tmp_path / "there")))
+    for one, other in zip(*(scene.frames for scene in scenes), strict=True):
+        here, there = (read_label(scene, f, "semantics") for scene, f in zip(scenes, (one, other)))
+        assert np.mean(here != there) < 1e-2
+    frames = len(scenes[0].frames)
+    assert len(crossed.to_host) == frames  # probabilities alone
+    weights = sum(1 for _ in street_net.load(street_net.EMBEDDED).state_dict())
+    assert len(crossed.to_device) == weights + 2 * frames  # image and evidence
+
+
+def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
+    tiny_networks.segformer(tmp_path / "net")
+    tiny_networks.depth_anything(tmp_path / "depth")
+    config = AnnotateConfig(
+        labeller="network", weights=str(tmp_path / "net"), depth_network=str(tmp_path / "depth"), device="cpu", processes=1
+    )
+    scenes = [read_scene(annotate.run(config, street / "scene", tmp_path / "here"))]
+    with pretend_device():
+        scenes.append(read_scene(annotate.run(replace(config, device="pretend"), street / "scene", tmp_path / "there")))
+    for one, other in zip(*(scene.frames for scene in scenes), strict=True):
+        assert set(one.labels) == set(other.labels)
+        classes, depth = (
+            [read_label(scene, f, name) for scene, f in zip(scenes, (one, other))] for name in ("semantics", "depth")
+        )
+        assert np.mean(classes[0] != classes[1]) < 1e-2
+        assert np.allclose(*depth, rtol=1e-2, equal_nan=True)
+
+
+def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    files.save(small, tmp_path / "model", "", {})
+    for device, error in (("cuda", ResourceError), ("mps:1", ResourceError), ("tpu", UsageError)):
+        config = SynthesizeConfig(model=str(tmp_path / "model"), device=device)
+        with pytest.raises(error, match="--device"):
+            synthesize.run(config, street / "scene", street / "fuse", tmp_path / "out")
+        with pytest.raises(error, match="--device"), parallel.join_processes(device):
+            pass
+    assert not (tmp_path / "out").exists()
+    for name in ("offload", "compiled"):
+        with pytest.raises(UsageError, match="published-type models only"):
+            loading.check_config(SynthesizeConfig(model=str(tmp_path / "model"), **{name: True}), False)
+
+
+def test_several_processes_take_a_device_each(monkeypatch):
+    taken = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (10 * 2**30, 24 * 2**30))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Card")
+    monkeypatch.setattr(torch.cuda, "set_device", taken.append)
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    assert parallel._ranks_on_device(3, 4, "auto").device == torch.device("cuda", 3)
+    assert parallel._ranks_on_device(0, 1, "cuda:2").device == torch.device("cuda", 2)
+    assert parallel._ranks_on_device(3, 4, "cpu").device == torch.device("cpu")
+    assert taken == [torch.device("cuda", 3), torch.device("cuda", 2)]
+    with pytest.raises(UsageError, match="cannot share"):
+        parallel._ranks_on_device(3, 4, "cuda:0")
+    with pytest.raises(UsageError, match="not implemented"):
+        parallel._ranks_on_device(3, 4, "mps")
+
+
+def test_the_number_format_follows_the_device(monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(log, "info_once", said.append)
+    card, apple = torch.device("cuda", 0), torch.device("mps", 0)
+    for capability, half, narrow in (((8, 0), torch.bfloat16, torch.bfloat16), ((7, 5), None, torch.float16)):
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _, found=capability: found)
+        assert precision.half_format("auto", card) == half
+        assert precision.half_format("auto", card, float16=True) == narrow
+        assert precision.choose_bf16("bfloat16", card) and not precision.choose_bf16("float32", card)
+    assert not precision.choose_bf16("auto", apple)
+    assert "diffusion model: bfloat16 (cuda:0 has bfloat16)" in said
+    assert "diffusion model: float16 (cuda:0 has no bfloat16)" in said
+    assert said[-1] == "diffusion model: float32 (on mps:0)"
