@@ -26,8 +26,9 @@ def report(needs: memory_plan.Needs) -> list[str]:
         plan, peak_bytes = memory_plan.choose(needs, budget * 10**9)
         way = [f"modalities {'together' if plan.modalities_together else 'apart'}"]
         way += [f"guidance {'together' if plan.guidance_together else 'apart'}", f"{plan.frames_at_once} frames per decoding"]
+        way += ["tower offloaded"] if plan.offload else []
         fits = "" if peak_bytes <= budget * 1e9 else "  (does not fit)"
-        lines.append(f"  budget {budget:2d} GB: {', '.join(way):<64}{peak_bytes / 1e9:5.1f} GB{fits}")
+        lines.append(f"  budget {budget:2d} GB: {', '.join(way):<80}{peak_bytes / 1e9:5.1f} GB{fits}")
     return lines
 
 

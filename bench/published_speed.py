@@ -23,7 +23,7 @@ from mudg.stages.learning import memory_plan
 def built(config: PublishedConfig, device: str, dtype: torch.dtype) -> PublishedMDM:
     """The full-size model on a device, every weight drawn."""
     model = memory_plan.meta_model(config, dtype).to_empty(device=device)
-    generator = seeds.torch_generator(0, 0, "weights", device)
+    generator = torch.Generator(device).manual_seed(seeds.key(0, 0, "weights"))
     with torch.no_grad():
         for value in model.parameters():
             value.normal_(0.0, 0.02, generator=generator)
@@ -65,7 +65,7 @@ def main() -> None:
     model = built(config, options.device, getattr(torch, options.dtype))
     frames, channels, tokens = config.window, config.codec.latent_channels, config.image_tokens
     h, w = height // model.codec.factor, width // model.codec.factor
-    generator = seeds.torch_generator(0, 0, "inputs", options.device)
+    generator = torch.Generator(options.device).manual_seed(seeds.key(0, 0, "inputs"))
     draw = lambda *shape: torch.randn(*shape, generator=generator, device=options.device)  # noqa: E731
     for batch in options.batches:
         x, planes = draw(batch, frames, channels, h, w), draw(batch, frames, 2 * channels, h, w)

@@ -90,9 +90,11 @@ def run(
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
     choose_bf16(config.precision, torch.device(config.device))
     started = time.monotonic()
-    jobs = [(config, Path(scene), Path(fused), directory.path, path, fitted) for path in paths]
     usual = os.cpu_count() if config.device == "cpu" else 1
-    frames = _run_jobs(jobs, names, config.processes or usual or 1)
+    processes = config.processes or usual or 1
+    model = loading.load_any(config) if processes == 1 else None  # several processes load one each
+    jobs = [(config, Path(scene), Path(fused), directory.path, path, fitted, model) for path in paths]
+    frames = _run_jobs(jobs, names, processes)
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
@@ -145,15 +147,17 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
 
 
 def make_trajectory(
-    config: SynthesizeConfig, scene_path: Path, fused: Path, out: Path, path: Trajectory, fitted: Path | None
-) -> int:
-    """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one."""
+    config: SynthesizeConfig, scene_path: Path, fused: Path, out: Path, path: Trajectory, fitted: Path | None,
+    model: loading.DiffusionModel | None = None,
+) -> int:  # fmt: skip
+    """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`: that of the
+    configuration, if it is in memory already."""
     folder = out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
     scene, cloud = read_scene(scene_path), read_fused(fused)
     cloud = cloud if config.given_classes else without_classes(cloud)
-    model = loading.load_any(config)
+    model = model or loading.load_any(config)
     camera = path.views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
     model.check_clip(min(len(path), model.config.window), height, width)

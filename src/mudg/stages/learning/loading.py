@@ -110,7 +110,8 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
     )  # fmt: skip
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(
-            "the model does not fit into the memory budget, however its work is split", where="--memory-budget-gb",
+            "the model does not fit into the memory budget, however its work is split",
+            where="--memory-budget-gb" if config.memory_budget_gb else f"free memory of --device {config.device}",
             expected=f">= {peak_bytes / 1e9:.1f} GB", got=f"{budget_gb:.4g} GB", remedy="use the 320x512 model, or bfloat16",
         )  # fmt: skip
     log.info(

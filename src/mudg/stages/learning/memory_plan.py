@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree
@@ -93,7 +93,8 @@ def meta_model(config: PublishedConfig, dtype: torch.dtype) -> PublishedMDM:
 
 
 def denoise_bytes(model: PublishedMDM, height: int, width: int, batch: int) -> int:
-    """Activations of one pass of the denoising network over `batch` latent videos."""
+    """Activations of one pass of the denoising network over `batch` latent videos, with the keys and values of their contexts, which are
+    kept from step to step."""
     config, net = model.config, model.net
     dtype, factor = model.dtype, model.codec.factor
     with torch.device("meta"):
@@ -101,7 +102,7 @@ def denoise_bytes(model: PublishedMDM, height: int, width: int, batch: int) -> i
         t = torch.zeros(batch, dtype=torch.long)
         text = torch.empty(batch, TEXT_TOKENS, config.net.context_width, dtype=dtype)
         tokens = torch.empty(batch, config.window, config.image_tokens.tokens, config.net.context_width, dtype=dtype)
-    return peak_activations(lambda: net(x, t, t, t, text, tokens))
+    return peak_activations(lambda: net(x, t, t, t, text, tokens, net.context_keys(text, tokens)))
 
 
 def autoencoder_bytes(model: PublishedMDM, height: int, width: int, frames: int) -> int:
@@ -117,8 +118,8 @@ def autoencoder_bytes(model: PublishedMDM, height: int, width: int, frames: int)
     )
 
 
-def parameter_bytes(model: PublishedMDM) -> int:
-    """Bytes of all weights: denoising network, autoencoder, image tower, resampler."""
+def parameter_bytes(model: nn.Module) -> int:
+    """Bytes of all weights; of the model: denoising network, autoencoder, image tower, resampler."""
     return sum(math.prod(p.shape) * p.element_size() for p in [*model.parameters(), *model.buffers()])
 
 
@@ -127,6 +128,8 @@ class Needs:
     """What the parts of the work take at the model's own size, in bytes; the last two grow in proportion to their number."""
 
     parameters: int
+    tower: int
+    """Of these, the image tower."""
     one_video: int
     """Activations of the denoising network for one latent video."""
     one_frame: int
@@ -137,17 +140,24 @@ def needs_of(config: PublishedConfig, bytes_per_value: int) -> Needs:
     """Count the needs of a model whose weights and activations take 2 (bfloat16) or 4 (float32) bytes a number."""
     model = meta_model(config, torch.bfloat16 if bytes_per_value == 2 else torch.float32)
     size = (config.height, config.width)
-    return Needs(parameter_bytes(model), denoise_bytes(model, *size, 1), autoencoder_bytes(model, *size, 1))
+    return Needs(
+        parameter_bytes(model), parameter_bytes(model.image), denoise_bytes(model, *size, 1), autoencoder_bytes(model, *size, 1)
+    )
 
 
-def choose(needs: Needs, budget_bytes: int, *, guidance: bool = True) -> tuple[WorkSplit, int]:
+def choose(needs: Needs, budget_bytes: int, *, guidance: bool = True, offload: bool = False) -> tuple[WorkSplit, int]:
     """The fastest way to cut the work of one clip that fits the budget, or the thriftiest if none does, and its peak in bytes.
 
-    The peak is parameters, the worst moment of all, and the reserve.
+    The peak is what stays, the worst moment of all, and the reserve. Of each cut the image tower is offloaded if that makes it fit
+    (moving it costs a fraction of a second per clip, smaller batches more), or in any case with `offload`.
     """
-    room = budget_bytes - needs.parameters - RESERVE_BYTES
-    batches = [(MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1) for cut in CUTS]
-    chosen = next((n for n, batch in enumerate(batches) if needs.one_video * batch <= room), len(CUTS) - 1)
-    frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= room), 1)
-    activations = max(needs.one_video * batches[chosen], needs.one_frame * frames)
-    return WorkSplit(*CUTS[chosen], frames), needs.parameters + activations + RESERVE_BYTES
+    for cut in CUTS:
+        videos = needs.one_video * (MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1)
+        for away in (True,) if offload else (False, True):
+            stays = needs.parameters - away * needs.tower + RESERVE_BYTES
+            room = budget_bytes - stays
+            frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= room), 1)
+            peak = max(stays + max(videos, needs.one_frame * frames), needs.parameters + RESERVE_BYTES)
+            if peak <= budget_bytes:
+                return WorkSplit(*cut, frames, away), peak
+    return WorkSplit(*cut, frames, away), peak
