@@ -16,9 +16,9 @@ BUDGETS_GB = (8, 10, 16, 24, 40, 80)
 
 def report(needs: memory_plan.Needs) -> list[str]:
     """What each way of cutting the work takes, and what is chosen for some budgets."""
-    lines = []
+    lines = [f"  condition, latents and images of a clip {needs.clip / 1e9:19.2f} GB"]
     for label, batch in CUTS:
-        total = needs.parameters + needs.one_video * batch + memory_plan.RESERVE_BYTES
+        total = needs.parameters + needs.clip + needs.one_video * batch + memory_plan.RESERVE_BYTES
         lines.append(f"  denoising, {label:<36}{needs.one_video * batch / 1e9:7.2f} GB, in all {total / 1e9:6.2f} GB")
     for frames in memory_plan.FRAMES_AT_ONCE:
         lines.append(f"  autoencoder, {frames:2d} frames at once {needs.one_frame * frames / 1e9:24.2f} GB")

@@ -18,6 +18,9 @@ def test_machine_report_names_what_matters() -> None:
     text = report["text"]
     for word in ("processors", "torch", "native library", "encoders", "weights"):
         assert word in text
+    rows = report["torch"]
+    assert rows["--device auto"] in ("cpu", "cuda") and rows["--device cpu"] == "on the CPU"
+    assert any(name.startswith("--device cuda") for name in rows) and "--device mps" in rows
     assert report["ready"] == (not report["problems"])
     json.dumps(report, default=str, allow_nan=False)
 

@@ -533,7 +533,7 @@ def test_full_size_fits_ten_gigabytes():
     assert (plan.modalities_together, plan.guidance_together) == (False, False)
     unguided, peak_bytes = memory_plan.choose(needs, 15_000_000_000, guidance=False)
     assert unguided.modalities_together
-    assert peak_bytes == needs.parameters + 3 * needs.one_video + memory_plan.RESERVE_BYTES
+    assert peak_bytes == needs.parameters + needs.clip + 3 * needs.one_video + memory_plan.RESERVE_BYTES
     roomy, _ = memory_plan.choose(needs, 80_000_000_000)
     assert (roomy.modalities_together, roomy.guidance_together, roomy.frames_at_once) == (True, True, 16)
 

@@ -64,9 +64,7 @@ def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "c
     """
     import torch
 
-    name = wanted
-    if wanted == "auto":
-        name = "cuda" if "cuda" in kinds and not _cuda_problem(0) else "cpu"
+    name = usual_device(kinds) if wanted == "auto" else wanted
     kind, _, number = name.partition(":")
     if kind not in PROBLEMS or not re.match(DevicePattern, wanted):
         raise UsageError(
@@ -83,6 +81,11 @@ def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "c
     chosen = torch.device("cpu") if kind == "cpu" else torch.device(kind, int(number or 0))
     log.info_once(f"{purpose}: {described(chosen)}")
     return chosen
+
+
+def usual_device(kinds: tuple[str, ...] = ("cpu", "cuda")) -> str:
+    """What `auto` stands for on this machine, of these kinds."""
+    return "cuda" if "cuda" in kinds and not _cuda_problem(0) else "cpu"
 
 
 def described(device: torch.device) -> str:

@@ -135,11 +135,23 @@ def _torch(problems: list[str]) -> dict[str, str]:
     except ImportError as error:
         problems.append(f"torch cannot be imported: {error}; reinstall with pip install 'torch>=2.10,<2.14'")
         return {"version": "missing"}
-    rows = {"version": torch.__version__, "threads": str(torch.get_num_threads())}
-    if torch.cuda.is_available():
-        rows["CUDA device"] = f"{torch.cuda.get_device_name(0)}, {torch.cuda.mem_get_info()[1] / 2**30:.0f} GiB"
-    else:
-        rows["CUDA device"] = "none: everything runs on the processor"
+    return {"version": torch.__version__, "threads": str(torch.get_num_threads()), **_devices()}
+
+
+def _devices() -> dict[str, str]:
+    """A row for every device that `--device` takes, and for each kind that is not here the reason."""
+    import torch
+
+    from mudg.base import devices
+
+    rows: dict[str, str] = {"--device auto": f"{devices.usual_device()}"}
+    for kind, problem_of in devices.PROBLEMS.items():
+        count = torch.cuda.device_count() if kind == "cuda" else 1
+        for number in range(max(count, 1)):
+            problem = problem_of(number)
+            here = torch.device(kind) if kind == "cpu" else torch.device(kind, number)
+            name = kind if problem or kind != "cuda" else f"{kind}:{number}"
+            rows[f"--device {name}"] = f"no: {problem}" if problem else devices.described(here)
     return rows
 
 

@@ -11,6 +11,7 @@ the defaults follow the released weights; docs/published.md lists the difference
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -449,7 +450,8 @@ class PublishedMDM(nn.Module):
         self.check_request(request)
         self.check_frames(len(condition.views))
         frames_at_once = self.split.frames_at_once
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=request.bf16 and self.dtype == torch.float32):
+        half = request.bf16 and self.dtype == torch.float32
+        with torch.autocast(self.device.type, torch.bfloat16) if half else contextlib.nullcontext():
             before = None if request.known is None else request.known["rgb"].to(self.device)
             before = None if before is None else self.codec.decode_rgb(before, frames_at_once)
             encoded = self.encode_condition(condition, seeds.torch_generator(request.seed, request.index, "posterior"), before)

@@ -43,6 +43,8 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
     (PublishedMDM if published else MDM).check_request(request_of(config))
     if published and fitted:
         raise UsageError("a published-type model does not use a fitted scene", where="--fitted", remedy="leave it out")
+    if published and config.offload and device.type == "cpu":
+        raise UsageError("the image tower is on the CPU already", where="--offload", got="--device cpu", remedy="leave one of them out")
     if published:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
     for flag, given in (("memory-budget-gb", config.memory_budget_gb), ("offload", config.offload), ("compiled", config.compiled)):
@@ -106,7 +108,7 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
     """How the model's work is cut to fit a memory budget in GB."""
     split, peak_bytes = memory_plan.choose(
         memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=config.guidance != 1,
-        offload=config.offload,
+        offload=(False,) if config.device == "cpu" else (True,) if config.offload else (False, True),
     )  # fmt: skip
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(

@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -21,6 +22,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from mudg.base.types import Camera, Condition, View
+from mudg.models.diffusion import SampleRequest
 from mudg.models.published.clip import TEXT_TOKENS
 from mudg.models.published.model import PublishedConfig, PublishedMDM, WorkSplit
 
@@ -118,6 +121,28 @@ def autoencoder_bytes(model: PublishedMDM, height: int, width: int, frames: int)
     )
 
 
+def sampling_bytes(model: PublishedMDM, split: WorkSplit, *, guidance: bool = True) -> int:
+    """What sampling one clip takes beside the weights, from its condition to its pixels, under a cut. Steps do not matter; the fit of
+    depth is left out (it needs values, and a few megabytes)."""
+    config, before = model.config, model.split
+    frames, height, width = config.window, config.height, config.width
+    camera = Camera("counted", width, height, 1.0, 1.0, 0.0, 0.0)
+    views = tuple(View(camera, np.eye(4), float(n)) for n in range(frames))
+    request = SampleRequest(1, guidance=None if guidance else 1.0, align=False)
+    model.split = replace(split, offload=False)  # nothing can be moved off the meta device
+
+    def whole() -> object:
+        with torch.device("meta"):
+            one = torch.empty(frames, 1, height, width)
+            given = Condition(views, one.expand(-1, 3, -1, -1).clone(), one, one > 0, torch.empty(3, height, width))
+        return model.sample(given, request)
+
+    try:
+        return peak_activations(whole)
+    finally:
+        model.split = before
+
+
 def parameter_bytes(model: nn.Module) -> int:
     """Bytes of all weights; of the model: denoising network, autoencoder, image tower, resampler."""
     return sum(math.prod(p.shape) * p.element_size() for p in [*model.parameters(), *model.buffers()])
@@ -125,7 +150,7 @@ def parameter_bytes(model: nn.Module) -> int:
 
 @dataclass(frozen=True)
 class Needs:
-    """What the parts of the work take at the model's own size, in bytes; the last two grow in proportion to their number."""
+    """What the parts of the work take at the model's own size, in bytes; videos and frames take in proportion to their number."""
 
     parameters: int
     tower: int
@@ -134,30 +159,38 @@ class Needs:
     """Activations of the denoising network for one latent video."""
     one_frame: int
     """Activations of the autoencoder for one frame."""
+    clip: int
+    """What is held beside them: condition, latents, decoded images."""
 
 
 def needs_of(config: PublishedConfig, bytes_per_value: int) -> Needs:
     """Count the needs of a model whose weights and activations take 2 (bfloat16) or 4 (float32) bytes a number."""
     model = meta_model(config, torch.bfloat16 if bytes_per_value == 2 else torch.float32)
     size = (config.height, config.width)
-    return Needs(
-        parameter_bytes(model), parameter_bytes(model.image), denoise_bytes(model, *size, 1), autoencoder_bytes(model, *size, 1)
-    )
+    video, frame = denoise_bytes(model, *size, 1), autoencoder_bytes(model, *size, 1)
+    at_once = min(FRAMES_AT_ONCE[0], config.window)  # most is held while the last images are decoded
+    clip = sampling_bytes(model, WorkSplit(False, False, at_once), guidance=False) - max(video, frame * at_once)
+    return Needs(parameter_bytes(model), parameter_bytes(model.image), video, frame, clip)
 
 
-def choose(needs: Needs, budget_bytes: int, *, guidance: bool = True, offload: bool = False) -> tuple[WorkSplit, int]:
+def choose(
+    needs: Needs, budget_bytes: int, *, guidance: bool = True, offload: tuple[bool, ...] = (False, True)
+) -> tuple[WorkSplit, int]:
     """The fastest way to cut the work of one clip that fits the budget, or the thriftiest if none does, and its peak in bytes.
 
-    The peak is what stays, the worst moment of all, and the reserve. Of each cut the image tower is offloaded if that makes it fit
-    (moving it costs a fraction of a second per clip, smaller batches more), or in any case with `offload`.
+    The peak is what stays, the worst moment of all, and the reserve.
+
+    Args:
+        offload: whether the image tower is on the CPU, in the order in which it is tried with each cut. Moving it costs a fraction of a
+            second per clip, smaller batches cost more.
     """
     for cut in CUTS:
         videos = needs.one_video * (MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1)
-        for away in (True,) if offload else (False, True):
-            stays = needs.parameters - away * needs.tower + RESERVE_BYTES
+        for away in offload:
+            stays = needs.parameters + needs.clip - away * needs.tower + RESERVE_BYTES
             room = budget_bytes - stays
             frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= room), 1)
-            peak = max(stays + max(videos, needs.one_frame * frames), needs.parameters + RESERVE_BYTES)
+            peak = max(stays + max(videos, needs.one_frame * frames), stays + away * needs.tower)
             if peak <= budget_bytes:
                 return WorkSplit(*cut, frames, away), peak
     return WorkSplit(*cut, frames, away), peak
