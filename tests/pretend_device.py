@@ -46,6 +46,12 @@ class _Backend:
     def manual_seed_all(self, seed: int) -> None:
         pass
 
+    def get_rng_state(self, device: object = None) -> torch.Tensor:
+        return torch.zeros(0, dtype=torch.uint8)
+
+    def set_rng_state(self, state: torch.Tensor, device: object = None) -> None:
+        pass
+
     def _is_in_bad_fork(self) -> bool:
         return False
 

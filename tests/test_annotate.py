@@ -238,7 +238,8 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     whole = annotate.run(config, tmp_path / "plain", tmp_path / "whole")
     plain = read_scene(tmp_path / "plain")
     settings = to_dict(config)
-    settings.pop("processes")
+    for name in annotate.COMPUTE:
+        settings.pop(name)
     begun = RunDir.open(tmp_path / "begun", annotate._OUTPUT, settings, annotate.inputs_of(config, tmp_path / "plain"))
     aside = tmp_path / "begun" / "labelled"
     first = [frame.id for frame in plain.frames[:2]]

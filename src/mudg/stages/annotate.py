@@ -40,6 +40,8 @@ from mudg.stages.labelling.points import NearbyReturns
 
 _STAGING = "labelled"
 _OUTPUT = VerbOutput("annotate", 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", f"{_STAGING}/"))
+COMPUTE = ("processes", "device")
+"""Settings that say where is computed, not what."""
 _SHARING = 4
 """Processes that share a device with the shipped network: each holds a context of some hundred megabytes there."""
 _FRAMES_PER_PROCESS = 8
@@ -59,7 +61,7 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     """
     refuse_overlap(out, {"scene": scene, **annotate_depth.folders(config)})
     settings = to_dict(config)
-    for name in ("processes", "device"):  # where is computed, not what
+    for name in COMPUTE:
         settings.pop(name)
     inputs = inputs_of(config, scene)
     folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
