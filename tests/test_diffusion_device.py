@@ -276,6 +276,8 @@ def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch)
             synthesize.run(config, street / "scene", street / "fuse", tmp_path / "out")
         with pytest.raises(error, match="--device"), parallel.join_processes(device):
             pass
+        with pytest.raises(error, match="--device"):
+            annotate.run(AnnotateConfig(device=device), street / "scene", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     for name in ("offload", "compiled"):
         with pytest.raises(UsageError, match="published-type models only"):

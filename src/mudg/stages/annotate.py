@@ -57,9 +57,10 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
         out: output folder; a finished result of the same configuration and scene is verified and reused.
 
     Raises:
-        InputError: the scene is malformed. UsageError: ``out`` holds something else. ResourceError: weights are missing.
+        InputError: the scene is malformed. UsageError: ``out`` holds something else. ResourceError: weights or the device are missing.
     """
     refuse_overlap(out, {"scene": scene, **annotate_depth.folders(config)})
+    config = annotate_depth.placed(config)
     settings = to_dict(config)
     for name in COMPUTE:
         settings.pop(name)
@@ -158,8 +159,7 @@ def _usual_processes(config: AnnotateConfig) -> int:
     """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with the shipped one,
     whose evidence is gathered on the CPU meanwhile."""
     cores = os.cpu_count() or 1
-    uses_network = config.labeller != "geometry" or bool(config.depth_network)
-    if not uses_network or annotate_depth.place(config).device == "cpu":
+    if config.device == "cpu" or (config.labeller == "geometry" and not config.depth_network):
         return cores
     return 1 if config.labeller == "network" or config.depth_network else min(cores, _SHARING)
 

@@ -45,7 +45,6 @@ from mudg.stages.config import SynthesizeConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.learning import loading
-from mudg.stages.learning.precision import choose_bf16
 
 SOURCE = "mudg_r"
 SKY = palette.ID["sky"]
@@ -88,7 +87,7 @@ def run(
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
-    choose_bf16(config.precision, torch.device(config.device))
+    loading.half_of(config)  # said before other processes begin
     started = time.monotonic()
     usual = os.cpu_count() if config.device == "cpu" else 1
     processes = config.processes or usual or 1
@@ -224,7 +223,7 @@ class ViewMaker:
         self._rules, self._full_size = rules, config.full_size
         self._render_at = render_at
         self._sources: dict[int, WarpSource] = {}
-        self._request = loading.request_of(config, choose_bf16(config.precision, model.device))
+        self._request = loading.request_of(config, loading.half_of(config) == torch.bfloat16)
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""

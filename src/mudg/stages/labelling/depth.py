@@ -36,6 +36,17 @@ def place(config: AnnotateConfig) -> Place:
     return Place(str(device), config.precision == "bfloat16")
 
 
+def placed(config: AnnotateConfig) -> AnnotateConfig:
+    """The configuration with its device chosen; of one without networks, only if it names a device.
+
+    Raises:
+        UsageError: not a device for networks. ResourceError: it is not on this machine.
+    """
+    if config.device == "auto" and config.labeller == "geometry" and not config.depth_network:
+        return replace(config, device="cpu")
+    return replace(config, device=place(config).device)
+
+
 def folders(config: AnnotateConfig) -> dict[str, Path]:
     """Flag that names a network's folder -> that folder, where one is named and lies on this machine."""
     found: dict[str, Path] = {}

@@ -67,6 +67,12 @@ def request_of(config: SynthesizeConfig, bf16: bool = False) -> SampleRequest:
     )  # fmt: skip
 
 
+def half_of(config: SynthesizeConfig) -> torch.dtype | None:
+    """The half precision that a configuration's model computes in, None for float32. Published-type models bear float16."""
+    device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
+    return half_format(config.precision, device, float16=published_files.is_published(config.model))
+
+
 def load_any(config: SynthesizeConfig) -> DiffusionModel:
     """The model of a configuration.
 
@@ -83,7 +89,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         log.warn(
             f"synthesize: the published model was trained for 50 denoising steps, but --steps is {config.steps} (recommended: --steps 50)"
         )
-    half = half_format(config.precision, device, float16=True)
+    half = half_of(config)
     dtype = None if device.type == "cpu" else half or torch.float32
     model = published_files.load(Path(config.model), dtype=dtype)
     model.split = WorkSplit(frames_at_once=1, offload=config.offload)
