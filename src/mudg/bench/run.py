@@ -65,7 +65,8 @@ def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = 
         raise UsageError("no such benchmark", expected=", ".join((*BENCHES, SHIFT, REAL)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
-    directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), to_dict(config), inputs, overwrite)
+    settings = {key: value for key, value in to_dict(config).items() if key != "device"}  # where is computed, not what
+    directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), settings, inputs, overwrite)
     if directory.complete:
         return directory.reused()
     torch.set_num_threads(config.threads)

@@ -517,7 +517,7 @@ class PublishedMDM(nn.Module):
 
         def velocity(x: Tensor, t: int) -> Tensor:
             found = [half for about in told for half in passed(x, t, about).split(count)]
-            return found[0] if guidance == 1 else noise.guide(*found, guidance, rescale)
+            return found[0] if guidance == 1 else noise.guide(found[0], found[1], guidance, rescale)
 
         return velocity
 

@@ -184,13 +184,14 @@ def choose(
         offload: whether the image tower is on the CPU, in the order in which it is tried with each cut. Moving it costs a fraction of a
             second per clip, smaller batches cost more.
     """
-    for cut in CUTS:
-        videos = needs.one_video * (MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1)
-        for away in offload:
-            stays = needs.parameters + needs.clip - away * needs.tower + RESERVE_BYTES
-            room = budget_bytes - stays
-            frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= room), 1)
-            peak = max(stays + max(videos, needs.one_frame * frames), stays + away * needs.tower)
-            if peak <= budget_bytes:
-                return WorkSplit(*cut, frames, away), peak
-    return WorkSplit(*cut, frames, away), peak
+    found = [_cut(needs, budget_bytes, cut, away, guidance) for cut in CUTS for away in offload]
+    return next((way for way in found if way[1] <= budget_bytes), found[-1])
+
+
+def _cut(needs: Needs, budget_bytes: int, cut: tuple[bool, bool], away: bool, guidance: bool) -> tuple[WorkSplit, int]:
+    """One cut with as many frames per decoding as fit, and its peak in bytes."""
+    videos = needs.one_video * (MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1)
+    stays = needs.parameters + needs.clip - away * needs.tower + RESERVE_BYTES
+    frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= budget_bytes - stays), 1)
+    peak = max(stays + max(videos, needs.one_frame * frames), stays + away * needs.tower)
+    return WorkSplit(cut[0], cut[1], frames, away), peak
