@@ -92,7 +92,11 @@ def match_cameras(cameras: Iterable[str], seen: Iterable[Seen]) -> CameraColors:
         known, new = (a, b) if a in reached else (b, a)
         of = dict(zip((a, b), pairs[a, b]))
         reached[new] = _useful(color_map(of[new], of[known]), of[new], of[known]).then(reached[known])
-    maps = {name: found for name, found in reached.items() if found.gain != (1.0, 1.0, 1.0) or found.offset != (0.0, 0.0, 0.0)}
+    maps = {
+        name: found
+        for name, found in reached.items()
+        if found.gain != (1.0, 1.0, 1.0) or found.offset != (0.0, 0.0, 0.0)
+    }
     return CameraColors(names[0], maps) if maps else SAME_COLORS
 
 
