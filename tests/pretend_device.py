@@ -7,8 +7,9 @@ device. What it cannot tell: kernels that exist only there, speed, memory, race 
 
 from __future__ import annotations
 
+import traceback
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch.utils import _pytree as pytree
@@ -100,6 +101,9 @@ class Pretend(torch.Tensor):
     def numpy(self, *args, **kwargs):
         raise TypeError("can't convert a tensor of another device to numpy; use .cpu() first")
 
+    def tolist(self):
+        return self.cpu().tolist()
+
     def new_tensor(self, data, *, dtype=None, device=None, requires_grad=False):
         made = torch.tensor(data, dtype=dtype or self.dtype).to(device or DEVICE)
         return made.requires_grad_(requires_grad)
@@ -117,38 +121,41 @@ class Pretend(torch.Tensor):
         return run(func, args, kwargs or {})
 
 
-COPIES = {"aten::_to_copy", "aten::copy_", "aten::to", "aten::_copy_from"}
+@dataclass(frozen=True)
+class Transfer:
+    """One copy between the devices: "there" or "back", number of values, and the function of the package that asked for it. Or a
+    "wait": a result whose size the CPU must know before it can go on, as that of ``nonzero`` and of a choice by a mask."""
+
+    way: str
+    values: int
+    where: str
 
 
-@dataclass
-class Copies:
-    """Sizes, in elements, of the tensors that were copied from one device to the other, in order."""
-
-    to_device: list[int] = field(default_factory=list)
-    to_host: list[int] = field(default_factory=list)
-
-
-_COUNTING: list[Copies] = []
+TRANSFERS: list[list[Transfer]] = []
+"""Lists that take every copy, see ``transfers``."""
+NUMBER_BACK = "aten::_local_scalar_dense"
+WAITS = {"aten::nonzero", "aten::masked_select", "aten::_unique2", "aten::repeat_interleave"}
 
 
 @contextmanager
-def copies():
-    """Within: every copy between the CPU and the pretend device is noted. Reading a single number (`float(x)`) is none."""
-    noted = Copies()
-    _COUNTING.append(noted)
+def transfers():
+    """Within: a list that fills with what goes from one device to the other, single numbers that are read included."""
+    TRANSFERS.append([])
     try:
-        yield noted
+        yield TRANSFERS[-1]
     finally:
-        _COUNTING.remove(noted)
+        TRANSFERS.pop()
 
 
-def _note(name, args, to_there):
-    if name not in COPIES:
-        return
-    source = args[1] if name == "aten::copy_" else args[0]
-    if isinstance(source, torch.Tensor) and isinstance(source, Pretend) != to_there:
-        for noted in _COUNTING:
-            (noted.to_device if to_there else noted.to_host).append(source.numel())
+def _note_transfer(way: str, values: int) -> None:
+    if TRANSFERS:
+        frames = [f for f in traceback.extract_stack() if "/mudg/" in f.filename]
+        where = f"{frames[-1].filename.rpartition('/mudg/')[2]}:{frames[-1].name}" if frames else ""
+        for taken in TRANSFERS:
+            taken.append(Transfer(way, values, where))
+
+
+COPIES = {"aten::_to_copy", "aten::copy_", "aten::to", "aten::_copy_from"}
 
 
 def run(func, args, kwargs):
@@ -170,7 +177,14 @@ def run(func, args, kwargs):
         kwargs = {**kwargs, "device": torch.device("cpu")}
     if name == "aten::copy_":
         to_there = isinstance(args[0], Pretend)
-    _note(name, args, to_there)
+        if to_there != isinstance(args[1], Pretend):
+            _note_transfer("there" if to_there else "back", args[1].numel())
+    elif name in COPIES and to_there != isinstance(args[0], Pretend):
+        _note_transfer("there" if to_there else "back", args[0].numel())
+    elif name == NUMBER_BACK:
+        _note_transfer("back", 1)
+    elif there and (name in WAITS or (name == "aten::index" and any(x.dtype == torch.bool for x in leaves[1:]))):
+        _note_transfer("wait", 0)
     if (
         "generator" in kwargs
         and kwargs["generator"] is not None
@@ -221,3 +235,22 @@ def pretend_device():
     finally:
         torch._C._set_only_lift_cpu_tensors(before)
         del devices.PROBLEMS[NAME], devices.SAME_CODE[NAME]
+
+
+@dataclass
+class Copies:
+    """Sizes, in elements, of the tensors that went from one device to the other, in order; single numbers are left out."""
+
+    to_device: list[int]
+    to_host: list[int]
+
+
+@contextmanager
+def copies():
+    """Within: every copy of a tensor between the devices is noted; the lists are filled at the end."""
+    found = Copies([], [])
+    with transfers() as taken:
+        yield found
+    for copy in taken:
+        if copy.values > 1:
+            (found.to_device if copy.way == "there" else found.to_host).append(copy.values)

@@ -11,7 +11,7 @@ import pytest
 from toy_scene import CAR_SIZE_M, ToyStreet
 
 from mudg.base import geometry
-from mudg.base.config import to_dict
+from mudg.base.config import result_settings
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.palette import ID, UNLABELLED
@@ -237,9 +237,8 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     config = AnnotateConfig(labeller="geometry")
     whole = annotate.run(config, tmp_path / "plain", tmp_path / "whole")
     plain = read_scene(tmp_path / "plain")
-    settings = to_dict(config)
-    for name in annotate.COMPUTE:
-        settings.pop(name)
+    settings = result_settings(config)
+    settings.pop("processes")
     begun = RunDir.open(tmp_path / "begun", annotate._OUTPUT, settings, annotate.inputs_of(config, tmp_path / "plain"))
     aside = tmp_path / "begun" / "labelled"
     first = [frame.id for frame in plain.frames[:2]]

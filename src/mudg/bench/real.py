@@ -167,13 +167,11 @@ def run(
     _refuse_foreign(Path(out))
     usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed)
     training = replace(
-        adaptation or AdaptConfig(), model=config.model, precision=config.precision, device=config.device, processes=1,
-        seed=config.seed,
-    )  # fmt: skip
+        adaptation or AdaptConfig(), model=config.model, precision=config.precision, processes=1, seed=config.seed
+    )
     generator = SynthesizeConfig(
-        shifts_m=tuple(virtual_shifts_m), model=config.model, precision=config.precision, device=config.device, processes=1,
-        seed=config.seed,
-    )  # fmt: skip
+        shifts_m=tuple(virtual_shifts_m), model=config.model, precision=config.precision, processes=1, seed=config.seed
+    )
     scenes = {name: _scene_of(config, path, Path(out) / name, overwrite) for name, path in logs.items()}
     splits = tuple(dict.fromkeys(protocol.split for protocol in protocols))
     jobs = [
@@ -369,7 +367,7 @@ def write_seen(job: SplitJob, whole: Scene, held: HeldOut) -> None:
     inputs = {"log": store.digest(job.source)}
     shown = job.folder / "shown"
     _write(job, shown, inputs, lambda root: write_part(whole, root, frames, sweeps))
-    settings = AnnotateConfig(device=job.generator.device, processes=1)
+    settings = AnnotateConfig(processes=1)
     labels = shown
     if not all(annotate.wanted_labels(settings) <= set(f.labels) for f in whole.frames if f.id in frames):
         labels = job.folder / "annotate"

@@ -126,7 +126,6 @@ def run(
         shifts_m=shifts,
         model=config.model,
         precision=config.precision,
-        device=config.device,
         processes=1,
         seed=config.seed,
     )

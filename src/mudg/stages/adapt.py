@@ -22,7 +22,7 @@ import torch
 
 from mudg import native
 from mudg.base import log, store
-from mudg.base.config import to_dict
+from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import run_in_processes
@@ -75,7 +75,7 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
     if reason:
         raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
                          remedy="smaller --block, or use the model as it is")  # fmt: skip
-    settings = {name: value for name, value in to_dict(config).items() if name not in ("processes", "device")}
+    settings = {name: value for name, value in result_settings(config).items() if name != "processes"}
     directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if directory.complete:
         return directory.reused() / "model"

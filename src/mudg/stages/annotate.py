@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log, store
-from mudg.base.config import to_dict
+from mudg.base.config import result_settings
 from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Scene
@@ -40,8 +40,6 @@ from mudg.stages.labelling.points import NearbyReturns
 
 _STAGING = "labelled"
 _OUTPUT = VerbOutput("annotate", 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", f"{_STAGING}/"))
-COMPUTE = ("processes", "device")
-"""Settings that say where is computed, not what."""
 _SHARING = 4
 """Processes that share a device with the shipped network: each holds a context of some hundred megabytes there."""
 _FRAMES_PER_PROCESS = 8
@@ -61,9 +59,8 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
     """
     refuse_overlap(out, {"scene": scene, **annotate_depth.folders(config)})
     config = annotate_depth.placed(config)
-    settings = to_dict(config)
-    for name in COMPUTE:
-        settings.pop(name)
+    settings = result_settings(config)
+    settings.pop("processes")  # changes no result
     inputs = inputs_of(config, scene)
     folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if folder.complete:

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mudg.base import log, palette, store
-from mudg.base.config import to_dict
+from mudg.base.config import result_settings
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
@@ -50,8 +50,8 @@ SOURCE = "mudg_r"
 SKY = palette.ID["sky"]
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
-COMPUTE = ("device", "offload", "compiled")
-"""Settings that say where and how is computed, not what: a result may be resumed and reused under others."""
+COMPUTE = ("offload", "compiled")
+"""Settings that say how is computed, not what: a result may be resumed and reused under others."""
 _OUTPUT = VerbOutput("synthesize", 1, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
 
 
@@ -76,7 +76,7 @@ def run(
     if fitted is not None:
         inputs["fitted"] = store.digest(fitted)
         model_of_scene(fitted, loaded)
-    settings = {name: value for name, value in to_dict(config).items() if name not in COMPUTE}
+    settings = {name: value for name, value in result_settings(config).items() if name not in COMPUTE}
     directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if directory.complete:
         return directory.reused()

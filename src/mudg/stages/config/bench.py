@@ -36,8 +36,6 @@ class BenchConfig:
     1)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
-    device: DeviceName = "auto"
-    """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
     threads: int = Field(default=1, ge=1)
     """mdm, poses: number of torch threads."""
     seed: int = 0
@@ -73,3 +71,5 @@ class BenchConfig:
     """real: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all)."""
     pose_iterations: int = Field(default=300, ge=1)
     """poses: optimisation steps of every fit."""
+    device: DeviceName = "auto"
+    """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
