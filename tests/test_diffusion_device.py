@@ -6,6 +6,7 @@ import json
 import signal
 from collections.abc import Iterator
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,8 +24,12 @@ from mudg.base.types import Condition
 from mudg.core.align import fit_depth
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_label, read_scene
+from mudg.models.depth.inputs import DepthInput
+from mudg.models.depth.networks import Preparation, TransformersDepth
 from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
+from mudg.models.folders import Place
 from mudg.models.labels import street_net
+from mudg.models.labels.segmenters import Segmenter
 from mudg.models.mdm import files
 from mudg.models.mdm.model import MDM
 from mudg.models.published import files as published_files
@@ -247,6 +252,40 @@ def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_pat
     assert len(crossed.to_host) == frames  # probabilities alone
     weights = sum(1 for _ in street_net.load(street_net.EMBEDDED).state_dict())
     assert len(crossed.to_device) == weights + 2 * frames  # image and evidence
+
+
+class Plain(torch.nn.Module):
+    """Answers as networks of transformers do, without the package."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        torch.manual_seed(4)
+        self.layer = torch.nn.Conv2d(3, channels, 3, padding=1)
+
+    def forward(self, pixel_values: torch.Tensor) -> SimpleNamespace:
+        made = self.layer(pixel_values)
+        return SimpleNamespace(logits=made[..., ::2, ::2], predicted_depth=made[:, 0])
+
+
+def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 255, (20, 30, 3), np.uint8)
+    asked = DepthInput(rgb, np.full((20, 30), np.nan, np.float32), np.ones((20, 30), np.float32), np.zeros((20, 30), bool))
+    preparation = Preparation(20, 30, 1, True, (0.5,) * 3, (0.5,) * 3)
+
+    def answers(place: Place):
+        net = Plain(3).to(place.ready()).eval()
+        segmenter = Segmenter(net, "segformer", np.array([0, 2, 10]), (0.5,) * 3, (0.2,) * 3, place=place)
+        depth = TransformersDepth(net, preparation, "depth", with_lidar=False, place=place)
+        return [*segmenter.classes(rgb), depth(asked).values]
+
+    here = answers(Place("cpu"))
+    with pretend_device(), copies() as crossed:
+        there = answers(Place("pretend"))
+    for a, b in zip(here, there, strict=True):
+        assert isinstance(b, np.ndarray) and np.allclose(a, b, atol=1e-5)
+    assert crossed.to_host == [3 * 600, 600]  # probabilities, depth
+    assert sorted(crossed.to_device)[-2:] == [3 * 600, 3 * 600]  # two images
 
 
 def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):

@@ -47,6 +47,8 @@ MOST_SCALE = 4
 """Patches are at most this many times finer than the clips."""
 SCORED_STEPS = 2
 """Denoising steps of the samples that are compared."""
+SHARING = 4
+"""Most lessons made at the same time where they share a device: each process holds a context and a small model there."""
 LEAST_GAIN_DB = 0.05
 """An adapted model that gains less than this on the clips kept for scoring is not taken."""
 
@@ -112,7 +114,8 @@ def _make_lessons(config: AdaptConfig, learnt: LearntLog, lessons: list[Lesson],
     """Fits and clips of all lessons, several made at a time; returns the number of clips made."""
     jobs = [(config, learnt, lesson, [row for row in plan if row[1].name == lesson.name], work) for lesson in lessons]
     made = 0
-    processes = config.processes or (os.cpu_count() if config.device == "cpu" else 1) or 1
+    cores = os.cpu_count() or 1
+    processes = config.processes or (cores if config.device == "cpu" else min(cores, SHARING))
     with log.task("lessons", len(jobs)) as bar:
         for _, clips in run_in_processes(make_lesson, jobs, min(processes, len(jobs))):
             made += clips

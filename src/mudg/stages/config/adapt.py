@@ -47,8 +47,8 @@ class AdaptConfig:
     device: DeviceName = "auto"
     """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     processes: int = Field(default=0, ge=0)
-    """Number of fits made at the same time, with one thread each (0 = one per core; one where the diffusion model is not on the CPU). The
-    result does not depend on it."""
+    """Number of fits made at the same time, with one thread each (0 = one per core; at most four where the diffusion model is not on the
+    CPU). The result does not depend on it."""
     threads: int = Field(default=0, ge=0)
     """Threads of the training (0 = one per core). Results are repeatable for the same number of threads."""
     seed: int = 0
