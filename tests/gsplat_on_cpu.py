@@ -23,7 +23,9 @@ ALPHA_MIN, ALPHA_MAX, STOP = 1 / 255, 0.999, 1e-4
 
 def install(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The package gsplat, drawing with the stand-ins until the test ends."""
-    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat; it needs no CUDA for this test)")
+    gsplat = pytest.importorskip(
+        "gsplat", reason="gsplat is not installed (pip install gsplat; it needs no CUDA for this test)"
+    )
     backend = ModuleType("gsplat.cuda._backend")
     backend._C = Kernels()  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
@@ -83,7 +85,13 @@ class Kernels:
     PINHOLE = "pinhole"
 
     def __init__(self) -> None:
-        for name in ("GLOBAL", "ROLLING_TOP_TO_BOTTOM", "ROLLING_LEFT_TO_RIGHT", "ROLLING_BOTTOM_TO_TOP", "ROLLING_RIGHT_TO_LEFT"):
+        for name in (
+            "GLOBAL",
+            "ROLLING_TOP_TO_BOTTOM",
+            "ROLLING_LEFT_TO_RIGHT",
+            "ROLLING_BOTTOM_TO_TOP",
+            "ROLLING_RIGHT_TO_LEFT",
+        ):
             setattr(self, name, name)
         self.UnscentedTransformParameters = self.FThetaCameraDistortionParameters = SimpleNamespace
 
@@ -99,12 +107,16 @@ class Kernels:
         assert dirs.norm(dim=-1).min() > 0  # the kernel divides by it
         with torch.enable_grad():
             dirs, coeffs = _leaves(dirs, coeffs)
-            v_coeffs, v_dirs = _gradients([self.spherical_harmonics_fwd(degree, dirs, coeffs, masks)], [v_colors], [coeffs, dirs])
+            v_coeffs, v_dirs = _gradients(
+                [self.spherical_harmonics_fwd(degree, dirs, coeffs, masks)], [v_colors], [coeffs, dirs]
+            )
         return v_coeffs, v_dirs
 
     # ---- projection of ellipsoids ----
 
-    def _project(self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, rest: tuple[Any, ...]) -> Any:
+    def _project(
+        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, rest: tuple[Any, ...]
+    ) -> Any:
         from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 
         covars, _ = _quat_scale_to_covar_preci(quats, scales, True, False)
@@ -127,16 +139,22 @@ class Kernels:
         drawn = (depths >= near) & (depths <= far) & (seen >= ALPHA_MIN) & (size > clip).any(-1)
         drawn &= ((means2d + size > 0) & (means2d - size < limit)).all(-1)
         radii = torch.where(drawn[..., None], size, 0).int()
-        poisoned = [torch.where(drawn.view(*drawn.shape, *[1] * (t.ndim - 2)), t, torch.nan) for t in (means2d, depths, conics)]
+        poisoned = [
+            torch.where(drawn.view(*drawn.shape, *[1] * (t.ndim - 2)), t, torch.nan) for t in (means2d, depths, conics)
+        ]
         return radii, *poisoned, torch.where(drawn, factor, 0) if compensate else None
 
-    def _projection_gradients(self, where: tuple[Tensor, ...], inputs: tuple[Any, ...], cotangents: list[Any]) -> list[Tensor]:
+    def _projection_gradients(
+        self, where: tuple[Tensor, ...], inputs: tuple[Any, ...], cotangents: list[Any]
+    ) -> list[Tensor]:
         means, quats, scales, viewmats, Ks, width, height, eps2d, model = inputs
         used, row = torch.unique(where[1], return_inverse=True)  # a kernel touches no other rows
         with torch.enable_grad():
             leaves = _leaves(means, quats, scales, viewmats)
             parts = [leaf[used] for leaf in leaves[:3]]
-            _, *outputs = self._project(*parts, leaves[3], Ks, (width, height, eps2d, 0.0, 1e10, cotangents[3] is not None, model))
+            _, *outputs = self._project(
+                *parts, leaves[3], Ks, (width, height, eps2d, 0.0, 1e10, cotangents[3] is not None, model)
+            )
             pairs = [(out[where[0], row], v) for out, v in zip(outputs, cotangents, strict=True) if v is not None]
             return _gradients([out for out, _ in pairs], [v for _, v in pairs], leaves)
 
@@ -145,10 +163,14 @@ class Kernels:
         width, height, eps2d, model, radii, _, _, v_means2d, v_depths, v_conics, v_factor, _ = rest
         drawn = torch.nonzero((radii > 0).all(-1), as_tuple=True)
         cotangents = [None if v is None else v[drawn] for v in (v_means2d, v_depths, v_conics, v_factor)]
-        v = self._projection_gradients(drawn, (means, quats, scales, viewmats, Ks, width, height, eps2d, model), cotangents)
+        v = self._projection_gradients(
+            drawn, (means, quats, scales, viewmats, Ks, width, height, eps2d, model), cotangents
+        )
         return v[0], None, v[1], v[2], v[3]
 
-    def projection_ewa_3dgs_packed_fwd(self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, *rest: Any) -> Any:
+    def projection_ewa_3dgs_packed_fwd(
+        self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, *rest: Any
+    ) -> Any:
         radii, *values = self.projection_ewa_3dgs_fused_fwd(means, covars, quats, scales, *rest)
         camera, gaussian = torch.nonzero((radii > 0).all(-1), as_tuple=True)
         rows = [None if value is None else value[camera, gaussian] for value in (radii, *values)]
@@ -207,7 +229,11 @@ class Kernels:
         def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
             x, y = _centers(pixels, width)
             # A copy of the means per pixel, so that absolute gradients can be summed over pixels.
-            here = means[entries].detach().expand(len(pixels), -1, -1).clone().requires_grad_() if spread else means[entries][None]
+            here = (
+                means[entries].detach().expand(len(pixels), -1, -1).clone().requires_grad_()
+                if spread
+                else means[entries][None]
+            )
             if spread:
                 spread.append((here, entries))
             dx, dy = here[..., 0] - x[:, None], here[..., 1] - y[:, None]
@@ -217,7 +243,9 @@ class Kernels:
 
         return response
 
-    def rasterize_to_pixels_3dgs_fwd(self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any) -> Any:
+    def rasterize_to_pixels_3dgs_fwd(
+        self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
+    ) -> Any:
         background, mask, width, height, tile, offsets, ids = rest
         means, conics, colors, opacity = (t.reshape(-1, *shape) for t, shape in
                                           ((means2d, (2,)), (conics, (3,)), (colors, colors.shape[-1:]), (opacities, ())))  # fmt: skip
@@ -225,10 +253,14 @@ class Kernels:
         image, alpha = self._pixels(colors, (width, height, tile), offsets, ids, response, (background, mask))
         return image, alpha, torch.zeros(0)
 
-    def rasterize_to_pixels_3dgs_bwd(self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any) -> Any:
+    def rasterize_to_pixels_3dgs_bwd(
+        self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
+    ) -> Any:
         background, mask, width, height, tile, offsets, ids, _, _, v_image, v_alpha, absolute = rest
         with torch.enable_grad():
-            flat = [t.reshape(-1, *shape) for t, shape in ((conics, (3,)), (colors, colors.shape[-1:]), (opacities, ()))]
+            flat = [
+                t.reshape(-1, *shape) for t, shape in ((conics, (3,)), (colors, colors.shape[-1:]), (opacities, ()))
+            ]
             leaves = _leaves(*flat)
             spread: list[Any] = [None]
             response = self._flat_response(means2d.reshape(-1, 2), leaves[0], leaves[2], width, spread)
@@ -255,7 +287,13 @@ class Kernels:
         drawn = (here[..., 2] >= near) & (here[..., 2] <= far) & (opacities >= ALPHA_MIN)
         radii = torch.where(drawn[..., None], width + height + means2d.abs(), 0).int()
         conics = torch.full((*drawn.shape, 3), torch.nan)
-        return radii, torch.where(drawn[..., None], means2d, torch.nan), torch.where(drawn, here[..., 2], torch.nan), conics, None
+        return (
+            radii,
+            torch.where(drawn[..., None], means2d, torch.nan),
+            torch.where(drawn, here[..., 2], torch.nan),
+            conics,
+            None,
+        )
 
     def rasterize_to_pixels_from_world_3dgs_fwd(self, means: Tensor, quats: Tensor, scales: Tensor, colors: Tensor,
                                                 opacities: Tensor, *rest: Any) -> Any:  # fmt: skip
@@ -274,7 +312,10 @@ class Kernels:
             end = first if last is None else last
             assert torch.equal(end[0, :3, :3], first[0, :3, :3])  # a turning camera would need spherical interpolation
             turn, shift = first[0, :3, :3], (1 - time) * first[0, :3, 3] + time * end[0, :3, 3]
-            ray = torch.stack([(x - Ks[0, 0, 2]) / Ks[0, 0, 0], (y - Ks[0, 1, 2]) / Ks[0, 1, 1], torch.ones_like(x)], 1) @ turn
+            ray = (
+                torch.stack([(x - Ks[0, 0, 2]) / Ks[0, 0, 0], (y - Ks[0, 1, 2]) / Ks[0, 1, 1], torch.ones_like(x)], 1)
+                @ turn
+            )
             origin = -shift @ turn
             whiten = rotation[entries].transpose(1, 2) / scales[entries][:, :, None]
             offset = torch.einsum("mij,pmj->pmi", whiten, origin[:, None] - means[entries])
@@ -295,18 +336,24 @@ class Kernels:
 
     # ---- discs ----
 
-    def projection_2dgs_fused_fwd(self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any) -> Any:
+    def projection_2dgs_fused_fwd(
+        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
+    ) -> Any:
         from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs
 
         width, height, _, near, far, _ = rest
         return _fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near, far)
 
-    def projection_2dgs_fused_bwd(self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any) -> Any:
+    def projection_2dgs_fused_bwd(
+        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
+    ) -> Any:
         width, height, radii, _, v_means2d, v_depths, v_normals, v_rays, _ = rest
         drawn = (radii > 0).all(-1)
         with torch.enable_grad():
             leaves = _leaves(means, quats, scales, viewmats)
-            _, means2d, depths, rays, normals = self.projection_2dgs_fused_fwd(*leaves, Ks, width, height, 0.3, 0.01, 1e10, 0.0)
+            _, means2d, depths, rays, normals = self.projection_2dgs_fused_fwd(
+                *leaves, Ks, width, height, 0.3, 0.01, 1e10, 0.0
+            )
             pairs = ((means2d, v_means2d), (depths, v_depths), (rays, v_rays), (normals, v_normals))
             return _gradients([out[drawn] for out, _ in pairs], [v[drawn] for _, v in pairs], leaves)
 
@@ -314,7 +361,9 @@ class Kernels:
         def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
             x, y = _centers(pixels, width)
             ray = rays[entries]
-            across = torch.linalg.cross(-ray[:, 0] + ray[:, 2] * x[:, None, None], -ray[:, 1] + ray[:, 2] * y[:, None, None])
+            across = torch.linalg.cross(
+                -ray[:, 0] + ray[:, 2] * x[:, None, None], -ray[:, 1] + ray[:, 2] * y[:, None, None]
+            )
             in_space = (across[..., :2] / across[..., 2:]).square().sum(-1)
             in_image = 2 * (torch.stack([x, y], 1)[:, None] - means[entries]).square().sum(-1)
             sigma = 0.5 * torch.minimum(in_space, in_image)

@@ -21,6 +21,7 @@ from mudg.base.types import Camera, Gaussians, Render, View
 from mudg.core.raster import gsplat_cuda, gsplat_package
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import ONLY_GSPLAT, RasterConfig, rasterize
+from mudg.stages import doctor
 
 GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")
 IMAGES = ("rgb", "depth", "alpha", "extra")
@@ -86,9 +87,13 @@ def _compare(
     behind = torch.tensor([0.2, 0.5, 0.7])
     shared = {"absgrad": config.primitive == "ellipsoid"}
     common = replace(config, backend=other, alpha_max=gsplat_cuda.ALPHA_MAX, **ONLY_GSPLAT)
-    got = rasterize(_gaussians(ours), views, replace(config, backend="gsplat"), background=behind, world_from_cam=pose_a, **shared)
+    got = rasterize(
+        _gaussians(ours), views, replace(config, backend="gsplat"), background=behind, world_from_cam=pose_a, **shared
+    )
     want = rasterize(_gaussians(theirs), views, common, background=behind.to(single), world_from_cam=pose_b, **shared)
-    errors = [((getattr(got, n) - getattr(want, n)).abs() / getattr(want, n).abs().max()).detach().amax(-3) for n in IMAGES]
+    errors = [
+        ((getattr(got, n) - getattr(want, n)).abs() / getattr(want, n).abs().max()).detach().amax(-3) for n in IMAGES
+    ]
     band = torch.stack(errors).amax(0) > 1e-5
     found = {n: float(error[~band].max()) for n, error in zip(IMAGES, errors)} | {"band": float(band.double().mean())}
     generator = torch.Generator().manual_seed(0)
@@ -328,7 +333,9 @@ def _facing(count: int = 12) -> tuple[Parameters, View]:
 def test_discs_that_face_the_camera_equal_flat_ellipsoids(gsplat: ModuleType, channels: int) -> None:
     p, view = _facing()
     p["extra"] = p["extra"][:, :1].repeat(1, max(channels, 1))
-    found = _compare(p, view, RasterConfig(primitive="disc", blur_px2=0.0), "torch", groups=("means", "opacity", "sh", "extra"))
+    found = _compare(
+        p, view, RasterConfig(primitive="disc", blur_px2=0.0), "torch", groups=("means", "opacity", "sh", "extra")
+    )
     assert all(found[name] <= 1e-5 for name in IMAGES), found
     assert found["band"] < 0.005
     assert all(found[f"d {name}"] <= 1e-4 for name in ("means", "opacity", "sh", "extra")), found
@@ -377,7 +384,9 @@ def test_a_rolling_shutter_shows_every_row_from_its_own_place(gsplat: ModuleType
     first, last = torch.eye(4), torch.eye(4)
     last[:3, 3] = torch.tensor([0.6, 0.1, 0.3])
     config = RasterConfig(backend="gsplat", projection="unscented")
-    rolling = rasterize(_gaussians(p), view, replace(config, shutter=shutter), world_from_cam=torch.stack([first, last]))
+    rolling = rasterize(
+        _gaussians(p), view, replace(config, shutter=shutter), world_from_cam=torch.stack([first, last])
+    )
     along, count = (2, 50) if "left" in shutter else (1, 37)
     for line in (0, count // 3, count - 1):
         time = line / (count - 1) if shutter in ("top_to_bottom", "left_to_right") else 1 - line / (count - 1)
@@ -470,6 +479,17 @@ def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert "first picture" in gsplat_package.status()
 
 
+def test_doctor_says_whether_it_can_be_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    monkeypatch.setattr(doctor, "_installed", lambda name: "1.5.3" if name == "gsplat" else "0")
+    _pretend_installed(monkeypatch, tmp_path, cuda=False)
+    assert doctor._optional()["gsplat"] == "1.5.3; cannot be used here: no CUDA device is available"
+    (tmp_path / "csrc.so").touch()
+    _pretend_installed(monkeypatch, tmp_path)
+    assert doctor._optional()["gsplat"] == "1.5.3; its kernels came with it"
+    monkeypatch.setattr(doctor, "_installed", lambda name: None)
+    assert "pip install 'mudg[gsplat]'" in doctor._optional()["gsplat"]
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("antialias", [False, True])
 def test_on_the_device_it_draws_what_the_native_kernel_draws(antialias: bool) -> None:
@@ -480,6 +500,8 @@ def test_on_the_device_it_draws_what_the_native_kernel_draws(antialias: bool) ->
     on_device = {name: value.cuda() for name, value in p.items()}
     g = replace(_gaussians(on_device), node=torch.zeros(len(p["means"]), dtype=torch.int32, device="cuda"))
     got: Render = rasterize(g, view, RasterConfig(backend="gsplat", antialias=antialias))
-    want = rasterize(_gaussians(p), view, RasterConfig(backend="cpu", antialias=antialias, alpha_max=gsplat_cuda.ALPHA_MAX))
+    want = rasterize(
+        _gaussians(p), view, RasterConfig(backend="cpu", antialias=antialias, alpha_max=gsplat_cuda.ALPHA_MAX)
+    )
     error = (got.rgb.cpu() - want.rgb).abs()
     assert (error > 1e-4).double().mean() < 0.005  # fast mathematics on the device

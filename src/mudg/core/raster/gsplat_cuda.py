@@ -65,7 +65,9 @@ def render(request: Request, module: ModuleType | None = None) -> Render:
     image, alpha, meta = _draw(gsplat, request, cameras, _splats(gsplat, request, g, cameras))
     trace = _trace(meta, request)
     if colorless is not None and (trace.visible & colorless).any():
-        raise NumericsError("the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra")
+        raise NumericsError(
+            "the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra"
+        )
     planes, alpha = image.permute(0, 3, 1, 2), alpha.permute(0, 3, 1, 2)
     features = 0 if g.extra is None else g.extra.shape[1]
     color, extra, depth_sum = planes[:, :3], planes[:, 3 : 3 + features], planes[:, 3 + features : 4 + features]
@@ -75,7 +77,9 @@ def render(request: Request, module: ModuleType | None = None) -> Render:
     depth = depth_sum / alpha.clamp_min(1e-10)
     if request.batched:
         return Render(rgb=color, depth=depth, alpha=alpha, extra=None if g.extra is None else extra, trace=trace)
-    return Render(rgb=color[0], depth=depth[0], alpha=alpha[0], extra=None if g.extra is None else extra[0], trace=trace)
+    return Render(
+        rgb=color[0], depth=depth[0], alpha=alpha[0], extra=None if g.extra is None else extra[0], trace=trace
+    )
 
 
 def _refuse(request: Request) -> None:
@@ -180,7 +184,11 @@ def _draw_unscented(
     gsplat: Any, common: dict[str, Any], cameras: _Cameras, splats: _Splats, shutter: str
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """View by view: gsplat's kernel for responses in space is made for one camera."""
-    rolling = {"rolling_shutter": gsplat.RollingShutterType[shutter.upper() if shutter == "global" else f"ROLLING_{shutter.upper()}"]}
+    rolling = {
+        "rolling_shutter": gsplat.RollingShutterType[
+            shutter.upper() if shutter == "global" else f"ROLLING_{shutter.upper()}"
+        ]
+    }
     drawn = []
     for index in range(len(cameras.viewmats)):
         one = slice(index, index + 1)

@@ -41,7 +41,10 @@ def compiled_kernels() -> Path | None:
     """The library of kernels that came with gsplat; None if gsplat compiles them when it first draws."""
     spec = importlib.util.find_spec("gsplat")
     folders = [] if spec is None else spec.submodule_search_locations or []
-    return next((file for folder in folders for file in sorted(Path(folder).glob("csrc*.*")) if file.suffix in (".so", ".pyd")), None)
+    return next(
+        (file for folder in folders for file in sorted(Path(folder).glob("csrc*.*")) if file.suffix in (".so", ".pyd")),
+        None,
+    )
 
 
 def nvcc() -> str | None:
@@ -69,7 +72,11 @@ def status() -> str:
     reason = problem()
     if reason:
         return f"cannot be used here: {reason}"
-    return "its kernels came with it" if compiled_kernels() else f"{nvcc()} compiles its kernels at the first picture (minutes, once)"
+    return (
+        "its kernels came with it"
+        if compiled_kernels()
+        else f"{nvcc()} compiles its kernels at the first picture (minutes, once)"
+    )
 
 
 def load() -> ModuleType:
