@@ -254,11 +254,13 @@ def test_no_gradient_is_recorded_where_none_is_wanted(gsplat: ModuleType) -> Non
     [("quats", 0.0), ("quats", 1e-30), ("quats", 1e30), ("scales", 0.0), ("scales", 1e30), ("means", 1e38), ("means", -1e38),
      ("opacity", 0.0), ("opacity", 1.0)],
 )  # fmt: skip
-def test_absurd_values_never_spread(gsplat: ModuleType, name: str, value: float) -> None:
+@pytest.mark.parametrize("projection", ["linear", "unscented"])
+def test_absurd_values_never_spread(gsplat: ModuleType, projection: Any, name: str, value: float) -> None:
     p = _parameters(30)
     p[name][3:6] = value
     p = _leaves(p)
-    out = rasterize(_gaussians(p), _views()[0], RasterConfig(backend="gsplat"), absgrad=True)
+    config = RasterConfig(backend="gsplat", projection=projection)
+    out = rasterize(_gaussians(p), _views()[0], config, absgrad=projection == "linear")
     (out.rgb.square().sum() + out.alpha.sum()).backward()
     assert all(torch.isfinite(getattr(out, n)).all() for n in IMAGES)
     assert torch.isfinite(out.trace.means2d).all()
@@ -296,9 +298,9 @@ def test_values_that_are_not_finite(gsplat: ModuleType) -> None:
         assert torch.isfinite(leaves["means"].grad).all()  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_nothing_to_draw(gsplat: ModuleType, packed: bool) -> None:
-    config, (view, _) = RasterConfig(backend="gsplat", packed=packed), _views()
+@pytest.mark.parametrize("settings", [{}, {"packed": True}, {"projection": "unscented"}, {"primitive": "disc"}])
+def test_nothing_to_draw(gsplat: ModuleType, settings: dict[str, Any]) -> None:
+    config, (view, _) = RasterConfig(backend="gsplat", **settings), _views()
     none = {n: v[:0] for n, v in _parameters(3).items()}
     behind = _parameters(3) | {"means": torch.tensor([[0.0, 0, -5]]).repeat(3, 1)}
     for p in (none, behind):
@@ -306,6 +308,8 @@ def test_nothing_to_draw(gsplat: ModuleType, packed: bool) -> None:
         assert out.alpha.abs().max() == 0
         assert out.rgb[:, 0, 0].tolist() == pytest.approx([0.1, 0.2, 0.3])
         assert not out.trace.visible.any()
+    rolling = RasterConfig(backend="gsplat", projection="unscented", shutter="top_to_bottom")
+    assert rasterize(_gaussians(none), view, rolling, world_from_cam=torch.eye(4).repeat(2, 1, 1)).alpha.max() == 0
 
 
 def test_other_number_formats_are_refused(gsplat: ModuleType) -> None:

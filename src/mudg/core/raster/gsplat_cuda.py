@@ -9,7 +9,7 @@ depth go through one pass whose gradients are complete in every mode.
 from __future__ import annotations
 
 import weakref
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Final
 
@@ -25,6 +25,7 @@ from mudg.core.raster.request import Request, harmonics
 
 ALPHA_MAX: Final = 0.999
 _FARTHEST_M: Final = 1e30
+_SMALLEST_M: Final = 1e-9
 _LARGEST_PX: Final = 1e9
 """Means and scales are held within these bounds: what lies beyond would overflow in gsplat's float32 and spread NaN."""
 
@@ -55,9 +56,9 @@ class _Splats:
 
 def render(request: Request, module: ModuleType | None = None) -> Render:
     """Draw all views. ``module`` stands in for the gsplat package in tests. See ``core.raster.rasterize``."""
-    if not len(request.gaussians):
-        return torch_twin.render(request)  # gsplat divides by the number of Gaussians
     _refuse(request)
+    if not len(request.gaussians):  # gsplat divides by their number
+        return torch_twin.render(replace(request, poses=(None,) * len(request.views)))
     gsplat, g, cameras = module or load(), request.gaussians, _cameras(request)
     if request.config.alpha_max != ALPHA_MAX:
         log.info_once(f"rasterizer: gsplat caps alpha at {ALPHA_MAX}, not at {request.config.alpha_max}")
@@ -86,11 +87,9 @@ def _refuse(request: Request) -> None:
     g, config = request.gaussians, request.config
     if g.means.dtype != torch.float32:
         raise InputError("gsplat works on float32 tensors", where="gaussians.means", got=str(g.means.dtype))
-    mode = {("unscented", "ellipsoid"): "projection='unscented'", ("linear", "disc"): "primitive='disc'"}.get(
-        (config.projection, config.primitive)
-    )
-    if mode and request.absgrad:
-        raise UsageError(f"gsplat gives no absolute gradients of projected means with {mode}",
+    if request.absgrad and (config.projection, config.primitive) != ("linear", "ellipsoid"):
+        raise UsageError("gsplat gives absolute gradients of projected means only of linearly projected ellipsoids",
+                         got=f"projection={config.projection!r}, primitive={config.primitive!r}",
                          remedy="densify without them (mcmc), or draw linearly projected ellipsoids")  # fmt: skip
     if config.projection == "unscented" and any(pose is not None and pose.requires_grad for pose in request.poses):
         raise UsageError("gsplat gives no gradients of camera poses with projection='unscented'",
@@ -134,7 +133,7 @@ def _cameras(request: Request) -> _Cameras:
 def _splats(gsplat: Any, request: Request, g: Gaussians, cameras: _Cameras) -> _Splats:
     focal = max(max(view.camera.fx, view.camera.fy) for view in request.views)
     means = (g.means - cameras.origin).clamp(-_FARTHEST_M, _FARTHEST_M)
-    scales = g.scales.clamp_max(_LARGEST_PX * request.config.near_m / focal)
+    scales = g.scales.clamp(_SMALLEST_M, _LARGEST_PX * request.config.near_m / focal)
     usable = g.quats.square().sum(1, keepdim=True) > 1e-24
     quats = torch.where(usable, g.quats, g.quats.new_tensor([1.0, 0, 0, 0]))
     sh = harmonics(g)
@@ -146,7 +145,8 @@ def _splats(gsplat: Any, request: Request, g: Gaussians, cameras: _Cameras) -> _
         rgb = (gsplat.spherical_harmonics(request.sh_degree, direction, sh) + 0.5).clamp_min(0)
         depth = offset @ forward[:, None]
         channels.append(torch.cat([rgb, depth] if g.extra is None else [rgb, g.extra, depth], 1))
-    return _Splats(means, quats, scales, g.opacity, torch.stack(channels))
+    together = channels[0][None] if len(channels) == 1 else torch.stack(channels)
+    return _Splats(means, quats, scales, g.opacity, together)
 
 
 def _draw(gsplat: Any, request: Request, cameras: _Cameras, splats: _Splats) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -184,16 +184,12 @@ def _draw_unscented(
     gsplat: Any, common: dict[str, Any], cameras: _Cameras, splats: _Splats, shutter: str
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """View by view: gsplat's kernel for responses in space is made for one camera."""
-    rolling = {
-        "rolling_shutter": gsplat.RollingShutterType[
-            shutter.upper() if shutter == "global" else f"ROLLING_{shutter.upper()}"
-        ]
-    }
+    name = "GLOBAL" if shutter == "global" else f"ROLLING_{shutter.upper()}"
     drawn = []
     for index in range(len(cameras.viewmats)):
         one = slice(index, index + 1)
         drawn.append(gsplat.rasterization(
-            **common, **rolling, colors=splats.channels[one], viewmats=cameras.viewmats[one].detach(),
+            **common, rolling_shutter=gsplat.RollingShutterType[name], colors=splats.channels[one], viewmats=cameras.viewmats[one].detach(),
             viewmats_rs=None if cameras.last is None else cameras.last[one].detach(), Ks=cameras.intrinsics[one],
             packed=False, with_ut=True, with_eval3d=True,
         ))  # fmt: skip
