@@ -13,6 +13,7 @@ import os
 import shutil
 import tempfile
 import threading
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -217,6 +218,55 @@ def append_line(path: Path, text: str) -> None:
     _make_parent(path)
     with Path(path).open("a", encoding="utf-8") as handle:
         handle.write(text.rstrip("\n") + "\n")
+
+
+class ScratchFile:
+    """A file without a name, for what does not fit into memory. The system removes it with the process, however that ends.
+
+    Blocks are appended by one thread; any thread may read them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.where = str(folder)
+        with disk_errors("cannot make a scratch file", folder):
+            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)
+        self._end = 0
+        self._lock = threading.Lock()
+        weakref.finalize(self, self._file.close)
+
+    def append(self, content: bytes | NDArray[Any]) -> int:
+        """Write a block at the end; returns where it begins. ResourceError if the disk is full."""
+        left, began = memoryview(content).cast("B"), self._end
+        with self._lock, _writing(Path(self.where)):
+            self._file.seek(began)
+            while len(left):
+                left = left[self._file.write(left) :]
+        self._end += memoryview(content).nbytes
+        return began
+
+    def read(self, begins: int, size: int) -> NDArray[np.uint8]:
+        """The bytes of a block. ResourceError if the disk does not give them back."""
+        found = np.empty(size, np.uint8)
+        left, remedy = memoryview(found), "check the disk, then repeat the command to resume"
+        with disk_errors("a scratch file cannot be read", Path(self.where), remedy):
+            while len(left):
+                count = self._read_into(left, begins + size - len(left))
+                if count == 0:
+                    raise ResourceError("a scratch file ended early", where=self.where, expected=f"{begins + size} bytes",
+                        got=f"{begins + size - len(left)}", remedy=remedy)  # fmt: skip
+                left = left[count:]
+        return found
+
+    def _read_into(self, buffer: memoryview, position: int) -> int:
+        if hasattr(os, "preadv"):
+            return os.preadv(self._file.fileno(), [buffer], position)
+        with self._lock:
+            self._file.seek(position)
+            return self._file.readinto(buffer)
+
+    def close(self) -> None:
+        """Give the space back."""
+        self._file.close()
 
 
 def sha256_file(path: Path) -> str:
