@@ -238,7 +238,7 @@ def test_a_full_disk_is_said_before_anything_is_read(tmp_path, monkeypatch):
         kept.scratch_folder(9, 4 << 30, tmp_path)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="needs a device that is always full")
 def test_a_disk_that_fills_up_is_an_error_in_words(tmp_path, monkeypatch):
     monkeypatch.setattr(store.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", buffering=0))
     with pytest.raises(ResourceError, match=r"writing failed[\s\S]*No space left[\s\S]*free disk space"):

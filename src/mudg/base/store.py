@@ -279,15 +279,25 @@ def sha256_file(path: Path) -> str:
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, NDArray[Any] | Tensor]) -> None:
-    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically."""
-    from safetensors.numpy import save as save_numpy
+    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically; without a copy of them in memory."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import save_file
 
     arrays: dict[str, NDArray[Any]] = {}
     for name, value in tensors.items():
         if not isinstance(value, np.ndarray):
             value = value.detach().cpu().numpy()
         arrays[name] = np.ascontiguousarray(value)
-    atomic_write(path, save_numpy(arrays))
+    path = Path(path)
+    with (
+        atomic_path(path) as temporary,
+        tempfile.TemporaryDirectory(prefix=f".{path.stem}.", suffix=".part", dir=path.parent) as own,
+    ):  # the library writes beside its target, under a name of its own
+        try:
+            save_file(arrays, Path(own) / path.name)
+        except SafetensorError as error:  # what it makes of a full disk
+            raise OSError(str(error)) from error
+        (Path(own) / path.name).replace(temporary)
 
 
 def read_safetensors(path: Path) -> dict[str, NDArray[Any]]:

@@ -258,7 +258,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """
     raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
-    virtual_from = state.begun_at or virtual_from
+    virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
 
     def choose(step: int) -> tuple[StoredView, ...]:
         probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
@@ -293,8 +293,9 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
                 write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
-            if step % config.checkpoint_every == 0 or interruption.requested:
-                save_checkpoint(state, folder.path / "steps")
+            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
+                with pace.saving():
+                    save_checkpoint(state, folder.path / "steps")
             bar.advance()
             if interruption.requested:
                 folder.pause(state.summary())

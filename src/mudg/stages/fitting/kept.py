@@ -171,6 +171,7 @@ class ViewFile(FiledViews):
             yield self[index]
 
     def close(self) -> None:
+        """Give the space back; nothing can be read any more."""
         self._file.close()
 
 
