@@ -140,8 +140,8 @@ def loaded(
 
 @contextlib.contextmanager
 def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
-    """Clocks in the loop: waiting for views, preparing them (reading, tensors; processor time of the thread), whole steps."""
-    found: dict[str, list[float]] = {"waiting": [], "preparing": [], "reading": [], "step": []}
+    """Clocks in the loop: waiting for views, reading them and making tensors (processor time of the thread), whole steps."""
+    found: dict[str, list[float]] = {"waiting": [], "tensors": [], "reading": [], "step": []}
     chosen_ahead, due, choose, tensors = fit.chosen_ahead, fit._densify_if_due, ViewSet.choose, StoredView.as_tensors
     began = [time.perf_counter()]
 
@@ -160,7 +160,7 @@ def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
 
     fit.chosen_ahead, fit._densify_if_due = with_clock, count  # type: ignore[assignment]
     ViewSet.choose = timed(choose, found["reading"], time.thread_time)  # type: ignore[method-assign]
-    StoredView.as_tensors = timed(tensors, found["preparing"], time.thread_time)  # type: ignore[method-assign]
+    StoredView.as_tensors = timed(tensors, found["tensors"], time.thread_time)  # type: ignore[method-assign]
     try:
         yield found
     finally:
@@ -196,7 +196,8 @@ def table(found: dict[str, Any]) -> str:
         f"starting model {found['start_s']:.1f} s, {found['gaussians']} Gaussians",
         f"peak of anonymous memory: {found['peak_loading_gib']:.2f} GiB while loading, {found['peak_gib']:.2f} GiB in all",
         f"{found['steps']} steps, {found['threads']} threads, medians: step {step:.0f} ms, of which waiting for views {waiting:.1f} ms "
-        f"({waiting / step:.1%}); in other threads: reading {found['reading_ms']:.1f} ms, making tensors {found['preparing_ms']:.1f} ms",
+        f"({waiting / step:.1%}), the making of tensors included; processor time: tensors of a view {found['tensors_ms']:.1f} ms, "
+        f"reading the views of a step, in other threads if in a file, {found['reading_ms']:.1f} ms",
     ]) + "\n"  # fmt: skip
 
 

@@ -310,6 +310,18 @@ def test_a_wrong_frame_is_named_by_the_thread_that_reads_it(world, tmp_path):
     assert threading.active_count() == before
 
 
+def test_ctrl_c_while_frames_are_read_ends_the_threads(world, tmp_path, monkeypatch):
+    def ctrl_c(self, index, stored):
+        assert threading.active_count() > before
+        raise KeyboardInterrupt
+
+    scene, before = read_scene(world["scene"]), threading.active_count()
+    monkeypatch.setattr(kept.ViewFile, "put", ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        fit.recorded_views(settings(), scene, scratch=tmp_path)
+    assert threading.active_count() == before and open_in(tmp_path) == []
+
+
 def test_sweeps_are_let_go_and_depths_stay_the_same(world, monkeypatch):
     scene = read_scene(world["scene"])
     frames = fit_views.training_frames(scene, ())

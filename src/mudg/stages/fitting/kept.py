@@ -42,7 +42,7 @@ from mudg.stages.fitting.views import (
 IN_MEMORY_BYTES = GIB
 """Decoded views of up to this size stay in memory."""
 AHEAD_THREADS = 2
-"""Threads that prepare views of later steps; each has two steps waiting."""
+"""Threads that read the views of later steps; each has two steps waiting."""
 LIDAR_SHARE = 0.05
 """Assumed share of pixels with LiDAR, for the size of views that are not read yet."""
 _BITS = ("sky", "mask")
@@ -200,22 +200,13 @@ def chosen_ahead(
 ) -> Iterator[Iterator[tuple[TrainView, ...]]]:
     """The views that ``choose`` gives for each of these steps, as tensors on a device.
 
-    Where views lie in a file, or steps are computed on another device, threads prepare those of a few steps beforehand; they end with
-    the block. What goes wrong in a thread is raised at its step.
+    Where views lie in a file, threads read those of a few steps beforehand; they end with the block. What goes wrong in a thread is
+    raised at its step. Tensors are made by the caller's thread: in another one, every large allocation costs its page faults anew.
     """
-    at_home = device.type == "cpu"
-
-    def prepared(turn: int) -> tuple[StoredView, ...] | tuple[TrainView, ...]:
-        chosen = choose(steps[turn])
-        return tuple(view.as_tensors() for view in chosen) if at_home else chosen
-
-    waiting: Generator[tuple[StoredView, ...] | tuple[TrainView, ...], None, None]
-    if views.filed or not at_home:
-        waiting = computed_ahead(prepared, len(steps), AHEAD_THREADS)
+    chosen: Generator[tuple[StoredView, ...], None, None]
+    if views.filed:
+        chosen = computed_ahead(lambda turn: choose(steps[turn]), len(steps), AHEAD_THREADS)
     else:
-        waiting = (prepared(turn) for turn in range(len(steps)))
-    with contextlib.closing(waiting):
-        yield (
-            tuple(view if isinstance(view, TrainView) else view.as_tensors(device) for view in chosen)
-            for chosen in waiting
-        )
+        chosen = (choose(step) for step in steps)
+    with contextlib.closing(chosen):
+        yield (tuple(view.as_tensors(device) for view in found) for found in chosen)
