@@ -1,9 +1,9 @@
 """Where the views of a fit lie: small sets in memory, large ones in a scratch file, read ahead of the steps that need them.
 
-Decoded views of a long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels about 14 GiB with the dense
-depth of virtual ones. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder of the fit, plane by plane as they are
-(masks in bits), so that a view costs one read and no decoding, and what a step gets is the same to the bit. The system keeps as much
-of the file in memory as it can spare. Which views a step gets is a function of the step, so threads read those of the next steps
+Decoded views of a long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11 GiB, 1,000 virtual
+ones with dense depth 18. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder of the fit, plane by plane as they
+are (masks in bits), so that a view costs one read and no decoding, and what a step gets is the same to the bit. The system keeps as
+much of the file in memory as it can spare. Which views a step gets is a function of the step, so threads read those of the next steps
 beforehand.
 """
 
@@ -45,8 +45,7 @@ AHEAD_THREADS = 2
 """Threads that read the views of later steps; each has two steps waiting."""
 LIDAR_SHARE = 0.05
 """Assumed share of pixels with LiDAR, for the size of views that are not read yet."""
-_BITS = ("sky", "mask")
-_PLANES = ("depth", "rgb", "channels", "confidence")
+_PLANES = ("depth", "rgb", "channels", "confidence", "sky", "mask")
 """Depth first, so that it lies at a multiple of its element's size."""
 
 
@@ -121,11 +120,11 @@ class ViewFile(FiledViews):
 
     def put(self, index: int, stored: StoredView) -> None:
         """Write a view to its place."""
-        planes = [(name, array) for name in (*_PLANES, *_BITS) if (array := getattr(stored, name)) is not None]
+        planes = [(name, array) for name in _PLANES if (array := getattr(stored, name)) is not None]
         parts: list[NDArray[Any]] = []
         if stored.lidar is not None:
             parts += [stored.lidar.depth_m.numpy(), stored.lidar.pixel.numpy().astype(np.int32)]
-        parts += [np.packbits(array) if name in _BITS else array for name, array in planes]
+        parts += [np.packbits(array) if array.dtype == bool else array for _, array in planes]
         content = np.concatenate([np.ascontiguousarray(part).reshape(-1).view(np.uint8) for part in parts])
         lidar = None if stored.lidar is None else len(stored.lidar.pixel)
         forms = tuple((name, array.dtype, array.shape) for name, array in planes)
@@ -161,9 +160,9 @@ class ViewFile(FiledViews):
         planes: dict[str, NDArray[Any]] = {}
         for name, kind, shape in slot.planes:
             pixels = math.prod(shape)
-            size = -(-pixels // 8) if name in _BITS else pixels * kind.itemsize
+            size = -(-pixels // 8) if kind.kind == "b" else pixels * kind.itemsize
             part, at = content[at : at + size], at + size
-            planes[name] = (np.unpackbits(part, count=pixels) if name in _BITS else part).view(kind).reshape(shape)
+            planes[name] = (np.unpackbits(part, count=pixels) if kind.kind == "b" else part).view(kind).reshape(shape)
         return StoredView(slot.head.name, slot.head.view, slot.head.kind, lidar=lidar, **planes)
 
     def __iter__(self) -> Iterator[StoredView]:
