@@ -242,7 +242,7 @@ def test_a_full_disk_is_said_before_anything_is_read(tmp_path, monkeypatch):
 def test_a_disk_that_fills_up_is_an_error_in_words(tmp_path, monkeypatch):
     monkeypatch.setattr(store.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", buffering=0))
     with pytest.raises(ResourceError, match=r"writing failed[\s\S]*No space left[\s\S]*free disk space"):
-        store.ScratchFile(tmp_path).append(b"x" * 100)
+        store.ScratchFile(tmp_path).append(np.zeros(100, np.uint8))
 
 
 # ---- whole fits ------------------------------------------------------------------------------------------------------

@@ -234,20 +234,20 @@ class ScratchFile:
         self._lock = threading.Lock()
         weakref.finalize(self, self._file.close)
 
-    def append(self, content: bytes | NDArray[Any]) -> int:
-        """Write a block at the end; returns where it begins. ResourceError if the disk is full."""
-        left, began = memoryview(content).cast("B"), self._end
+    def append(self, content: NDArray[np.uint8]) -> int:
+        """Write a block, u8[N], at the end; returns where it begins. ResourceError if the disk is full."""
+        left, began = content.data, self._end
         with self._lock, _writing(Path(self.where)):
             self._file.seek(began)
             while len(left):
                 left = left[self._file.write(left) :]
-        self._end += memoryview(content).nbytes
+        self._end += len(content)
         return began
 
     def read(self, begins: int, size: int) -> NDArray[np.uint8]:
         """The bytes of a block. ResourceError if the disk does not give them back."""
         found = np.empty(size, np.uint8)
-        left, remedy = memoryview(found), "check the disk, then repeat the command to resume"
+        left, remedy = found.data, "check the disk, then repeat the command to resume"
         with disk_errors("a scratch file cannot be read", Path(self.where), remedy):
             while len(left):
                 count = self._read_into(left, begins + size - len(left))
