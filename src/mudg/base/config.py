@@ -33,6 +33,18 @@ def to_dict(config: Any) -> dict[str, Any]:
     return TypeAdapter(type(config)).dump_python(config, mode="json")
 
 
+def result_settings(config: Any) -> dict[str, Any]:
+    """What a result depends on: ``to_dict`` without every ``device``, so that a result made or begun on one device is reused or
+    resumed on another."""
+    return _without_devices(to_dict(config))
+
+
+def _without_devices(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: _without_devices(value) if isinstance(value, Mapping) else value for name, value in values.items() if name != "device"
+    }
+
+
 def dump_yaml(config: Any) -> str:
     """A configuration as YAML text that ``load`` reads back to an equal configuration."""
     import yaml

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from mudg.base import log, store
-from mudg.base.config import to_dict
+from mudg.base.config import result_settings
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.bench import poses as bench_poses
@@ -64,7 +64,7 @@ def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = 
         raise UsageError("no such benchmark", expected=", ".join((*BENCHES, SHIFT, REAL)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
-    directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), to_dict(config), inputs, overwrite)
+    directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), result_settings(config), inputs, overwrite)
     if directory.complete:
         return directory.reused()
     torch.set_num_threads(config.threads)

@@ -9,6 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -70,3 +71,5 @@ class BenchConfig:
     """real: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all)."""
     pose_iterations: int = Field(default=300, ge=1)
     """poses: optimisation steps of every fit."""
+    device: DeviceName = "auto"
+    """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""

@@ -66,7 +66,7 @@ def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
     small = view.resized(width, max(1, round(camera.height * width / camera.width)))
     render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
     depth = torch.where(render.alpha > 0.5, render.depth, torch.inf)
-    return _Witness(small, depth[0].numpy())
+    return _Witness(small, depth[0].cpu().numpy())
 
 
 def block_centres(size_px: int) -> NDArray[np.intp]:
@@ -100,7 +100,7 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
 def unseen_rows(
     model: SceneModel, virtual: Sequence[StoredView], unseen: Sequence[NDArray[np.bool_]], most: int, run_seed: int
 ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-    """Table rows (columns, labels) at the surfaces that only virtual views show, thinned to one per place, at most ``most``.
+    """Table rows (columns, labels; on the CPU) at the surfaces that only virtual views show, thinned to one per place, at most ``most``.
 
     A point in the box of a dynamic object belongs to that object.
     """
@@ -121,7 +121,7 @@ def unseen_rows(
         columns.append(points[rows].columns(model.classes, model.sh_degree))
         owners.append(torch.full((len(rows),), index, dtype=torch.int32))
     if not columns:
-        return {name: value.detach()[:0] for name, value in model.table.columns.items()}, {"node": torch.zeros(0, dtype=torch.int32)}
+        return {name: value.detach()[:0].cpu() for name, value in model.table.columns.items()}, {"node": torch.zeros(0, dtype=torch.int32)}
     return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}
 
 

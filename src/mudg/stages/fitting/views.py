@@ -7,7 +7,7 @@ gets is a function of (run seed, step) alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,10 @@ class LidarPixels:
     pixel: Tensor
     depth_m: Tensor
 
+    def to(self, device: torch.device) -> LidarPixels:
+        """The same pixels on a device."""
+        return LidarPixels(self.pixel.to(device, non_blocking=True), self.depth_m.to(device, non_blocking=True))
+
 
 @dataclass(frozen=True)
 class TrainView:
@@ -65,6 +69,14 @@ class TrainView:
     sky: Tensor | None
     depth: Tensor | None
     lidar: LidarPixels | None
+
+    def to(self, device: torch.device) -> TrainView:
+        """The same view on a device; itself on the CPU. Nobody waits for the copies."""
+        if device == self.rgb.device:
+            return self
+        given = {f.name: value for f in fields(self) if isinstance(value := getattr(self, f.name), Tensor)}
+        sent = {name: value.to(device, non_blocking=True) for name, value in given.items()}
+        return replace(self, **sent, lidar=None if self.lidar is None else self.lidar.to(device))
 
 
 @dataclass(frozen=True)
