@@ -7,7 +7,9 @@ device. What it cannot tell: kernels that exist only there, speed, memory, race 
 
 from __future__ import annotations
 
+import traceback
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import torch
 from torch.utils import _pytree as pytree
@@ -93,6 +95,9 @@ class Pretend(torch.Tensor):
     def numpy(self, *args, **kwargs):
         raise TypeError("can't convert a tensor of another device to numpy; use .cpu() first")
 
+    def tolist(self):
+        return self.cpu().tolist()
+
     def new_tensor(self, data, *, dtype=None, device=None, requires_grad=False):
         made = torch.tensor(data, dtype=dtype or self.dtype).to(device or DEVICE)
         return made.requires_grad_(requires_grad)
@@ -108,6 +113,38 @@ class Pretend(torch.Tensor):
     @classmethod
     def __torch_dispatch__(cls, func, types_, args=(), kwargs=None):
         return run(func, args, kwargs or {})
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """One copy between the devices: "there" or "back", number of values, and the line of the package that asked for it."""
+
+    way: str
+    values: int
+    where: str
+
+
+TRANSFERS: list[list[Transfer]] = []
+"""Lists that take every copy, see ``transfers``."""
+NUMBER_BACK = "aten::_local_scalar_dense"
+
+
+@contextmanager
+def transfers():
+    """Within: a list that fills with what goes from one device to the other, single numbers that are read included."""
+    TRANSFERS.append([])
+    try:
+        yield TRANSFERS[-1]
+    finally:
+        TRANSFERS.pop()
+
+
+def _note_transfer(way: str, values: int) -> None:
+    if TRANSFERS:
+        frames = [f for f in traceback.extract_stack() if "/mudg/" in f.filename]
+        where = f"{frames[-1].filename.rpartition('/mudg/')[2]}:{frames[-1].name}" if frames else ""
+        for taken in TRANSFERS:
+            taken.append(Transfer(way, values, where))
 
 
 COPIES = {"aten::_to_copy", "aten::copy_", "aten::to", "aten::_copy_from"}
@@ -132,6 +169,12 @@ def run(func, args, kwargs):
         kwargs = {**kwargs, "device": torch.device("cpu")}
     if name == "aten::copy_":
         to_there = isinstance(args[0], Pretend)
+        if to_there != isinstance(args[1], Pretend):
+            _note_transfer("there" if to_there else "back", args[1].numel())
+    elif name in COPIES and to_there != isinstance(args[0], Pretend):
+        _note_transfer("there" if to_there else "back", args[0].numel())
+    elif name == NUMBER_BACK:
+        _note_transfer("back", 1)
     if (
         "generator" in kwargs
         and kwargs["generator"] is not None

@@ -36,12 +36,13 @@ def to_dict(config: Any) -> dict[str, Any]:
 def result_settings(config: Any) -> dict[str, Any]:
     """What a result depends on: ``to_dict`` without every ``device``, so that a result made or begun on one device is reused or
     resumed on another."""
-    return _without_devices(to_dict(config))
+    return without_devices(to_dict(config))
 
 
-def _without_devices(values: Mapping[str, Any]) -> dict[str, Any]:
+def without_devices(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as JSON values without every ``device``, at any depth."""
     return {
-        name: _without_devices(value) if isinstance(value, Mapping) else value for name, value in values.items() if name != "device"
+        name: without_devices(value) if isinstance(value, Mapping) else value for name, value in values.items() if name != "device"
     }
 
 

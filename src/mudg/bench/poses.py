@@ -98,8 +98,9 @@ def _rows_of_case(config: BenchConfig, scene: Scene, city: int, kind: str, out: 
 def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
     """A small, quick fit with poses "fixed", "learnt", or only "smoothed"."""
     return FitConfig(
-        method="street_gaussians", iterations=config.pose_iterations, seed=config.seed, device=config.device, preview_every=10**6, checkpoint_every=10**6,
-        start=StartConfig(gaussians=8000), densify=DensifyConfig(kind="none"), loss=RecordedLossConfig(semantic_every=1000),
+        method="street_gaussians", iterations=config.pose_iterations, seed=config.seed, device=config.device,
+        preview_every=10**6, checkpoint_every=10**6, start=StartConfig(gaussians=8000),
+        densify=DensifyConfig(kind="none"), loss=RecordedLossConfig(semantic_every=1000),
         poses=PoseConfig(learn=poses != "fixed", rounds=0 if poses == "smoothed" else PoseConfig().rounds),
     )  # fmt: skip
 

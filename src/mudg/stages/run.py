@@ -270,7 +270,7 @@ class _Ledger:
         known = out / "run.json"
         if known.is_file():
             before = cls._read(known)
-            if before["asked"] == asked:
+            if configuration.without_devices(before["asked"]) == asked:
                 pass
             elif overwrite:
                 before = {}

@@ -11,7 +11,12 @@ from mudg.base.devices import choose_device
 from mudg.base.errors import UsageError
 from mudg.core.raster.rasterize import Backend, available
 
-DRAWN_ON: Final[dict[str, tuple[str, ...]]] = {"auto": ("cpu", "cuda"), "cpu": ("cpu",), "torch": ("cpu", "cuda"), "gsplat": ("cuda",)}
+DRAWN_ON: Final[dict[str, tuple[str, ...]]] = {
+    "auto": ("cpu", "cuda"),
+    "cpu": ("cpu",),
+    "torch": ("cpu", "cuda"),
+    "gsplat": ("cuda",),
+}
 """Kinds of devices that each backend draws on."""
 
 

@@ -50,7 +50,8 @@ class SkyNode:
         texel_rad = np.pi / self.rows
         stride = int(np.clip(0.7 * texel_rad * min(camera.fx, camera.fy), 1, 8))
         height, width = -(-camera.height // stride), -(-camera.width // stride)
-        grid = self._grid_there(view, height, width) if self.table.device.type != "cpu" else torch.from_numpy(self._grid(view, height, width))
+        here = self.table.device.type == "cpu"
+        grid = torch.from_numpy(self._grid(view, height, width)) if here else self._grid_there(view, height, width)
         grid = grid.to(self.table["panorama"].dtype)
         padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
         return F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)[0]

@@ -37,7 +37,12 @@ class FiniteCheck:
 
     def terms(self, view: str, terms: Mapping[str, Tensor]) -> None:
         """Add the loss terms of a view."""
-        self._add([(value.detach(), functools.partial(_refuse_term, name, self._where(view))) for name, value in terms.items()])
+        self._add(
+            [
+                (value.detach(), functools.partial(_refuse_term, name, self._where(view)))
+                for name, value in terms.items()
+            ]
+        )
 
     def gradients(self, view: str, model: SceneModel, appearance: Appearance) -> None:
         """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there is."""
