@@ -24,6 +24,10 @@ from mudg.base import store
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.base.types import FusedCloud
+from mudg.bench import chain
+from mudg.bench import poses as bench_poses
+from mudg.bench import real as bench_real
+from mudg.bench import shift as bench_shift
 from mudg.core import native_ops, trajectory
 from mudg.core.raster import place
 from mudg.core.raster.rasterize import RasterConfig
@@ -37,7 +41,7 @@ from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import StaticNode
 from mudg.models.scene.sky import SkyNode
 from mudg.stages import fit, render, score
-from mudg.stages.config import FitConfig, RenderConfig, RunConfig, ScoreConfig, with_device
+from mudg.stages.config import BenchConfig, FitConfig, RenderConfig, RunConfig, ScoreConfig, with_device
 from mudg.stages.config.fit import VirtualConfig
 from mudg.stages.fitting.finite import FiniteCheck
 from mudg.stages.fitting.perception import perception_of
@@ -378,6 +382,21 @@ def test_every_step_of_a_run_follows_its_device_unless_it_has_its_own():
     assert with_device(RunConfig()) == RunConfig()
     assert result_settings(made) == result_settings(RunConfig())
     assert "device" not in json.dumps(result_settings(made))
+
+
+def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
+    config = BenchConfig(device="cuda:1", methods=("street_gaussians",), variant=("wide=width_px:64",))
+    fits = [row.fit for row in bench_shift.rows_of(config)] + [
+        row.changes for row in bench_real.rows_of(config) if row.changes
+    ]
+    assert len(fits) == 3
+    assert {
+        fitted.device for fitted in (*fits, bench_shift.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
+    } == {"cuda:1"}
+    monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
+    assert chain.at_once(config) == 1
+    assert chain.at_once(replace(config, processes=3)) == 3
+    assert chain.at_once(replace(config, device="cpu")) == os.cpu_count()
 
 
 # ---- render and score -------------------------------------------------------------------------------------------------
