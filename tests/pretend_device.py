@@ -117,7 +117,8 @@ class Pretend(torch.Tensor):
 
 @dataclass(frozen=True)
 class Transfer:
-    """One copy between the devices: "there" or "back", number of values, and the line of the package that asked for it."""
+    """One copy between the devices: "there" or "back", number of values, and the function of the package that asked for it. Or a
+    "wait": a result whose size the CPU must know before it can go on, as that of ``nonzero`` and of a choice by a mask."""
 
     way: str
     values: int
@@ -127,6 +128,7 @@ class Transfer:
 TRANSFERS: list[list[Transfer]] = []
 """Lists that take every copy, see ``transfers``."""
 NUMBER_BACK = "aten::_local_scalar_dense"
+WAITS = {"aten::nonzero", "aten::masked_select", "aten::_unique2", "aten::repeat_interleave"}
 
 
 @contextmanager
@@ -175,6 +177,8 @@ def run(func, args, kwargs):
         _note_transfer("there" if to_there else "back", args[0].numel())
     elif name == NUMBER_BACK:
         _note_transfer("back", 1)
+    elif there and (name in WAITS or (name == "aten::index" and any(x.dtype == torch.bool for x in leaves[1:]))):
+        _note_transfer("wait", 0)
     if (
         "generator" in kwargs
         and kwargs["generator"] is not None

@@ -35,8 +35,8 @@ from mudg.core.table import Table
 from mudg.data.cloudfile import write_fused
 from mudg.data.observations import ObservationWriter, read_observations
 from mudg.models.scene.appearance import Appearance
-from mudg.models.scene.densify import DensifySettings
-from mudg.models.scene.mcmc import McmcSettings, order_of_place
+from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
+from mudg.models.scene.mcmc import McmcSettings, drift, order_of_place, relocate_and_grow
 from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import StaticNode
 from mudg.models.scene.sky import SkyNode
@@ -226,11 +226,44 @@ def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path,
             copy.values in {n * count for n in pixels for count in (1, 3)} or copy.values < 1000 for copy in large
         )
         back = [copy for copy in copied if copy.way == "back"]
+        assert not [copy for copy in copied if copy.way == "wait"], step
         if step > 1:  # at first the tracks' offsets come back and the rows of every node are counted
             assert [copy.where for copy in back] == ["stages/fitting/finite.py:refuse"], step
             assert back[0].values < 100
     late = [copy for copy in steps.of[5] if copy.way == "there" and copy.values <= NUMBERS]
     assert all(copy.where == "models/scene/nodes.py:_sent" for copy in late), late
+
+
+def test_densification_brings_no_rows_back(plain_fit):
+    """Rows are chosen, copied, moved and dropped there; counts come back, and the only large thing that goes there is noise."""
+    draw = torch.Generator().manual_seed(0)
+    gradient = DensifySettings(1, 9, 1, max_rows=5000, prune_opacity=0.1)
+    chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, dead_opacity=0.2)
+    model = fit.load_model(plain_fit)
+    rows = len(model.table)
+    seen_rows = DensifyStats(torch.rand(rows, generator=draw) * 4e-3, torch.ones(rows))
+    with pretend_device() as there:
+        far, noted = model.to(there), {}
+        stats = seen_rows.to(there)
+        for name, change in {
+            "densify": lambda m, s: densify(m, s, 4, gradient, 0),
+            "relocate": lambda m, s: relocate_and_grow(m, 5, chain_of_copies, 0),
+            "drift": lambda m, s: drift(m, 6, 1e-3, replace(chain_of_copies, gate_opacity=0.9), 0),
+        }.items():
+            with transfers() as seen:
+                found = change(far, stats)
+            assert found == change(model, seen_rows), name
+            noted[name] = [copy for copy in seen if copy.values > NUMBERS]
+            assert all(copy.way == "there" for copy in noted[name]), noted[name]
+            torch.testing.assert_close(
+                far.table["means"].detach().cpu(), model.table["means"].detach(), atol=1e-6, rtol=1e-6
+            )
+            if found:
+                assert sum(found.values()) > found["rows"], found
+        assert {copy.where for copy in noted["densify"]} == {"models/scene/densify.py:_halves"}
+        assert not noted["relocate"]
+        assert [copy.where for copy in seen if copy.way == "wait"] == ["models/scene/mcmc.py:drift"]
+        assert {copy.where for copy in noted["drift"]} == {"models/scene/mcmc.py:drift"}
 
 
 def test_what_is_not_finite_is_found_in_one_look(world):
