@@ -21,6 +21,7 @@ from test_score_metrics import lpips_state
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import store
+from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.base.types import FusedCloud
@@ -359,6 +360,18 @@ def test_the_sky_is_drawn_there_without_a_copy():
                 made = moved.coarse_picture(view)
             assert not seen
             torch.testing.assert_close(made.cpu(), here, atol=1e-5, rtol=1e-5)
+
+
+def test_colors_of_cameras_are_mapped_there():
+    colors = CameraColors("front", {"rear": ColorMap((1.1, 0.9, 1.3), (0.02, -0.01, 0.1))})
+    rgb = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0))
+    with pretend_device() as there:
+        moved = rgb.to(there)
+        assert colors.image_of("front", moved) is moved
+        assert torch.equal(colors.image_of("rear", moved).cpu(), colors.image_of("rear", rgb))
+        with transfers() as seen:
+            colors.image_of("rear", moved)
+        assert not seen
 
 
 def test_rows_are_put_in_the_order_of_their_place_with_ties_as_they_come():
