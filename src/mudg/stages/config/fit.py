@@ -185,7 +185,8 @@ class FitConfig:
     device: DeviceName = "auto"
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
     checkpoint_every: int = Field(default=500, ge=1)
-    """Steps between checkpoints; an interrupted fit resumes at the last one."""
+    """Steps between checkpoints; an interrupted fit resumes at the last one. Large ones are rarer: they take at most a twentieth of
+    the time."""
     preview_every: int = Field(default=500, ge=1)
     """Steps between preview images."""
     start: StartConfig = Field(default_factory=StartConfig)
