@@ -31,6 +31,7 @@ from mudg.models.scene.densify import DensifyStats
 from mudg.stages import fit, fuse, ingest
 from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
 from mudg.stages.config.fit import DensifyConfig
+from mudg.stages.fitting.finite import FiniteCheck
 from mudg.stages.fitting.views import StoredView, ViewSet
 
 FORWARD = ("project", "sort", "bin", "blend")
@@ -81,11 +82,13 @@ class Clock:
 def instrument(clock: Clock) -> None:
     """Put the clock into the loop of `stages/fit.py`."""
     for part, names in {
-        "compose": ("compose",), "Adam": ("adam_step", "gradients_or_refuse"), "densify": ("_densify_if_due", "shorten_needles"),
-        "losses": ("recorded_terms", "virtual_terms", "regularisers", "finite_or_refuse"),
+        "compose": ("compose",), "Adam": ("adam_step",), "densify": ("_densify_if_due", "shorten_needles"),
+        "losses": ("recorded_terms", "virtual_terms", "regularisers"),
     }.items():  # fmt: skip
         for name in names:
             setattr(fit, name, clock.wrapped(part, getattr(fit, name)))
+    FiniteCheck.terms = clock.wrapped("losses", FiniteCheck.terms)  # type: ignore[method-assign]
+    FiniteCheck.gradients = clock.wrapped("Adam", FiniteCheck.gradients)  # type: ignore[method-assign]
     rasterize, backward = clock.wrapped("rest", fit.rasterize), clock.wrapped("losses", torch.Tensor.backward)
 
     def timed_rasterize(*arguments: Any, **named: Any) -> Any:

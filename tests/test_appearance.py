@@ -16,12 +16,14 @@ from mudg.base.errors import InputError, NumericsError
 from mudg.base.run_folder import RunDir
 from mudg.core.native_ops import adam_columns
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.core.table import torch_adam_columns
+from mudg.core.table import Table, torch_adam_columns
 from mudg.data.scene import read_scene
 from mudg.models.scene.appearance import Appearance, owner, rigid_motion
-from mudg.models.scene.model import compose
+from mudg.models.scene.model import SceneModel, compose
+from mudg.models.scene.nodes import StaticNode
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
+from mudg.stages.fitting.finite import FiniteCheck
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 
 SIZE = (60, 40)
@@ -121,8 +123,9 @@ def test_only_the_image_of_a_step_moves(kernel):
 def test_a_non_finite_gradient_is_named():
     made = everything()
     made.tables["virtual"]["affine"].grad = torch.full((2, 3, 4), float("nan"))
+    scene = SceneModel(Table({"means": torch.zeros(1, 3)}), (StaticNode(),), None, (), 0)
     with pytest.raises(NumericsError, match=r"virtual.affine, view v/1, step 3"):
-        made.refuse_non_finite("v/1", 3)
+        FiniteCheck(3, at_once=True).gradients("v/1", scene, made)
     assert made.tables["virtual"]["affine"].grad is None
 
 

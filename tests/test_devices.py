@@ -52,6 +52,17 @@ def test_mps_is_refused_where_nothing_is_implemented_on_it():
         devices.choose_device("mps", "rasterizer")
 
 
+def test_memory_of_a_device_that_runs_out_is_an_error_with_a_remedy():
+    def fill():
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total")
+
+    with (
+        pytest.raises(ResourceError, match=r"fit: the memory of cuda:1 ran out[\s\S]*--width-px"),
+        devices.memory_of(torch.device("cuda", 1), "fit"),
+    ):
+        fill()
+
+
 def test_the_pretend_device_refuses_what_a_gpu_refuses():
     with pretend_device() as there:
         assert devices.choose_device("pretend", "fit") == there

@@ -26,6 +26,7 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_scene
+from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
@@ -33,6 +34,7 @@ from mudg.stages.config import FitConfig
 from mudg.stages.fitting import start as fit_start
 from mudg.stages.fitting import trust as fit_trust
 from mudg.stages.fitting import views as fit_views
+from mudg.stages.fitting.finite import FiniteCheck
 
 SIZE = (60, 40)
 FRAMES = 6
@@ -224,7 +226,6 @@ def test_perfect_virtual_views_help_off_the_path(world, tmp_path):
 
 
 def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeypatch):
-    before = {}
     sky_map = fit.losses.sky_map
     calls = {"count": 0}
 
@@ -232,20 +233,17 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
         calls["count"] += 1
         return sky_map(alpha, sky) * (float("nan") if calls["count"] == 5 else 1.0)
 
-    refuse = fit.finite_or_refuse
-
-    def snapshot(terms, view, step):
-        before["step"] = step
-        refuse(terms, view, step)
-
+    stepped = []
+    adam_step = fit.adam_step
+    monkeypatch.setattr(fit, "adam_step", lambda model, step, *rest: (stepped.append(step), adam_step(model, step, *rest)))
     monkeypatch.setattr(fit.losses, "sky_map", poisoned)
-    monkeypatch.setattr(fit, "finite_or_refuse", snapshot)
     with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/00000\d, step 5"):
         fit.run(settings(), world["scene"], world["fuse"], tmp_path / "fit")
-    assert before["step"] == 5
+    assert stepped == [1, 2, 3, 4]
 
 
-def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, at_once):
     scene = read_scene(world["scene"])
     frames = fit_views.training_frames(scene, ())
     classes = fit_views.classes_of(scene, frames, {})
@@ -253,8 +251,15 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
     model = fit_start.start_model(scene, fused_cloud(FRAMES), stored, classes, settings(start__gaussians=300))
     model.table["log_scales"].grad = torch.zeros_like(model.table["log_scales"])
     model.table["log_scales"].grad[3, 1] = float("inf")
+
+    def check_two_views():
+        check = FiniteCheck(9, at_once)
+        check.gradients("front/000001", model, Appearance({}))
+        check.gradients("front/000002", model, Appearance({}))
+        check.refuse()
+
     with pytest.raises(NumericsError, match=r"gaussians.log_scales, view front/000001, step 9"):
-        fit.gradients_or_refuse(model, "front/000001", 9)
+        check_two_views()
     assert model.table["log_scales"].grad is None
 
 

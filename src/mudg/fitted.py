@@ -41,15 +41,19 @@ class FittedScene:
         self._model = model
 
     @classmethod
-    def read(cls, folder: str | Path) -> FittedScene:
+    def read(cls, folder: str | Path, device: str = "auto") -> FittedScene:
         """Read the folder of a finished fit.
 
+        Args:
+            device: where it is rendered: ``auto`` (CUDA if there is one), ``cpu``, ``cuda``, ``cuda:N``.
+
         Raises:
-            InputError: not such a folder, or of another version. IntegrityError: a file was altered.
+            InputError: not such a folder, or of another version. IntegrityError: a file was altered. ResourceError: no such device.
         """
+        from mudg.core.raster.place import drawing_device
         from mudg.stages.fit import load_model
 
-        return cls(load_model(Path(folder)))
+        return cls(load_model(Path(folder)).to(drawing_device(device, "render")))
 
     @property
     def method(self) -> str:

@@ -259,7 +259,24 @@ FLAGS: dict[str, type[Common]] = {
     "convert": Convert, "adapt": Adapt, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
 }  # fmt: skip
 
-CHAINS: dict[str, type[Common]] = {"demo": DemoOwn, "run": RunOwn}
+
+@dataclass(frozen=True, kw_only=True)
+class RunListed(RunOwn):
+    """What ``mudg run --help`` lists: its own flags, and the setting that all steps share."""
+
+    device: str = "auto"
+    """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoListed(DemoOwn):
+    """What ``mudg demo --help`` lists: its own flags, and the setting that all steps share."""
+
+    device: str = "auto"
+    """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
+
+
+CHAINS: dict[str, type[Common]] = {"demo": DemoListed, "run": RunListed}
 """Commands that run several steps, with the flags that --help lists. --help-all adds some 200 settings of the steps."""
 
 

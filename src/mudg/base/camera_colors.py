@@ -7,6 +7,7 @@ generated, have those of their camera. The maps are found by `core/color_match.p
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 Triple = tuple[float, float, float]
@@ -41,7 +43,8 @@ class ColorMap:
 
     def of_image(self, rgb: Tensor) -> Tensor:
         """An image [3, H, W] mapped, differentiable, not clamped."""
-        return rgb * rgb.new_tensor(self.gain).view(3, 1, 1) + rgb.new_tensor(self.offset).view(3, 1, 1)
+        gain, offset = (_per_channel(values, rgb.dtype, rgb.device) for values in (self.gain, self.offset))
+        return rgb * gain + offset
 
     def of_bytes(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Colours u8[..., 3] mapped, rounded and clamped."""
@@ -102,6 +105,14 @@ class CameraColors:
 
 SAME_COLORS = CameraColors()
 """All cameras have the same colours."""
+
+
+@functools.lru_cache(maxsize=256)
+def _per_channel(values: Triple, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Three numbers as [3, 1, 1], sent to a device once."""
+    import torch
+
+    return torch.tensor(values, dtype=dtype).to(device).view(3, 1, 1)
 
 
 def _triple(values: Any) -> Triple:

@@ -10,8 +10,9 @@ Numpy arrays stay on the CPU. A stage moves tensors to the device in one place, 
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import StringConstraints
@@ -96,3 +97,17 @@ def described(device: torch.device) -> str:
         return {"cpu": "on the CPU"}.get(device.type, f"on {device}")
     free, total = torch.cuda.mem_get_info(device)
     return f"on {device} ({torch.cuda.get_device_name(device)}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free)"
+
+
+@contextlib.contextmanager
+def memory_of(device: torch.device, purpose: str) -> Iterator[None]:
+    """Within: memory of the device that runs out is a ResourceError with a remedy."""
+    import torch
+
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise ResourceError(
+            f"{purpose}: the memory of {device} ran out", got=str(error).split(". ")[0],
+            remedy="smaller images (--width-px), fewer Gaussians (--densify.max-gaussians), or --device cpu",
+        ) from error  # fmt: skip

@@ -5,14 +5,16 @@ OUT/fit/<method>   every fit      OUT/start/<method>   what a variant with other
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mudg.base.errors import UsageError
+from mudg.core.raster.place import drawing_device
 from mudg.methods import METHODS
 from mudg.stages import fit
-from mudg.stages.config import FitConfig
+from mudg.stages.config import BenchConfig, FitConfig
 from mudg.stages.run import WITHOUT_DIFFUSION, fits_of
 
 
@@ -28,6 +30,13 @@ def made(make: Callable[[bool], Path], overwrite: bool) -> Path:
         if not overwrite:
             raise
         return make(True)
+
+
+def at_once(config: BenchConfig) -> int:
+    """Logs that are processed at the same time: as many as asked for, else one per core, or one where they would share a GPU."""
+    if config.processes:
+        return config.processes
+    return os.cpu_count() or 1 if drawing_device(config.device, "benchmark").type == "cpu" else 1
 
 
 def learns_virtual(settings: FitConfig) -> bool:

@@ -28,11 +28,12 @@ import torch
 from numpy.typing import NDArray
 
 from mudg.base import geometry, log, seeds, store
-from mudg.base.config import to_dict
+from mudg.base.config import result_settings
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Scene, Track
 from mudg.core import metrics
 from mudg.core.fusion import fuse_sweeps
+from mudg.core.raster.place import drawing_device
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.city import CityConfig, write_city
 from mudg.data.scene import read_image, read_label, read_scene
@@ -97,8 +98,9 @@ def _rows_of_case(config: BenchConfig, scene: Scene, city: int, kind: str, out: 
 def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
     """A small, quick fit with poses "fixed", "learnt", or only "smoothed"."""
     return FitConfig(
-        method="street_gaussians", iterations=config.pose_iterations, seed=config.seed, preview_every=10**6, checkpoint_every=10**6,
-        start=StartConfig(gaussians=8000), densify=DensifyConfig(kind="none"), loss=RecordedLossConfig(semantic_every=1000),
+        method="street_gaussians", iterations=config.pose_iterations, seed=config.seed, device=config.device,
+        preview_every=10**6, checkpoint_every=10**6, start=StartConfig(gaussians=8000),
+        densify=DensifyConfig(kind="none"), loss=RecordedLossConfig(semantic_every=1000),
         poses=PoseConfig(learn=poses != "fixed", rounds=0 if poses == "smoothed" else PoseConfig().rounds),
     )  # fmt: skip
 
@@ -130,11 +132,12 @@ def disturbed(tracks: tuple[Track, ...], kind: str, seed: int) -> tuple[Track, .
 
 def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> fit.FitState:
     """Fit in memory; ``folder`` takes the log and the pictures."""
-    state = fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene))
-    run = RunDir.open(folder, fit.OUTPUT, to_dict(config), {})
+    device = drawing_device(config.device, "fit", config.raster)
+    state = fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene)).to(device)
+    run = RunDir.open(folder, fit.OUTPUT, result_settings(config), {})
     if not run.fresh:  # the fit starts again, and so does its log
         run.discard()
-        run = RunDir.open(folder, fit.OUTPUT, to_dict(config), {})
+        run = RunDir.open(folder, fit.OUTPUT, result_settings(config), {})
     fit.optimise(state, config, run)
     return state
 

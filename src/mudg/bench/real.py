@@ -14,7 +14,6 @@ hiding, the verbs of the chain are run with folders of their own. They are given
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +28,7 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, is_temporary, refuse_overlap
 from mudg.base.types import Scene
 from mudg.bench import real_measure, real_page, real_tables, real_truth
-from mudg.bench.chain import FitChain, learns_virtual, made
+from mudg.bench.chain import FitChain, at_once, learns_virtual, made
 from mudg.bench.real_protocols import (
     PROTOCOLS,
     SPLITS,
@@ -56,6 +55,7 @@ from mudg.stages.config import (
     IngestConfig,
     RenderConfig,
     SynthesizeConfig,
+    on_device,
 )
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, "street_gaussians", "mudg_r", "mudg_s"
@@ -165,7 +165,7 @@ def run(
         out, {"model": mdm_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}}
     )
     _refuse_foreign(Path(out))
-    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed)
+    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed, device=config.device)
     training = replace(
         adaptation or AdaptConfig(), model=config.model, precision=config.precision, processes=1, seed=config.seed
     )
@@ -176,12 +176,12 @@ def run(
     splits = tuple(dict.fromkeys(protocol.split for protocol in protocols))
     jobs = [
         SplitJob(
-            Path(out) / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, usual, generator,
-            training, config.shown, overwrite,
+            Path(out) / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, usual,
+            on_device(generator, config.device), on_device(training, config.device), config.shown, overwrite,
         )
         for name, scene in scenes.items() for split in splits
     ]  # fmt: skip
-    found = _run_jobs(jobs, config.processes or os.cpu_count() or 1)
+    found = _run_jobs(jobs, at_once(config))
     entries = [
         _entry_of(name, path, [f for j, f in zip(jobs, found) if j.out.name == name]) for name, path in scenes.items()
     ]
@@ -209,7 +209,7 @@ def rows_of(config: BenchConfig) -> tuple[RealMethod, ...]:
         raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
     wanted = {*config.methods, *(ABLATION if config.ablation else ())}
     rows = [row for row in METHOD_ROWS if row.name in wanted]
-    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed)
+    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed, device=config.device)
     for text in config.variant:
         changed = variant_of(text, usual)
         learns = changed.fit is not None and learns_virtual(changed.fit)
@@ -267,7 +267,7 @@ def _scene_of(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> 
 
 
 def _row_values(row: RealMethod) -> dict[str, Any]:
-    changes = None if row.changes is None else configuration.to_dict(row.changes)
+    changes = None if row.changes is None else configuration.result_settings(row.changes)
     return {"name": row.name, "title": row.title, "fit": row.fit, "sees": row.sees, "changes": changes}
 
 
@@ -349,7 +349,7 @@ def make_split(job: SplitJob) -> dict[str, Any]:
             scored = job.out / "score" / protocol.name / row.name
             made(
                 lambda o, p=protocol, v=views, s=scored: real_measure.write_scores(
-                    p, job.source, truths[p.name], v, s, overwrite=o
+                    p, job.source, truths[p.name], v, s, overwrite=o, device=job.usual.device
                 ),
                 job.overwrite,
             )
@@ -367,7 +367,7 @@ def write_seen(job: SplitJob, whole: Scene, held: HeldOut) -> None:
     inputs = {"log": store.digest(job.source)}
     shown = job.folder / "shown"
     _write(job, shown, inputs, lambda root: write_part(whole, root, frames, sweeps))
-    settings = AnnotateConfig(processes=1)
+    settings = on_device(AnnotateConfig(processes=1), job.usual.device)
     labels = shown
     if not all(annotate.wanted_labels(settings) <= set(f.labels) for f in whole.frames if f.id in frames):
         labels = job.folder / "annotate"
@@ -407,7 +407,7 @@ def _asked_cameras(job: SplitJob, whole: Scene, held: HeldOut) -> tuple[str, ...
 def views_of(job: SplitJob, row: RealMethod, cameras: tuple[str, ...]) -> tuple[Path, DiffusionUse | None]:
     """The folder with a method's views at all places that are asked for, made if need be; and how it used the diffusion model."""
     places = job.folder / "asked" if (job.folder / "asked").is_dir() else job.scene
-    drawn = RenderConfig(cameras=cameras, shifts_m=job.split.shifts_m, video=False)
+    drawn = RenderConfig(cameras=cameras, shifts_m=job.split.shifts_m, video=False, device=job.usual.device)
     if row.name == FILL:
         paths = render.trajectories(read_scene(places), drawn)
         fill = job.folder / FILL

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import log, store
+from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Observation, Scene, View
@@ -226,9 +227,13 @@ COLUMNS: Final[dict[str, Column]] = {
 
 
 def write_scores(
-    protocol: Protocol, source: Path, truth: Path, views: Path, out: Path, *, overwrite: bool = False
+    protocol: Protocol, source: Path, truth: Path, views: Path, out: Path, *, overwrite: bool = False, device: str = "cpu"
 ) -> Path:
-    """Score a method's views (folders of observations) of a log; writes its values and its pictures for the page."""
+    """Score a method's views (folders of observations) of a log; writes its values and its pictures for the page.
+
+    Args:
+        device: of the network behind the perceptual distance.
+    """
     refuse_overlap(out, {"log": source, "truth": truth, "views": views})
     inputs = {"log": store.digest(source), "truth": store.digest(truth), "views": store.digest(views)}
     asked = {"protocol": protocol.name, "columns": list(protocol.columns), "perceptual_views": PERCEPTUAL_VIEWS}
@@ -239,9 +244,10 @@ def write_scores(
     finder = _Finder(views)
     sums: dict[str, dict[str, Sum]] = {}
     sampled = perceptual_views(targets)
-    features = (
-        PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec)) if sampled and _wants(protocol) else None
-    )
+    features = None
+    if sampled and _wants(protocol):
+        there = choose_device(device, "networks of the scores")
+        features = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=there)
     with log.task(f"score {protocol.name}", len(targets)) as bar:
         for number in range(len(targets)):
             target = targets.load(number, scene)

@@ -12,7 +12,6 @@ one thread.
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +28,7 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, is_temporary, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
-from mudg.bench.chain import FitChain, learns_virtual, made
+from mudg.bench.chain import FitChain, at_once, learns_virtual, made
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
@@ -46,6 +45,7 @@ from mudg.stages.config import (
     RenderConfig,
     ScoreConfig,
     SynthesizeConfig,
+    on_device,
 )
 from mudg.stages.run import CONTINUED_SHARE
 
@@ -129,12 +129,13 @@ def run(
         processes=1,
         seed=config.seed,
     )
+    painted = on_device(painted, config.device)
     renders, usual = mdm_files.uses_renders(config.model), usual_fit(config)
     jobs = [
         LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, usual, painted, renders, config.videos, overwrite)
         for seed in seeds
     ]  # fmt: skip
-    logs = _run_jobs(jobs, config.processes or os.cpu_count() or 1)
+    logs = _run_jobs(jobs, at_once(config))
     document = shift_tables.document(logs, rows_as_values(rows), list(distances_m), settings_of(config, rules))
     store.write_json(Path(out) / "bench.json", document)
     store.write_text(Path(out) / "bench.md", shift_tables.markdown(document))
@@ -164,7 +165,7 @@ def _refuse_foreign(out: Path) -> None:
 
 def usual_fit(config: BenchConfig) -> FitConfig:
     """The settings of fits, as ``mudg run`` takes them for the whole chain."""
-    return FitConfig(method=WITH, iterations=config.iterations, seed=config.seed)
+    return FitConfig(method=WITH, iterations=config.iterations, seed=config.seed, device=config.device)
 
 
 def rows_of(config: BenchConfig) -> tuple[Row, ...]:
@@ -215,7 +216,7 @@ def variant_of(text: str, plain: FitConfig) -> Row:
 def rows_as_values(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """The rows for JSON."""
     return [
-        {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.to_dict(r.fit)} for r in rows
+        {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.result_settings(r.fit)} for r in rows
     ]
 
 
@@ -254,7 +255,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
     if any(row.name == DIFFUSION or (row.fit is not None and learns_virtual(row.fit)) for row in job.rows):
         first = job.fits.first() if job.renders else None
         made(lambda o: synthesize.run(job.synthesize, scene, fused, painted, fitted=first, overwrite=o), job.overwrite)
-    drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False)
+    drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False, device=job.usual.device)
     paths = render.trajectories(read_scene(scene), drawn)
     truth = out / "truth"
     made(lambda o: score_truth.write_truth(scene, paths, truth, overwrite=o), job.overwrite)
@@ -295,7 +296,7 @@ def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajec
 
 def _scores_of(job: LogJob, row: Row, views: Path) -> dict[str, Any]:
     """A method's values by distance, from a score of its own against the common truth."""
-    settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS)
+    settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS, device=job.usual.device)
     scene, truth, scored = job.out / "scene", job.out / "truth", job.out / "score" / row.name
     made(lambda o: score.run(settings, scene, {row.name: views}, scored, truth=truth, overwrite=o), job.overwrite)
     return {

@@ -55,10 +55,10 @@ def l1_map(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 @functools.lru_cache(maxsize=8)
-def _window(channels: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def _window(channels: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     weights = torch.exp(-(offset**2) / (2 * SSIM_SIGMA_PX**2))
-    weights = (weights / weights.sum()).to(dtype)
+    weights = (weights / weights.sum()).to(device, dtype)
     return (
         weights.view(1, 1, 1, -1).expand(channels, 1, 1, SSIM_WINDOW).contiguous(),
         weights.view(1, 1, -1, 1).expand(channels, 1, SSIM_WINDOW, 1).contiguous(),
@@ -72,7 +72,7 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     """
     _same_shape(prediction, target, "ssim_map")
     channels = prediction.shape[0]
-    row, column = _window(5 * channels, prediction.dtype)
+    row, column = _window(5 * channels, prediction.dtype, prediction.device)
     stack = torch.cat([prediction, target, prediction**2, target**2, prediction * target])[None]
     half = SSIM_WINDOW // 2
     blurred = F.conv2d(F.conv2d(stack, row, padding=(0, half), groups=5 * channels), column, padding=(half, 0), groups=5 * channels)
@@ -172,15 +172,18 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
     return F.cross_entropy(logits[None], target[None], ignore_index=UNLABELLED, reduction="none")[0]
 
 
-def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
+def class_loss(
+    logits: Tensor, target: Tensor, weight: Tensor, total: float | Tensor, lift: tuple[int, Tensor] | None = None
+) -> Tensor:
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
 
     ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
     """
     if lift is not None:
-        logits = logits.index_add(0, torch.tensor([lift[0]], device=logits.device), lift[1].detach()[None].to(logits.dtype))
+        channel = torch.full((1,), lift[0], device=logits.device)  # filled there: a list would be copied, and waited for
+        logits = logits.index_add(0, channel, lift[1].detach()[None].to(logits.dtype))
     labelled = torch.where((target >= 0) & (target < len(logits)), target, UNLABELLED)
-    return (semantic_map(logits, labelled) * weight).sum() / total
+    return (semantic_map(logits, labelled) * weight).sum() / (total.to(weight.dtype) if isinstance(total, Tensor) else total)
 
 
 def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) -> Tensor:

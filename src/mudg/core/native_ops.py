@@ -58,7 +58,9 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     return _WithGradient.apply(prediction, value, gradient)
 
 
-def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lift: tuple[int, Tensor] | None = None) -> Tensor:
+def class_loss(
+    logits: Tensor, target: Tensor, weight: Tensor, total: float | Tensor, lift: tuple[int, Tensor] | None = None
+) -> Tensor:
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``.
 
     Differentiable in the logits (once); everything else is data. The value does not depend on the number of threads.
@@ -67,7 +69,7 @@ def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lif
         logits: ``[C, H, W]``.
         target: i64[H, W] in 0..C-1; anything else (255) is unlabelled and counts nothing.
         weight: ``[H, W]``.
-        total: positive.
+        total: positive; a scalar tensor is read where the library computes, and stays on the device elsewhere.
         lift: a channel, and ``[H, W]`` to add to its logits.
 
     Raises:
@@ -89,7 +91,7 @@ def class_loss(logits: Tensor, target: Tensor, weight: Tensor, total: float, lif
     library.mudg_class_loss.restype = ctypes.c_double
     value = library.mudg_class_loss(
         *map(_address, (values, ids, weight, added)), ctypes.c_int(channel), ctypes.c_int(len(values)),
-        ctypes.c_int64(ids.numel()), ctypes.c_float(1.0 / total), _address(gradient), ctypes.byref(status),
+        ctypes.c_int64(ids.numel()), ctypes.c_float(1.0 / float(total)), _address(gradient), ctypes.byref(status),
     )  # fmt: skip
     if status.value != 0:
         raise ResourceError("not enough memory for the class loss", where=f"logits {tuple(values.shape)}")

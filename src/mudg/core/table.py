@@ -61,6 +61,25 @@ class Table:
             if value.shape[:1] != (rows,):
                 raise InputError("columns of a table differ in length", where=name, expected=f"{rows} rows", got=str(tuple(value.shape)))
 
+    # -- device -----------------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> torch.device:
+        """Where the columns, their moments and the labels are."""
+        return next(iter(self.columns.values())).device
+
+    def to(self, device: torch.device) -> Table:
+        """The same table, moments included, on a device; itself if it is there already. Gradients do not move."""
+        if self.device == device:
+            return self
+        there = Table(
+            {name: value.detach().to(device) for name, value in self.columns.items()},
+            {name: value.to(device) for name, value in self.labels.items()},
+        )
+        there.moment1 = {name: value.to(device) for name, value in self.moment1.items()}
+        there.moment2 = {name: value.to(device) for name, value in self.moment2.items()}
+        return there
+
     # -- row operations ---------------------------------------------------------------------------------------------
 
     def take(self, rows: Tensor) -> None:
@@ -153,15 +172,16 @@ def torch_adam_columns(columns: Sequence[AdamColumn], step: int, rows: Tensor | 
     """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place: the plain-torch kernel of ``Table.adam_step``."""
     for one in columns:
         whole = (one.parameter, one.moment1, one.moment2)
-        parameter, moment1, moment2 = whole if rows is None else (values[rows] for values in whole)
-        gradient = one.gradient if rows is None else one.gradient[rows]
+        parameter, moment1, moment2 = whole if rows is None else (values.clone() for values in whole)
+        gradient = one.gradient
         moment1.mul_(BETA1).add_(gradient, alpha=1 - BETA1)
         moment2.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
         denominator = (moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
         parameter.addcdiv_(moment1, denominator, value=-one.rate / (1 - BETA1**step))
         if rows is not None:
+            chosen = rows.view(-1, *[1] * (gradient.ndim - 1))  # chosen by a mask: counting rows would wait for the device
             for values, updated in zip(whole, (parameter, moment1, moment2)):
-                values[rows] = updated
+                values.copy_(torch.where(chosen, updated, values))
 
 
 def _leaf(value: Tensor) -> Tensor:

@@ -133,24 +133,31 @@ class LpipsFeatures(nn.Module):
 
     def __init__(self, state: Mapping[str, Tensor], where: str = "LPIPS weights") -> None:
         super().__init__()
-        self.kernels, self.biases, self.channel_weights = [], [], []
+        self.register_buffer("shift", torch.tensor(self.SHIFT).view(1, 3, 1, 1))
+        self.register_buffer("scale", torch.tensor(self.SCALE).view(1, 3, 1, 1))
         for stage, (place, out, into, size, _, _) in enumerate(self.LAYERS):
             named = f"net.slice{stage + 1}.{place}"
-            self.kernels.append(_tensor(state, f"{named}.weight", (out, into, size, size), where))
-            self.biases.append(_tensor(state, f"{named}.bias", (out,), where))
-            self.channel_weights.append(_tensor(state, f"lin{stage}.model.1.weight", (1, out, 1, 1), where).flatten())
+            self.register_buffer(f"kernel{stage}", _tensor(state, f"{named}.weight", (out, into, size, size), where))
+            self.register_buffer(f"bias{stage}", _tensor(state, f"{named}.bias", (out,), where))
+            weights = _tensor(state, f"lin{stage}.model.1.weight", (1, out, 1, 1), where).flatten()
+            self.register_buffer(f"weights{stage}", weights)
+
+    @property
+    def channel_weights(self) -> list[Tensor]:
+        """Weights per channel, by stage."""
+        return [self.get_buffer(f"weights{stage}") for stage in range(len(self.LAYERS))]
 
     def forward(self, rgb: Tensor) -> list[Tensor]:
         """Features ``[C, h, w]`` of the five stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
         if min(rgb.shape[-2:]) < self.SMALLEST_PX:
             size = f"{rgb.shape[-1]}x{rgb.shape[-2]}"
             raise InputError("an image is too small for LPIPS", expected=f"{self.SMALLEST_PX} pixels a side", got=size)
-        shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (self.SHIFT, self.SCALE))
-        x = (rgb[None].clamp(0, 1) * 2 - 1 - shift) / scale
+        x = (rgb[None].clamp(0, 1) * 2 - 1 - self.shift) / self.scale
         features = []
         for stage, (_, _, _, _, stride, padding) in enumerate(self.LAYERS):
             x = F.max_pool2d(x, 3, 2) if stage in self.POOLED else x
-            x = F.relu(F.conv2d(x, self.kernels[stage], self.biases[stage], stride, padding))
+            kernel, bias = self.get_buffer(f"kernel{stage}"), self.get_buffer(f"bias{stage}")
+            x = F.relu(F.conv2d(x, kernel, bias, stride, padding))
             features.append(x[0])
         return features
 
@@ -166,11 +173,14 @@ def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], wher
 class PerceptualDistance:
     """``lpips_distance`` of a pair's colours in the features of a network; threads may call it.
 
-    The same truth is compared with one method after another: each thread keeps its features until another truth comes.
+    The same truth is compared with one method after another: each thread keeps its features until another truth comes. Pairs come on the
+    CPU; what is compared goes to the device of the network here, and the number comes back.
     """
 
-    def __init__(self, features: nn.Module, weights: list[Tensor] | None = None) -> None:
-        self._features, self._weights = features, weights
+    def __init__(self, features: nn.Module, weights: list[Tensor] | None = None, device: torch.device | None = None) -> None:
+        self._device = device or torch.device("cpu")
+        self._features = features.to(self._device)
+        self._weights = None if weights is None else [weight.to(self._device) for weight in weights]
         self._known = threading.local()
 
     def __call__(self, pair: Pair) -> float | None:
@@ -179,7 +189,8 @@ class PerceptualDistance:
             return None
         with torch.no_grad():
             if getattr(self._known, "image", None) is not pair.truth_rgb:
-                self._known.features = unit_features(self._features(pair.truth_rgb))
+                self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))
                 self._known.image = pair.truth_rgb
-            distance = lpips_distance(self._features(pair.rgb), self._known.features, pair.mask, self._weights, over_weight=True)
+            made, mask = self._features(pair.rgb.to(self._device)), None if pair.mask is None else pair.mask.to(self._device)
+            distance = lpips_distance(made, self._known.features, mask, self._weights, over_weight=True)
             return float(distance)

@@ -15,7 +15,6 @@ With ``start`` it goes on with a finished fit (``fitting/continued.py``).
 from __future__ import annotations
 
 import contextlib
-import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -28,13 +27,15 @@ import torch
 from torch import Tensor
 
 from mudg.base import checkpoint, log, palette, store
-from mudg.base.config import to_dict
-from mudg.base.errors import NumericsError, UsageError
+from mudg.base.config import result_settings
+from mudg.base.devices import memory_of
+from mudg.base.errors import UsageError
 from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import FusedCloud, Gaussians, Render, Scene
 from mudg.core import losses, metrics, native_ops
 from mudg.core.pictures import panels_of
+from mudg.core.raster.place import drawing_device
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet
@@ -55,6 +56,7 @@ from mudg.stages.fitting.continued import (
     continued_model,
     whole_run,
 )
+from mudg.stages.fitting.finite import FiniteCheck
 from mudg.stages.fitting.kept import chosen_ahead, keep, recorded_bytes, scratch_folder, virtual_bytes
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
@@ -133,13 +135,14 @@ def run(
         inputs |= {name: store.digest(folder) for name, folder in named.items()}
     if config.virtual.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
-    folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)
+    folder = RunDir.open(out, OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     if begun is not None:
         config = whole_run(config)
-    with one_torch_thread():
-        state = _prepare(config, FitInputs(Path(scene), Path(fused), virtual, begun), folder.path)
+    device = drawing_device(config.device, "fit", config.raster)
+    with one_torch_thread(), memory_of(device, "fit"):
+        state = _prepare(config, FitInputs(Path(scene), Path(fused), virtual, begun), folder.path).to(device)
         with contextlib.closing(state.views):
             optimise(state, config, folder)
             add_certainty(state, config)
@@ -164,6 +167,16 @@ class FitState:
     appearance: Appearance = field(default_factory=lambda: Appearance({}))
     begun_at: int = 0
     """Steps of the schedule that counted as done when the fit began: above 0 where it goes on with a finished one."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is that a step changes; views are sent there one by one."""
+        return self.model.device
+
+    def to(self, device: torch.device) -> FitState:
+        """The same state on a device."""
+        model, stats, appearance = self.model.to(device), self.stats.to(device), self.appearance.to(device)
+        return replace(self, model=model, stats=stats, appearance=appearance)
 
     def summary(self) -> dict[str, Any]:
         """For run.json."""
@@ -218,7 +231,7 @@ def recorded_views(
 
 
 def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]) -> FitState:
-    """The state that a fit starts from: a model built from the fused cloud, nothing corrected yet."""
+    """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
     model = start_model(scene, cloud, views.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
     stats = DensifyStats.zeros(len(model.table))
@@ -258,7 +271,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
-    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual)
+    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual, state.device)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
 
@@ -269,7 +282,8 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     with (
         log.task(f"fit {config.method}", config.iterations, state.step) as bar,
         Interruption() as interruption,
-        chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1)) as upcoming,
+        # The one way to the device; results come back in fitting/rendering.py.
+        chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1), state.device) as upcoming,
     ):
         while state.step < config.iterations:
             began = time.perf_counter()
@@ -277,7 +291,9 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
                 start_unseen_gaussians(state, config, raster)
             views = next(upcoming)
-            learnt = [_learn_from(state, view, config, raster, perception, step, view is views[0]) for view in views]
+            check = FiniteCheck(step, at_once=state.device.type == "cpu")
+            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views]
+            check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
             state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
@@ -304,17 +320,30 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 interruption.stop_now()
 
 
-def _learn_from(
-    state: FitState, view: TrainView, config: FitConfig, raster: RasterConfig, perception: Perception, step: int, first: bool
-) -> tuple[Render, dict[str, Tensor]]:
-    """Render a view and add the gradients of its loss to the parameters'.
+@dataclass(frozen=True)
+class LearnStep:
+    """What a step does with each of its views.
 
     Args:
+        check: takes what must be finite.
         first: whether it is the first view of this step; terms that do not depend on the view count with it.
+    """
+
+    config: FitConfig
+    raster: RasterConfig
+    perception: Perception
+    check: FiniteCheck
+    step: int
+    first: bool
+
+
+def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Render, dict[str, Tensor]]:
+    """Render a view and add the gradients of its loss to the parameters'.
 
     Returns:
         The picture, and the weighted loss terms.
     """
+    config, step, raster = how.config, how.step, how.raster
     recorded = view.kind == "recorded"
     feeds_densify = recorded or config.virtual.densify
     growing = feeds_densify and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
@@ -322,12 +351,11 @@ def _learn_from(
     gaussians = compose(state.model, view.view.time_s, with_classes)
     pose = state.appearance.world_from_cam(view.view, view.name) if recorded else None
     render = rasterize(gaussians, view.view, raster, absgrad=growing, world_from_cam=pose)
-    terms = recorded_terms(state, render, view, config) if recorded else virtual_terms(state, render, view, config, perception)
-    terms |= (regularisers(gaussians, config) if first else {}) | correction_terms(state, gaussians, view, config, raster, step)
-    finite_or_refuse(terms, view.name, step)
+    terms = recorded_terms(state, render, view, config) if recorded else virtual_terms(state, render, view, config, how.perception)
+    terms |= (regularisers(gaussians, config) if how.first else {}) | correction_terms(state, gaussians, view, config, raster, step)
+    how.check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
-    gradients_or_refuse(state.model, view.name, step)
-    state.appearance.refuse_non_finite(view.name, step)
+    how.check.gradients(view.name, state.model, state.appearance)
     if growing:
         camera = view.view.camera
         state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0])
@@ -338,9 +366,10 @@ def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterCon
     """When virtual views join: start Gaussians at the surfaces that only they show (see ``fitting/trust.py``)."""
     unseen = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
     columns, labels, share = unseen_rows(state.model, unseen, config.virtual.gaussians, config.seed)
-    state.model.table.append(columns, labels)
+    there = [{name: value.to(state.device) for name, value in of.items()} for of in (columns, labels)]
+    state.model.table.append(*there)
     state.model.sort_rows()
-    state.stats = DensifyStats.zeros(len(state.model.table))
+    state.stats = DensifyStats.zeros(len(state.model.table), state.device)
     log.info(f"virtual views: {share:.0%} of their pixels show what no recorded view saw")
 
 
@@ -357,14 +386,15 @@ def recorded_terms(state: FitState, render: Render, view: TrainView, config: Fit
     """
     weights = config.loss
     labels = view.confidence * view.mask
-    rgb = losses.outside_mask_copied(_picture(state, render, view), view.rgb, None if view.mask.all() else view.mask)
+    everywhere = state.device.type == "cpu" and bool(view.mask.all())  # to ask another device is to wait for it
+    rgb = losses.outside_mask_copied(_picture(state, render, view), view.rgb, None if everywhere else view.mask)
     terms = {"color": native_ops.photometric(rgb, view.rgb, weights.ssim_weight)}
     if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
         terms["lidar"] = weights.lidar_weight * losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
     if view.sky is not None and weights.sky_weight and state.model.sky is not None:
         terms["sky"] = weights.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, view.sky), labels)
     if render.extra is not None and view.channels is not None and weights.semantic_weight:
-        total = max(float(labels.sum()), 1e-12) / weights.semantic_weight
+        total = labels.sum().double().clamp_min(1e-12) / weights.semantic_weight
         terms["semantics"] = native_ops.class_loss(render.extra, view.channels, labels[0], total, sky_lift(state.model, render.alpha))
     return terms
 
@@ -419,7 +449,7 @@ def correction_terms(
         terms["exposure"] = config.appearance.exposure_weight * distance
     if config.loss.object_weight and view.kind == "recorded" and _settled(state.schedule, step) and len(state.model.nodes) > 1:
         alpha = rasterize(objects_only(gaussians), view.view, raster).alpha
-        inside = boxes_in_view(state.model, view.view)
+        inside = boxes_in_view(state.model, view.view).to(state.device, non_blocking=True)
         terms["objects"] = config.loss.object_weight * losses.object_map(alpha, inside).mean()
     return terms
 
@@ -435,27 +465,6 @@ def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
     for node in model.nodes:
         if isinstance(node, RigidNode):
             node.after_step(share)
-
-
-def finite_or_refuse(terms: Mapping[str, Tensor], view: str, step: int) -> None:
-    """NumericsError naming term, view and step if a loss term is not finite; nothing has been changed by then."""
-    for name, value in terms.items():
-        if not math.isfinite(value.item()):
-            raise NumericsError(f"the loss term {name!r} is not finite", where=f"view {view}, step {step}",
-                got=str(value.item()),
-                remedy="check this view's image and labels; the parameters are those of the step before")  # fmt: skip
-
-
-def gradients_or_refuse(model: SceneModel, view: str, step: int) -> None:
-    """NumericsError naming the parameter if a gradient is not finite; the parameters have not been touched."""
-    for owner, table in {"gaussians": model.table, **model.node_tables()}.items():
-        for name, gradient in table.gradients().items():
-            # A sum is the cheapest pass over memory there is; it may overflow, so what it finds is counted.
-            if not math.isfinite(gradient.sum().item()) and (count := int((~torch.isfinite(gradient)).sum())):
-                table.clear_gradients()
-                raise NumericsError("a gradient is not finite", where=f"{owner}.{name}, view {view}, step {step}",
-                    got=f"{count} values",
-                    remedy="the parameters are those of the step before; report the scene, or leave this view out")  # fmt: skip
 
 
 # ---- the optimiser ---------------------------------------------------------------------------------------------------
@@ -483,7 +492,7 @@ def _densify_if_due(state: FitState, config: FitConfig, step: int) -> dict[str, 
         if schedule.reset_due(step):
             reset_opacity(model, schedule)
     if report:
-        state.stats = DensifyStats.zeros(len(model.table))
+        state.stats = DensifyStats.zeros(len(model.table), model.device)
     return report
 
 
@@ -507,7 +516,8 @@ def _progress(state: FitState, view: TrainView, render: Render, terms: Mapping[s
     with torch.no_grad():
         rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
         psnr = metrics.psnr(rgb, view.rgb, view.mask)
-    return {"psnr": round(min(psnr, 99.0), 3), **{f"loss_{name}": round(value.item(), 6) for name, value in terms.items()}}
+        values = torch.stack(list(terms.values())).tolist()
+    return {"psnr": round(min(psnr, 99.0), 3), **{f"loss_{name}": round(value, 6) for name, value in zip(terms, values)}}
 
 
 def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:

@@ -10,12 +10,14 @@ import math
 from pathlib import Path
 
 from mudg.base import log, store
-from mudg.base.config import to_dict
+from mudg.base.config import result_settings
+from mudg.base.devices import memory_of
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
+from mudg.core.raster.place import drawing_device
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.exporters.video import write_mp4
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
@@ -41,16 +43,17 @@ def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite:
     """
     refuse_overlap(out, {"scene": scene, "model": model})
     inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
-    folder = RunDir.open(out, _OUTPUT, to_dict(config), inputs, overwrite)
+    folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    fitted = load_model(Path(model))
+    device = drawing_device(config.device, "render", config.raster)
+    fitted = load_model(Path(model)).to(device)
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)
     source = str(fitted.facts.get("method", "fit"))
     paths = trajectories(read_scene(Path(scene)), config)
     try:
-        with log.task(f"render {source}", sum(len(path) for path in paths)) as bar:
+        with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
             for path in paths:
                 _render_trajectory(fitted, path, config, folder.path / path.name, source, bar)
                 if config.video:

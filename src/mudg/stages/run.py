@@ -17,7 +17,7 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.run_folder import is_temporary, refuse_overlap
 from mudg.base.versions import environment, version
-from mudg.stages.config import FitConfig, RunConfig
+from mudg.stages.config import FitConfig, RunConfig, with_device
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
@@ -73,6 +73,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     _refuse_overlap(config, source, out)
     torch.set_num_threads(native.default_threads())
     ledger = _Ledger.open(out, config, str(source), overwrite)
+    config = with_device(config)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
         for step in _steps(config, scene, out, overwrite):
@@ -264,12 +265,12 @@ class _Ledger:
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
         """Open or begin the ledger of ``out``; UsageError if it belongs to other settings, or the folder to something else."""
-        asked = {"verb": "run", "source": source, **configuration.to_dict(config)}
+        asked = {"verb": "run", "source": source, **configuration.result_settings(config)}
         before: dict[str, Any] = {}
         known = out / "run.json"
         if known.is_file():
             before = cls._read(known)
-            if before["asked"] == asked:
+            if configuration.without_devices(before["asked"]) == asked:
                 pass
             elif overwrite:
                 before = {}

@@ -23,6 +23,7 @@ from torch import Tensor
 from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, palette, store
+from mudg.base.devices import choose_device
 from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import computed_ahead
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
@@ -130,7 +131,7 @@ def run(
     }
     given = {"scene": scene, **methods, **{name: path for name, path in others.items() if path is not None}}
     inputs = {name: store.digest(path) for name, path in given.items()}
-    work = RunDir.open(out, _OUTPUT, configuration.to_dict(config), inputs, overwrite)
+    work = RunDir.open(out, _OUTPUT, configuration.result_settings(config), inputs, overwrite)
     if work.complete:
         return work.reused()
     recorded = read_scene(scene)
@@ -162,11 +163,14 @@ def run(
 def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     """The rows that need weights and have them."""
     found: dict[str, PairDistance] = {}
+    if not (config.perceptual_views or config.lpips_weights):
+        return found
+    device = choose_device(config.device, "networks of the scores")
     if config.perceptual_views:
-        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec))
+        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=device)
     if config.lpips_weights:
         network = lpips_network(config.lpips_weights)
-        found["lpips"] = PerceptualDistance(network, network.channel_weights)
+        found["lpips"] = PerceptualDistance(network, network.channel_weights, device)
     return found
 
 

@@ -19,7 +19,7 @@ from typing import Any, Final, Literal
 import torch
 from torch import Tensor
 
-from mudg.base.errors import InputError, NumericsError
+from mudg.base.errors import InputError
 from mudg.base.types import View
 from mudg.core import losses
 from mudg.core.table import AdamKernel, Table
@@ -69,6 +69,10 @@ class Appearance:
     def __bool__(self) -> bool:
         return bool(self.tables)
 
+    def to(self, device: torch.device) -> Appearance:
+        """The same corrections, with their moments, on a device."""
+        return Appearance(self.names, {group: table.to(device) for group, table in self.tables.items()})
+
     # -- use ----------------------------------------------------------------------------------------------------------
 
     def colored(self, rgb: Tensor, name: str, kind: str) -> Tensor:
@@ -90,7 +94,8 @@ class Appearance:
         if row is None:
             return None
         shift, turn = (self.tables[CAMERA_POSE][name][row] for name in ("shift", "turn"))
-        return torch.from_numpy(view.world_from_cam.copy()).to(shift.dtype) @ rigid_motion(shift, turn)
+        given = torch.from_numpy(view.world_from_cam.copy()).to(shift.dtype)
+        return given.to(shift.device, non_blocking=True) @ rigid_motion(shift, turn)
 
     def _affine(self, name: str, kind: str) -> Tensor | None:
         """Difference ``[3, 4]`` of the view's colour map from the identity."""
@@ -103,15 +108,6 @@ class Appearance:
             raise InputError("a view has no colour map", where=name, expected=", ".join(list(rows)[:8]))
         affine = self.tables[group]["affine"]
         return affine[row] - affine.mean(0) if group == RECORDED_COLOR else affine[row]
-
-    def refuse_non_finite(self, view: str, step: int) -> None:
-        """NumericsError naming the correction if a gradient is not finite; nothing has been changed by then."""
-        for group, table in self.tables.items():
-            for name, gradient in table.gradients().items():
-                if not bool(torch.isfinite(gradient).all()):
-                    table.clear_gradients()
-                    raise NumericsError("a gradient is not finite", where=f"appearance {group}.{name}, view {view}, step {step}",
-                                        remedy="the parameters are those of the step before; leave this view out")  # fmt: skip
 
     # -- learning -----------------------------------------------------------------------------------------------------
 
@@ -154,7 +150,7 @@ def rigid_motion(shift_m: Tensor, turn_rad: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
     top = torch.cat([torch.matrix_exp(skew), shift_m[:, None]], 1)
-    return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+    return torch.cat([top, torch.eye(4, dtype=top.dtype, device=top.device)[3:]])
 
 
 def _identity(group: str, rows: int) -> Table:

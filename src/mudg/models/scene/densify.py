@@ -12,6 +12,7 @@ count (``stages/fit.py``: recorded views only, see ``Observation.kind``). ``mode
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -78,9 +79,13 @@ class DensifyStats:
     seen: Tensor
 
     @classmethod
-    def zeros(cls, rows: int) -> DensifyStats:
-        """Nothing seen yet."""
-        return cls(torch.zeros(rows), torch.zeros(rows))
+    def zeros(cls, rows: int, device: torch.device | None = None) -> DensifyStats:
+        """Nothing seen yet; ``device``: that of the rows (None: the CPU)."""
+        return cls(torch.zeros(rows, device=device), torch.zeros(rows, device=device))
+
+    def to(self, device: torch.device) -> DensifyStats:
+        """The same statistics on a device."""
+        return DensifyStats(self.gradient.to(device), self.seen.to(device))
 
     def observe(self, trace: RasterTrace, width: int, height: int, plain_from: int | None = None) -> None:
         """Add one backward pass (gradients in pixels; stored in units of half the image).
@@ -95,7 +100,7 @@ class DensifyStats:
         gradient = trace.abs_grad2d
         if plain_from is not None and plain_from < len(gradient) and trace.means2d.grad is not None:
             gradient = torch.cat([gradient[:plain_from], trace.means2d.grad[plain_from:]])
-        half_size = torch.tensor([width / 2, height / 2])
+        half_size = _half_size(width, height, gradient.device)
         visible = trace.visible
         length = torch.view_as_complex(gradient * half_size).abs()  # far faster than a norm over rows of two
         self.gradient += length * visible
@@ -111,6 +116,12 @@ class DensifyStats:
         return cls(tensors["gradient"].clone(), tensors["seen"].clone())
 
 
+@functools.lru_cache(maxsize=64)
+def _half_size(width: int, height: int, device: torch.device) -> Tensor:
+    """Half an image's width and height, sent to a device once."""
+    return torch.tensor([width / 2, height / 2]).to(device)
+
+
 def densify(model: SceneModel, stats: DensifyStats, step: int, settings: DensifySettings, run_seed: int) -> dict[str, Any]:
     """Clone, split and prune rows of the model's table in place; the caller starts new statistics.
 
@@ -124,11 +135,11 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
     largest = model.table["log_scales"].detach().amax(1).exp()
     split_rows = (grow & (largest > settings.split_above_m)).nonzero()[:, 0]
     clone_rows = (grow & (largest <= settings.split_above_m)).nonzero()[:, 0]
-    keep = torch.ones(len(model.table), dtype=torch.bool)
+    keep = torch.ones(len(model.table), dtype=torch.bool, device=model.device)
     keep[split_rows] = False
     for columns, labels in (copied_rows(model.table, clone_rows), *_halves(model, split_rows, step, run_seed)):
         model.table.append(columns, labels)
-    keep = torch.cat([keep, torch.ones(len(model.table) - len(keep), dtype=torch.bool)])
+    keep = torch.cat([keep, keep.new_ones(len(model.table) - len(keep))])
     doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
     pruned = int((doomed & keep).sum())
     model.table.take(keep & ~doomed)
@@ -157,7 +168,7 @@ def shorten_needles(table: Table, longest_to_middle: float) -> None:
 def _rows_to_grow(model: SceneModel, stats: DensifyStats, settings: DensifySettings) -> Tensor:
     """Bool[N]: rows over their threshold, the strongest first where the budget is short."""
     mean = stats.gradient / stats.seen.clamp_min(1)
-    static = torch.tensor([node.kind == "static" for node in model.nodes])[model.table.labels["node"].long()]
+    static = torch.tensor([node.kind == "static" for node in model.nodes]).to(model.device)[model.table.labels["node"].long()]
     relative = mean / torch.where(static, settings.static_gradient, settings.object_gradient)
     wanted = relative > 1
     budget = min(settings.max_rows - len(model.table), int(settings.growth * len(model.table)))
@@ -182,7 +193,7 @@ def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[t
     for half in (0, 1):
         columns, labels = copied_rows(model.table, rows)
         generator = seeds.torch_generator(run_seed, step, f"split half {half}")
-        noise = torch.randn(len(rows), 3, generator=generator)
+        noise = torch.randn(len(rows), 3, generator=generator).to(rows.device)  # drawn on the CPU: the same on every device
         local = torch.exp(columns["log_scales"]) * noise
         columns["means"] = columns["means"] + rotate(columns["quats"], local)
         columns["log_scales"] = columns["log_scales"] - torch.log(torch.tensor(SPLIT_SHRINK))
@@ -201,4 +212,4 @@ def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, 
     for index, node in enumerate(model.nodes):
         if isinstance(node, RigidNode):
             half_size[index] = torch.tensor(node.size_m) / 2 * box_margin + 0.1
-    return doomed | (means.abs() > half_size[table.labels["node"].long()]).any(1)
+    return doomed | (means.abs() > half_size.to(model.device)[table.labels["node"].long()]).any(1)

@@ -20,7 +20,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -105,15 +104,18 @@ def systematic_counts(weights: Tensor, total: int, offset: float) -> Tensor:
         i64[N] with sum ``total``.
     """
     if total == 0:
-        return torch.zeros(len(weights), dtype=torch.int64)
+        return torch.zeros(len(weights), dtype=torch.int64, device=weights.device)
     ends = torch.cumsum(weights.double(), 0)
     reached = torch.floor(ends / ends[-1] * total + offset).long().clamp(max=total)
-    return torch.diff(reached, prepend=torch.zeros(1, dtype=torch.int64))
+    return torch.diff(reached, prepend=reached.new_zeros(1))
 
 
 def order_of_place(means: Tensor) -> Tensor:
     """Row numbers i64[N] sorted by x, then y, then z: an order that belongs to the Gaussians, not to the table."""
-    return torch.from_numpy(np.lexsort(means.T.flip(0).numpy()))
+    order = torch.argsort(means[:, 2], stable=True)
+    for axis in (1, 0):
+        order = order[torch.argsort(means[order, axis], stable=True)]
+    return order
 
 
 def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_seed: int) -> dict[str, Any]:
@@ -161,9 +163,9 @@ def _draw_copies(
     order = order_of_place(table["means"].detach())
     order = order[torch.argsort(owner[order], stable=True)]
     offsets = seeds.numpy_rng(run_seed, step, "relocation").random(len(model.nodes) + 1)
-    copies = torch.zeros(len(table), dtype=torch.int64)
-    for index, block in enumerate(order.split(model.counts())):
-        wanted = int(dead[block].sum())
+    copies = torch.zeros(len(table), dtype=torch.int64, device=model.device)
+    dead_in = torch.bincount(owner[dead], minlength=len(model.nodes)).tolist()
+    for index, (block, wanted) in enumerate(zip(order.split(model.counts()), dead_in)):
         if wanted:
             copies[block] += systematic_counts(weights[block], wanted, float(offsets[index]))
     added = max(0, min(settings.max_rows - len(table), int(settings.growth * len(table))))
@@ -195,7 +197,8 @@ def drift(model: SceneModel, step: int, rate: float, settings: McmcSettings, run
     rows = (opacity < reach).nonzero()[:, 0]
     if len(rows) == 0:
         return
-    noise = torch.randn(len(rows), 3, generator=seeds.torch_generator(run_seed, step, "drift"))
+    # Drawn on the CPU: the same on every device. It is as long as the list of rows that are nearly transparent by now.
+    noise = torch.randn(len(rows), 3, generator=seeds.torch_generator(run_seed, step, "drift")).to(rows.device, non_blocking=True)
     means = table.columns["means"].detach()
     scales = table.columns["log_scales"].detach()[rows].exp()
     means[rows] += random_step(scales, table.columns["quats"].detach()[rows], opacity[rows], noise, rate, settings)

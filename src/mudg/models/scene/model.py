@@ -67,6 +67,18 @@ class SceneModel:
     colors: CameraColors = SAME_COLORS
     _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are, and all that is learnt."""
+        return self.table.device
+
+    def to(self, device: torch.device) -> SceneModel:
+        """The same scene, moments included, on a device; itself if it is there already."""
+        if self.device == device:
+            return self
+        sky, nodes = None if self.sky is None else self.sky.to(device), tuple(node.to(device) for node in self.nodes)
+        return replace(self, table=self.table.to(device), nodes=nodes, sky=sky, facts=dict(self.facts))
+
     def counts(self) -> list[int]:
         """Rows of each node, in order; counted again only when rows were taken or appended."""
         owner = self.table.labels["node"]
@@ -115,7 +127,7 @@ class SceneModel:
         kept = [index for index, node in enumerate(self.nodes) if node.name not in gone or node.kind == "static"]
         renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
-        owner = renumber[self.table.labels["node"].long()]
+        owner = renumber.to(self.device)[self.table.labels["node"].long()]
         rows = (owner >= 0).nonzero()[:, 0]
         labels = {key: value[rows] for key, value in self.table.labels.items()} | {"node": owner[rows]}
         table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, labels)
@@ -232,4 +244,4 @@ def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
 def composite_semantics(model: SceneModel, extra: Tensor, alpha: Tensor) -> Tensor:
     """Rendered class logits ``[C, H, W]`` with the sky's logit added where nothing covers it (``sky_lift``)."""
     lift = sky_lift(model, alpha)
-    return extra if lift is None else extra.index_add(0, torch.tensor([lift[0]], device=extra.device), lift[1][None])
+    return extra if lift is None else extra.index_add(0, torch.full((1,), lift[0], device=extra.device), lift[1][None])

@@ -7,6 +7,8 @@ faded or recoloured. A rigid node moves them with its box; a deformable one also
 
 from __future__ import annotations
 
+import copy
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Self
@@ -76,6 +78,10 @@ class StaticNode:
         """What rebuilds the node: plain JSON values and tensors."""
         return {"name": self.name}, {}
 
+    def to(self, device: torch.device) -> Self:
+        """The same node with what it learns on a device."""
+        return self
+
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> StaticNode:
         """Inverse of ``state``."""
@@ -90,6 +96,9 @@ class RigidNode:
     positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
 
     The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians. ``learn_pose``: whether a fit may change them.
+
+    Poses are worked out on the CPU, also where the offsets are on another device: a copy of them is kept here, and what moves the
+    rows at a time goes to their device once.
     """
 
     kind = "rigid"
@@ -107,6 +116,7 @@ class RigidNode:
         count = len(self.times_s)
         self.offsets = offsets or Table({"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)})
         self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
+        self._copied: tuple[Tensor, Tensor] | None = None
         self._quats = torch.from_numpy(np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])).float()
         self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
         self._positions = torch.from_numpy(self.world_from_object[:, :3, 3].copy()).float()
@@ -127,10 +137,25 @@ class RigidNode:
 
     # -- pose -------------------------------------------------------------------------------------------------------
 
+    def _offsets_here(self) -> tuple[Tensor, Tensor]:
+        """Shift and yaw on the CPU: the columns themselves, or the copy of those of another device."""
+        shift, yaw = self.offsets["shift"], self.offsets["yaw"]
+        if shift.device.type == "cpu":
+            return shift, yaw
+        if self._copied is None:
+            self._copied = shift.detach().cpu(), yaw.detach().cpu()
+        return self._copied
+
+    def offset_values(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The offsets: shift f64[K, 3] m and yaw f64[K] rad."""
+        shift, yaw = (values.detach().double().numpy() for values in self._offsets_here())
+        return shift, yaw
+
     def _key_pose(self, index: int) -> tuple[Tensor, Tensor]:
         """Corrected key: position ``[3]`` and unit quaternion ``[4]`` in the world."""
-        position = self._positions[index] + self._rotations[index] @ self.offsets["shift"][index]
-        half = self.offsets["yaw"][index] / 2
+        shift, yaw = self._offsets_here()
+        position = self._positions[index] + self._rotations[index] @ shift[index]
+        half = yaw[index] / 2
         zero = torch.zeros_like(half)
         turn = torch.stack([torch.cos(half), zero, zero, torch.sin(half)])
         return position, left_product_matrix(self._quats[index]) @ turn
@@ -148,7 +173,8 @@ class RigidNode:
         return after - 1, after, float((time_s - times[after - 1]) / (times[after] - times[after - 1]))
 
     def pose_at(self, time_s: float) -> tuple[Tensor, Tensor] | None:
-        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, differentiable in the offsets; None outside the span."""
+        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, on the CPU; differentiable in the offsets if they are there. None
+        outside the span."""
         found = self.keys_around(time_s)
         if found is None:
             return None
@@ -162,7 +188,7 @@ class RigidNode:
     @torch.no_grad()
     def corrected_keys(self, which: slice = slice(None)) -> NDArray[np.float64]:
         """The keys, or some of them, with their offsets: world_from_object f64[K, 4, 4]."""
-        shift, yaw = self.offsets["shift"][which].double().numpy(), self.offsets["yaw"][which].double().numpy()
+        shift, yaw = (values[which].double().numpy() for values in self._offsets_here())
         return self.world_from_object[which] @ np.stack([geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)])
 
     def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
@@ -177,14 +203,15 @@ class RigidNode:
     @torch.no_grad()
     def add_offsets(self, shift_m: NDArray[np.float64], yaw_rad: NDArray[np.float64]) -> None:
         """Move every key by ``shift_m`` [K, 3] and ``yaw_rad`` [K] in the frame of the box, in place."""
-        self.offsets["shift"].add_(torch.from_numpy(shift_m).float())
-        self.offsets["yaw"].add_(torch.from_numpy(yaw_rad).float())
+        for name, move in (("shift", shift_m), ("yaw", yaw_rad)):
+            self.offsets[name].add_(torch.from_numpy(move).float().to(self.offsets.device))
         self._placements.clear()
+        self._copied = None
 
     def settle(self) -> None:
         """Set the offsets to ``settled_offsets``: the best guess before any picture was seen."""
         shift, yaw = self.settled_offsets()
-        now = [self.offsets[name].detach().double().numpy() for name in ("shift", "yaw")]
+        now = self.offset_values()
         self.add_offsets(shift - now[0], yaw - now[1])
 
     def settled_offsets(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -215,12 +242,13 @@ class RigidNode:
         return replace(rows, means=torch.addmm(position, rows.means, rotation_t), quats=rows.quats @ product_t)
 
     def _placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``, remembered per time."""
+        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``, where the rows are;
+        remembered per time."""
         if time_s not in self._placements:
             with torch.no_grad():
                 pose = self.pose_at(time_s)
-            place = None if pose is None else (pose[0], rotation_matrix(pose[1]).T, left_product_matrix(pose[1]).T)
-            self._placements[time_s] = place
+            place = None if pose is None else (pose[0], rotation_matrix(pose[1]), left_product_matrix(pose[1]))
+            self._placements[time_s] = None if place is None else _sent(place, self.offsets.device)
         return self._placements[time_s]
 
     def parameters(self) -> Table | None:
@@ -229,6 +257,14 @@ class RigidNode:
 
     def after_step(self, share: float) -> None:
         """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning rate."""
+
+    def to(self, device: torch.device) -> Self:
+        """See ``StaticNode``. A copy, unless it is there already."""
+        if self.offsets.device == device:
+            return self
+        there = copy.copy(self)
+        there.offsets, there._placements, there._copied = self.offsets.to(device), {}, None
+        return there
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
         """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box stays."""
@@ -292,7 +328,7 @@ class DeformableNode(RigidNode):
         control = self.offsets["deform"][before]
         if after != before:
             control = torch.lerp(control, self.offsets["deform"][after], u)
-        place = 2 * means / means.new_tensor(self.size_m)
+        place = 2 * means / _size_there(self.size_m, means.dtype, means.device)
         moved = F.grid_sample(control[None], place[None, None, None], mode="bilinear", padding_mode="border", align_corners=True)
         return moved[0, :, 0, 0].T
 
@@ -310,6 +346,20 @@ class DeformableNode(RigidNode):
         deform *= 1 - share * DEFORM_DECAY
         if self.learn_pose:  # what moves as a whole is the pose's to explain
             deform -= deform.mean((2, 3, 4), keepdim=True)
+
+
+@functools.lru_cache(maxsize=256)
+def _size_there(size_m: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Size of a box as a tensor, sent to a device once."""
+    return torch.tensor(size_m, dtype=dtype).to(device)
+
+
+def _sent(place: tuple[Tensor, Tensor, Tensor], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """A position and two matrices, these transposed, on a device by one copy."""
+    if device.type != "cpu":
+        packed = torch.cat([part.flatten() for part in place]).to(device, non_blocking=True)
+        place = packed[:3], packed[3:12].view(3, 3), packed[12:].view(4, 4)
+    return place[0], place[1].T, place[2].T
 
 
 def object_node(track: Track, learn_pose: bool = False, deformable: bool = False) -> RigidNode:

@@ -50,7 +50,9 @@ class SkyNode:
         texel_rad = np.pi / self.rows
         stride = int(np.clip(0.7 * texel_rad * min(camera.fx, camera.fy), 1, 8))
         height, width = -(-camera.height // stride), -(-camera.width // stride)
-        grid = torch.from_numpy(self._grid(view, height, width)).to(self.table["panorama"])
+        here = self.table.device.type == "cpu"
+        grid = torch.from_numpy(self._grid(view, height, width)) if here else self._grid_there(view, height, width)
+        grid = grid.to(self.table["panorama"].dtype)
         padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
         return F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)[0]
 
@@ -61,6 +63,17 @@ class SkyNode:
         right, down, ahead = view.world_from_cam[:3, 0], view.world_from_cam[:3, 1], view.world_from_cam[:3, 2]
         rays = x[None, :, None] * right + (y[:, None, None] * down + ahead)
         return self.panorama_grid(rays, padding=1)
+
+    def _grid_there(self, view: View, height: int, width: int) -> Tensor:
+        """As ``_grid``, computed where the panorama is, from plain numbers: nothing is copied there."""
+        camera, device = view.camera.resized(width, height), self.table.device
+        columns, rows = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in (width, height))
+        across, down = geometry.pinhole_ray(camera.intrinsics, columns, rows)  # type: ignore[arg-type]
+        pose = view.world_from_cam[:3, :3].tolist()
+        x, y, z = (across * right + (down[:, None] * below + ahead) for right, below, ahead in pose)
+        span = 2 * self.rows / (2 * self.rows + 2)
+        longitude, elevation = torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))
+        return torch.stack([(longitude / np.pi) * span, -2 * elevation / np.pi], -1)
 
     def panorama_grid(self, directions_world: NDArray[np.float64], padding: int = 0) -> NDArray[np.float32]:
         """Directions ``[..., 3]`` to panorama positions ``[..., 2]`` in [-1, 1] (x: longitude, y: from up to down)."""
@@ -96,6 +109,10 @@ class SkyNode:
         rows_of, columns_of = nearest[0][:, columns : 2 * columns], nearest[1][:, columns : 2 * columns] % columns
         filled = mean.reshape(3, rows, columns)[:, rows_of, columns_of]
         self.table.columns["panorama"].detach().copy_(torch.from_numpy(filled).float()[None])
+
+    def to(self, device: torch.device) -> SkyNode:
+        """The same sky on a device."""
+        return SkyNode(self.table.to(device))
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """What rebuilds the sky: plain JSON values and tensors."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.fit import FitConfig
     from mudg.stages.config.learn import LearnConfig
     from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
-    from mudg.stages.config.run import DEMO_CITY, RunConfig, run_preset, with_lines, with_seed
+    from mudg.stages.config.run import DEMO_CITY, RunConfig, on_device, run_preset, with_device, with_lines, with_seed
     from mudg.stages.config.synthesize import SynthesizeConfig
     from mudg.stages.config.views import RenderConfig, ScoreConfig
 
@@ -32,6 +32,8 @@ _HOMES = {
     "DEMO_CITY": "mudg.stages.config.run",
     "RunConfig": "mudg.stages.config.run",
     "run_preset": "mudg.stages.config.run",
+    "on_device": "mudg.stages.config.run",
+    "with_device": "mudg.stages.config.run",
     "with_lines": "mudg.stages.config.run",
     "with_seed": "mudg.stages.config.run",
     "SynthesizeConfig": "mudg.stages.config.synthesize",
@@ -53,7 +55,9 @@ __all__ = [
     "RunConfig",
     "ScoreConfig",
     "SynthesizeConfig",
+    "on_device",
     "run_preset",
+    "with_device",
     "with_lines",
     "with_seed",
 ]

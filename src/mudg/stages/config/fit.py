@@ -9,6 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -181,6 +182,8 @@ class FitConfig:
     """Learn semantic classes where the scene has labels."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
+    device: DeviceName = "auto"
+    """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
     checkpoint_every: int = Field(default=500, ge=1)
     """Steps between checkpoints; an interrupted fit resumes at the last one. Large ones are rarer: they take at most a twentieth of
     the time."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import fields, is_dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 from mudg.stages.config.adapt import AdaptConfig
 from mudg.stages.config.fit import FitConfig
 from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
@@ -23,6 +24,9 @@ class RunConfig:
     adaptation: Literal["auto", "on", "off"] = "auto"
     """Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not for
     generated cities."""
+    device: DeviceName = "auto"
+    """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps
+    that one."""
     ingest: IngestConfig = Field(default_factory=IngestConfig)
     annotate: AnnotateConfig = Field(default_factory=AnnotateConfig)
     fuse: FuseConfig = Field(default_factory=FuseConfig)
@@ -62,6 +66,16 @@ def with_seed(config: RunConfig, seed: int) -> RunConfig:
     seeded = {n: replace(p, seed=seed) for n, p in parts.items() if any(f.name == "seed" for f in fields(p))}
     seeded["ingest"] = replace(config.ingest, city=replace(config.ingest.city, seed=seed))
     return replace(config, **seeded)
+
+
+def with_device(config: RunConfig) -> RunConfig:
+    """The same settings with the run's device in every step that leaves its own at auto."""
+    return replace(config, **{f.name: on_device(getattr(config, f.name), config.device) for f in fields(config)})
+
+
+def on_device(settings: Any, device: str) -> Any:
+    """The settings of a step on a device, unless they name one themselves or the step has none."""
+    return replace(settings, device=device) if getattr(settings, "device", "") == "auto" else settings
 
 
 def with_lines(

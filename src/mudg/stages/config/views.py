@@ -8,6 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -34,6 +35,8 @@ class RenderConfig:
     """Frames per second of the videos."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
+    device: DeviceName = "auto"
+    """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -52,3 +55,6 @@ class ScoreConfig:
     same views as the perceptual distance (empty = not computed)."""
     error_pictures: bool = True
     """Write an image of the colour error at the middle view of every trajectory."""
+    device: DeviceName = "auto"
+    """Device of the networks behind perceptual distance and LPIPS: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics
+    run on the CPU."""

@@ -81,9 +81,9 @@ def evidence_of(
     """What recorded views tell about every Gaussian, those that are left out like the others; see ``certainty_of``."""
     count = min(most or len(views), len(views))
     chosen = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
-    total = torch.zeros(5, len(model.table))
+    total = torch.zeros(5, len(model.table), device=model.device)
     for index in chosen:
-        sums = weight_sums(model, views[int(index)].as_tensors(), raster, appearance)
+        sums = weight_sums(model, views[int(index)].as_tensors(model.device), raster, appearance)
         total += torch.cat([(sums[:1] / (sums[:1] + 1)), sums])
     total *= len(views) / len(chosen)
     return PhotoEvidence(*total)
@@ -96,7 +96,7 @@ def weight_sums(
     with torch.no_grad():
         gaussians = compose(model, view.view.time_s, semantics=False)
         pose = None if appearance is None else appearance.world_from_cam(view.view, view.name)
-    features = torch.zeros(len(gaussians), 4, requires_grad=True)
+    features = torch.zeros(len(gaussians), 4, device=model.device, requires_grad=True)
     render = rasterize(replace(gaussians, extra=features), view.view, raster, world_from_cam=pose)
     if render.extra is None:
         raise ValueError("the renderer returned no features")

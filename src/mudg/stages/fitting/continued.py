@@ -83,7 +83,7 @@ def whole_run(config: FitConfig) -> FitConfig:
 
 
 def continued_model(start: StartFit, classes: Sequence[int], config: FitConfig) -> SceneModel:
-    """The model of a finished fit, with channels for all of ``classes`` (train ids) and no moments.
+    """The model of a finished fit, on the CPU, with channels for all of ``classes`` (train ids) and no moments.
 
     Raises:
         UsageError: it was fitted with other degrees of spherical harmonics.

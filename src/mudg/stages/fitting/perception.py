@@ -20,20 +20,20 @@ Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Render ``[3, H, W]`` and target ``[3, H, W]`` in [0, 1], weight ``[1, H, W]`` -> distance, differentiable in the render."""
 
 
-def perception_of(config: VirtualConfig) -> Perception:
-    """The distance that ``config.perception`` names.
+def perception_of(config: VirtualConfig, device: torch.device | None = None) -> Perception:
+    """The distance that ``config.perception`` names, of images on a device (None: the CPU).
 
     Raises:
         UsageError: LPIPS without a file of its weights. InputError: the file holds something else.
     """
     if config.perception == "filters":
-        return _compared(FilterBank(), losses.feature_distance)
+        return _compared(FilterBank().to(device), losses.feature_distance)
     if config.perception == "codec":
         codec = mdm_files.load("embedded").codec
-        return _compared(CodecFeatures(codec.requires_grad_(False)), _lpips())
+        return _compared(CodecFeatures(codec.requires_grad_(False)).to(device), _lpips())
     if not config.lpips_weights:
         raise UsageError("LPIPS needs a weight file", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
-    trunk = lpips_network(config.lpips_weights)
+    trunk = lpips_network(config.lpips_weights).to(device)
     return _compared(trunk, _lpips(trunk.channel_weights))
 
 

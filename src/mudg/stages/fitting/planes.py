@@ -14,8 +14,8 @@ FAR_M = 1000.0
 
 
 def render_planes(model: SceneModel, view: View) -> RenderPlanes:
-    """What a fitted scene shows at a view (without the leading dimension). In the sky coverage and certainty are 0; a scene fitted
-    by a version that measured no certainty counts as half certain wherever it covers."""
+    """What a fitted scene, on any device, shows at a view: on the CPU, without the leading dimension. In the sky coverage and certainty
+    are 0; a scene fitted by a version that measured no certainty counts as half certain wherever it covers."""
     seen = render_condition(model, view)
     solid = torch.isfinite(seen.depth)
     alpha = torch.where(solid, seen.alpha, 0.0)

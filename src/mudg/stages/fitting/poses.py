@@ -77,7 +77,7 @@ def refine_poses(
     }
     evidence = {index: PoseEvidence.none(len(node.times_s)) for index, node in learning.items()}
     for stored in views:
-        outlines = _outlines(learning, stored)
+        outlines = {index: mask.to(model.device, non_blocking=True) for index, mask in _outlines(learning, stored).items()}
         if outlines:
             _add_evidence(model, stored, outlines, evidence, raster, appearance)
     moves = [_move(node, evidence[index]) for index, node in learning.items() if evidence[index].views]
@@ -109,7 +109,7 @@ def _add_evidence(
     rows = {index: (here.node == index).nonzero()[:, 0] for index in outlines}  # type: ignore[operator]
     poses = {index: model.nodes[index].pose_matrix(time_s) for index in outlines}  # type: ignore[union-attr]
     color = _picture(model, here, stored, raster, appearance)
-    target = _blurred(torch.from_numpy(stored.rgb).permute(2, 0, 1).float() / 255)
+    target = _blurred(torch.from_numpy(stored.rgb).to(model.device, non_blocking=True).permute(2, 0, 1).float() / 255)
     changes = []
     for axis, step in enumerate(STEPS):
         moved = _displaced(here, rows, poses, axis, step)
@@ -164,11 +164,11 @@ def _displaced(
         if pose is None:
             continue
         world = pose @ move @ geometry.invert(pose)
-        rotation = torch.from_numpy(world[:3, :3]).float()
-        means[mine] = means[mine] @ rotation.T + torch.from_numpy(world[:3, 3]).float()
+        rotation, shift_m = (torch.from_numpy(part).float().to(means.device, non_blocking=True) for part in (world[:3, :3], world[:3, 3]))
+        means[mine] = means[mine] @ rotation.T + shift_m
         if axis == 3:
-            turn = torch.from_numpy(geometry.quaternion_from_matrix(world)).float()
-            quats[mine] = quats[mine] @ left_product_matrix(turn).T
+            turn = left_product_matrix(torch.from_numpy(geometry.quaternion_from_matrix(world)).float())
+            quats[mine] = quats[mine] @ turn.to(quats.device, non_blocking=True).T
     return replace(gaussians, means=means, quats=quats)
 
 
@@ -180,7 +180,7 @@ def _normal_equations(jacobian: Tensor, missing: Tensor) -> tuple[NDArray[np.flo
     sigma = max(COLOR_SIGMA, 1.4826 * float(missing.abs().median()))
     weight = COLOR_SHARE / sigma**2 * torch.clamp(2 * sigma / missing.abs().clamp_min(1e-9), max=1.0)
     weighted = jacobian * weight[:, None]
-    return (jacobian.T @ weighted).numpy(), (weighted.T @ missing).numpy()
+    return (jacobian.T @ weighted).cpu().numpy(), (weighted.T @ missing).cpu().numpy()
 
 
 def _move(node: RigidNode, evidence: PoseEvidence) -> NDArray[np.float64]:
@@ -191,7 +191,7 @@ def _move(node: RigidNode, evidence: PoseEvidence) -> NDArray[np.float64]:
     """
     keys, base = len(node.times_s), node.world_from_object
     settled = np.column_stack(node.settled_offsets())
-    now = np.column_stack([node.offsets[name].detach().double().numpy() for name in ("shift", "yaw")]) - settled
+    now = np.column_stack(node.offset_values()) - settled
     system = np.zeros((keys, 4, keys, 4))
     for key in range(keys):
         system[key, :, key, :] = evidence.matrix[key] + np.diag([TRUST_M**-2] * 3 + [TRUST_RAD**-2])

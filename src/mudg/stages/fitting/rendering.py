@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.models.scene.model import SceneModel, compose, composite_semantics, composite_sky
 
 NEAR_M = 0.2
+Rendered = TypeVar("Rendered")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,19 +41,19 @@ class RenderedCondition:
 def render_view(
     model: SceneModel, view: View, raster: RasterConfig, sky_below_alpha: float = 0.5, source: str = ""
 ) -> Observation:
-    """Render one view of a fitted scene as an observation of kind "virtual".
+    """Render one view of a fitted scene as an observation of kind "virtual", on the CPU.
 
     Where coverage is below ``sky_below_alpha``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
     sky has no depth. Confidence is the coverage (1 where the sky is a valid answer).
     """
-    return _observed(model, rasterize(compose(model, view.time_s), view, raster), view, sky_below_alpha, source)
+    return _brought_back(_observed(model, rasterize(compose(model, view.time_s), view, raster), view, sky_below_alpha, source))
 
 
 @torch.no_grad()
 def render_condition(
     model: SceneModel, view: View, raster: RasterConfig | None = None, sky_below_alpha: float = 0.5
 ) -> RenderedCondition:
-    """Render one view of a fitted scene with the certainty of its pixels; see ``render_view``."""
+    """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``."""
     gaussians, certainty = compose(model, view.time_s), model.certainty
     if certainty is not None:
         known = certainty.float()[:, None]
@@ -65,10 +67,19 @@ def render_condition(
         render = replace(render, extra=render.extra[:-1] if len(render.extra) > 1 else None)
     seen = _observed(model, render, view, sky_below_alpha)
     shape = render.alpha.shape[1:]
-    depth = torch.full(shape, torch.nan) if seen.depth is None else seen.depth[0]
-    unknown = torch.full(shape, palette.UNLABELLED, dtype=torch.uint8)
+    depth = render.alpha.new_full(shape, torch.nan) if seen.depth is None else seen.depth[0]
+    unknown = render.alpha.new_full(shape, palette.UNLABELLED, dtype=torch.uint8)
     semantics = unknown if seen.semantics is None else seen.semantics.to(torch.uint8)
-    return RenderedCondition(seen.rgb, depth, render.alpha[0], semantics, blended)
+    return _brought_back(RenderedCondition(seen.rgb, depth, render.alpha[0], semantics, blended))
+
+
+def _brought_back(result: Rendered) -> Rendered:
+    """The same with its tensors on the CPU: the one place where pictures leave the device."""
+    made: Any = result
+    tensors = {f.name: value for f in fields(made) if isinstance(value := getattr(made, f.name), Tensor)}
+    if all(value.device.type == "cpu" for value in tensors.values()):
+        return result
+    return replace(made, **{name: value.cpu() for name, value in tensors.items()})
 
 
 def _observed(model: SceneModel, render: Render, view: View, sky_below_alpha: float, source: str = "") -> Observation:
@@ -78,7 +89,7 @@ def _observed(model: SceneModel, render: Render, view: View, sky_below_alpha: fl
     semantics = None
     if render.extra is not None:
         channel = composite_semantics(model, render.extra, render.alpha).argmax(0)
-        semantics = torch.tensor(model.classes)[channel]
+        semantics = torch.tensor(model.classes).to(channel.device, non_blocking=True)[channel]
         if model.sky is not None:
             semantics = torch.where(covered[0], semantics, palette.ID["sky"])
             depth = torch.where(semantics[None] == palette.ID["sky"], torch.nan, depth)

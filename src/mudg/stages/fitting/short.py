@@ -11,10 +11,10 @@ WIDTHS = 2
 """Photographs are fitted at this many times the width of the clips that the renders are for."""
 
 
-def short_fit(iterations: int, clip_width_px: int, camera_width_px: int, seed: int) -> FitConfig:
+def short_fit(iterations: int, clip_width_px: int, camera_width_px: int, seed: int, device: str = "cpu") -> FitConfig:
     """A fit to recorded views alone, for renders in the conditions of clips `clip_width_px` wide."""
     return FitConfig(
         method="street_gaussians", iterations=iterations, width_px=min(WIDTHS * clip_width_px, camera_width_px), seed=seed,
-        preview_every=1_000_000, densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
+        device=device, preview_every=1_000_000, densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
         start=StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M),
     )  # fmt: skip

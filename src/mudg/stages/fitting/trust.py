@@ -70,7 +70,7 @@ def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
     small = view.resized(width, max(1, round(camera.height * width / camera.width)))
     render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
     depth = torch.where(render.alpha > 0.5, render.depth, torch.inf)
-    return _Witness(small, depth[0].numpy())
+    return _Witness(small, depth[0].cpu().numpy())
 
 
 def block_centres(size_px: int) -> NDArray[np.intp]:
@@ -104,8 +104,8 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
 def unseen_rows(
     model: SceneModel, unseen: Iterable[tuple[StoredView, NDArray[np.bool_]]], most: int, run_seed: int
 ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], float]:
-    """Table rows (columns, labels) at the surfaces that only virtual views show, thinned to one per place, at most ``most``; and the
-    mean share of pixels that show them.
+    """Table rows (columns, labels; on the CPU) at the surfaces that only virtual views show, thinned to one per place, at most
+    ``most``; and the mean share of pixels that show them.
 
     A point in the box of a dynamic object belongs to that object. Above ``MOST_SEEDS`` points, every second one goes on.
     """
@@ -131,7 +131,7 @@ def unseen_rows(
         columns.append(points[rows].columns(model.classes, model.sh_degree))
         owners.append(torch.full((len(rows),), index, dtype=torch.int32))
     if not columns:
-        none = {name: value.detach()[:0] for name, value in model.table.columns.items()}
+        none = {name: value.detach()[:0].cpu() for name, value in model.table.columns.items()}
         return none, {"node": torch.zeros(0, dtype=torch.int32)}, float(np.mean(shares))
     return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}, float(np.mean(shares))
 

@@ -1,0 +1,473 @@
+"""Fit, render and score on a device that is not the CPU: the same numbers, what is copied there and back, and going on elsewhere.
+
+The pretend device runs the plain-torch twins, so that the CPU that it is compared with runs them too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from fit_settings import fit_config
+from pretend_device import Transfer, pretend_device, transfers
+from test_scene_options import EVERYTHING, walker_cloud, walker_track, with_tracks
+from test_score_metrics import lpips_state
+from toy_world import camera, fused_cloud, truth, view_at, write_scene
+
+from mudg.base import store
+from mudg.base.camera_colors import CameraColors, ColorMap
+from mudg.base.config import result_settings
+from mudg.base.errors import NumericsError, ResourceError, UsageError
+from mudg.base.types import FusedCloud
+from mudg.bench import chain
+from mudg.bench import poses as bench_poses
+from mudg.bench import real as bench_real
+from mudg.bench import shift as bench_shift
+from mudg.core import native_ops, trajectory
+from mudg.core.raster import place
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.core.table import Table
+from mudg.data.cloudfile import write_fused
+from mudg.data.observations import ObservationWriter, read_observations
+from mudg.models.scene.appearance import Appearance
+from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
+from mudg.models.scene.mcmc import McmcSettings, drift, order_of_place, relocate_and_grow
+from mudg.models.scene.model import SceneModel, compose
+from mudg.models.scene.nodes import StaticNode
+from mudg.models.scene.sky import SkyNode
+from mudg.stages import fit, render, score
+from mudg.stages.config import BenchConfig, FitConfig, RenderConfig, RunConfig, ScoreConfig, with_device
+from mudg.stages.config.fit import VirtualConfig
+from mudg.stages.fitting.finite import FiniteCheck
+from mudg.stages.fitting.perception import perception_of
+from mudg.stages.fitting.planes import render_planes
+
+SIZE, FRAMES = (36, 24), 4
+PRETEND = torch.device("pretend", 0)
+CPU = torch.device("cpu")
+FILES = ("gaussians.safetensors", "nodes.safetensors")
+NUMBERS = 64
+"""Copies of at most so many values are small: poses, sizes, numbers for the log."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> dict[str, Path]:
+    """A scene with a car and a walker, its fused cloud, and perfect virtual views 2 m to the left."""
+    root = tmp_path_factory.mktemp("world")
+    plain = write_scene(root / "plain", frames=FRAMES, width=SIZE[0], height=SIZE[1])
+    scene = with_tracks(plain, (*plain.tracks, walker_track(plain.tracks[0].times_s)), root / "scene")
+    cloud = fused_cloud(FRAMES)
+    write_fused(root / "fuse", FusedCloud(cloud.static, {**cloud.objects, "walker": walker_cloud()}), {})
+    path = trajectory.shifted(scene, "front", 2.0)
+    with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
+        for view in path.views:
+            writer.add(truth(view.resized(30, 20)))
+    return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+
+
+@pytest.fixture(autouse=True)
+def early_densification(monkeypatch):
+    """Rounds of both kinds within a few steps."""
+
+    def schedule(config: FitConfig) -> DensifySettings | McmcSettings | None:
+        if config.densify.kind == "mcmc":
+            return McmcSettings(2, 4, 2, max_rows=config.densify.max_gaussians)
+        return DensifySettings(2, 4, 2, static_gradient=1e-4, max_rows=config.densify.max_gaussians, reset_every=3)
+
+    monkeypatch.setattr(fit, "densify_schedule", schedule)
+
+
+def settings(method: str, device: str, **changes) -> FitConfig:
+    small = {
+        "iterations": 6, "start__gaussians": 120, "densify__max_gaussians": 400, "checkpoint_every": 1000, "preview_every": 1000,
+        "raster": "torch", "loss__semantic_every": 2, "virtual__probability": 0.5, "virtual__gaussians": 50,
+    }  # fmt: skip
+    return fit_config(method=method, device=device, **{**small, **changes})
+
+
+@contextlib.contextmanager
+def twins():
+    """Within: the CPU computes what the other device does, without the native library."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native_ops, "_library_for", lambda tensors: None)
+        yield
+
+
+def tensors_of(folder: Path) -> dict[str, torch.Tensor]:
+    names = [folder / name for name in (*FILES, "appearance.safetensors")]
+    return {
+        f"{path.stem}/{key}": value
+        for path in names
+        if path.is_file()
+        for key, value in store.read_tensors(path).items()
+    }
+
+
+def assert_same_fit(mine: Path, theirs: Path) -> None:
+    one, other = tensors_of(mine), tensors_of(theirs)
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert value.shape == other[name].shape, name
+        torch.testing.assert_close(
+            value, other[name], atol=1e-5, rtol=1e-5, msg=lambda text, name=name: f"{name}: {text}"
+        )
+
+
+def fitted(world: dict[str, Path], out: Path, config: FitConfig, **more: Path) -> Path:
+    return fit.run(config, world["scene"], world["fuse"], out, observations=world["virtual"], **more)
+
+
+CASES = {
+    "gradient": ("street_gaussians", {"sh_degree": 1, "poses__learn": True, "poses__start": 0.3, "poses__rounds": 2}),
+    "everything": ("mudg_s", {**EVERYTHING, "densify__kind": "gradient", "virtual__densify": True}),
+    "mcmc": ("mudg_s", {"densify__kind": "mcmc", "appearance__exposure": "camera"}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_a_fit_has_the_numbers_of_the_cpu(world, tmp_path, case):
+    method, changes = CASES[case]
+    with twins():
+        here = fitted(world, tmp_path / "here", settings(method, "cpu", **changes))
+    with pretend_device():
+        there = fitted(world, tmp_path / "there", settings(method, "pretend", **changes))
+    assert_same_fit(there, here)
+    lines = [[json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()] for folder in (here, there)]
+    did = set().union(*lines[0])
+    assert did >= ({"relocated"} if changes.get("densify__kind") == "mcmc" else {"cloned", "split", "pruned"})
+    assert ("boxes_moved_m" in did) == bool(changes.get("poses__learn"))
+    for mine, theirs in zip(*lines, strict=True):
+        assert mine.keys() == theirs.keys()
+        assert mine.get("view") == theirs.get("view")
+        numbers = [name for name in mine if name not in ("view", "seconds")]
+        assert [mine[name] for name in numbers] == pytest.approx([theirs[name] for name in numbers], rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_fit_goes_on_on_the_other_device(world, tmp_path, monkeypatch):
+    """Begun there, interrupted, finished here; then another fit goes on there with what was made here."""
+    with twins():
+        whole = fitted(world, tmp_path / "whole", settings("street_gaussians", "cpu"))
+    adam_step = fit.adam_step
+
+    def stop(model, step, *rest):
+        adam_step(model, step, *rest)
+        if step == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(fit, "adam_step", stop)
+    with pretend_device(), pytest.raises(KeyboardInterrupt):
+        fitted(world, tmp_path / "parts", settings("street_gaussians", "pretend"))
+    monkeypatch.setattr(fit, "adam_step", adam_step)
+    with twins():
+        parts = fitted(world, tmp_path / "parts", settings("street_gaussians", "cpu"))
+        assert_same_fit(parts, whole)
+        here = fitted(world, tmp_path / "here", settings("mudg_s", "cpu", iterations=2), start=whole)
+    with pretend_device():
+        there = fitted(world, tmp_path / "there", settings("mudg_s", "pretend", iterations=2), start=whole)
+    assert_same_fit(there, here)
+
+
+# ---- what is copied ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plain_fit(world, tmp_path_factory) -> Path:
+    """A short fit on the CPU, with the native library."""
+    config = fit_config(method="street_gaussians", iterations=30, start__gaussians=120, device="cpu")
+    return fit.run(config, world["scene"], world["fuse"], tmp_path_factory.mktemp("fit") / "out")
+
+
+class Steps:
+    """The copies of every step, apart from those of the rasterizer's twin, which asks for numbers all the time."""
+
+    def __init__(self) -> None:
+        self.of: dict[int, list[Transfer]] = {}
+
+    def watch(self, seen: list[Transfer], monkeypatch) -> None:
+        """Cut the list of copies into steps."""
+        choose, due = fit.ViewSet.choose, fit._densify_if_due
+
+        def began(views, run_seed, step, *rest):
+            seen.clear()
+            return choose(views, run_seed, step, *rest)
+
+        def ended(state, config, step):
+            report = due(state, config, step)
+            self.of[step] = [copy for copy in seen if not copy.where.startswith("core/raster/")]
+            return report
+
+        monkeypatch.setattr(fit.ViewSet, "choose", began)
+        monkeypatch.setattr(fit, "_densify_if_due", ended)
+
+
+@pytest.mark.parametrize("method", ["street_gaussians", "mudg_s"])
+def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path, monkeypatch, method):
+    steps, pixels = Steps(), {SIZE[0] * SIZE[1], 30 * 20}
+    config = settings(method, "pretend", densify__kind="none", iterations=5, start__gaussians=60, poses__learn=True, poses__rounds=0,
+                      virtual__gaussians=0)  # fmt: skip
+    monkeypatch.setattr(fit, "densify_schedule", lambda _config: None)
+    monkeypatch.setattr(fit, "add_certainty", lambda state, config: None)
+    with pretend_device(), transfers() as seen:
+        steps.watch(seen, monkeypatch)
+        fitted(world, tmp_path / "fit", config)
+    assert set(steps.of) == {1, 2, 3, 4, 5}
+    for step, copied in steps.of.items():
+        there = [copy for copy in copied if copy.way == "there"]
+        large = [copy for copy in there if copy.values > NUMBERS]
+        assert {copy.where.partition(":")[0] for copy in large} == {"stages/fitting/views.py"}, step
+        assert all(
+            copy.values in {n * count for n in pixels for count in (1, 3)} or copy.values < 1000 for copy in large
+        )
+        back = [copy for copy in copied if copy.way == "back"]
+        assert not [copy for copy in copied if copy.way == "wait"], step
+        if step > 1:  # at first the tracks' offsets come back and the rows of every node are counted
+            assert [copy.where for copy in back] == ["stages/fitting/finite.py:refuse"], step
+            assert back[0].values < 100
+    late = [copy for copy in steps.of[5] if copy.way == "there" and copy.values <= NUMBERS]
+    assert all(copy.where == "models/scene/nodes.py:_sent" for copy in late), late
+
+
+def test_densification_brings_no_rows_back(plain_fit):
+    """Rows are chosen, copied, moved and dropped there; counts come back, and the only large thing that goes there is noise."""
+    draw = torch.Generator().manual_seed(0)
+    gradient = DensifySettings(1, 9, 1, max_rows=5000, prune_opacity=0.1)
+    chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, dead_opacity=0.2)
+    model = fit.load_model(plain_fit)
+    rows = len(model.table)
+    seen_rows = DensifyStats(torch.rand(rows, generator=draw) * 4e-3, torch.ones(rows))
+    with pretend_device() as there:
+        far, noted = model.to(there), {}
+        stats = seen_rows.to(there)
+        for name, change in {
+            "densify": lambda m, s: densify(m, s, 4, gradient, 0),
+            "relocate": lambda m, s: relocate_and_grow(m, 5, chain_of_copies, 0),
+            "drift": lambda m, s: drift(m, 6, 1e-3, replace(chain_of_copies, gate_opacity=0.9), 0),
+        }.items():
+            with transfers() as seen:
+                found = change(far, stats)
+            assert found == change(model, seen_rows), name
+            noted[name] = [copy for copy in seen if copy.values > NUMBERS]
+            assert all(copy.way == "there" for copy in noted[name]), noted[name]
+            torch.testing.assert_close(
+                far.table["means"].detach().cpu(), model.table["means"].detach(), atol=1e-6, rtol=1e-6
+            )
+            if found:
+                assert sum(found.values()) > found["rows"], found
+        assert {copy.where for copy in noted["densify"]} == {"models/scene/densify.py:_halves"}
+        assert not noted["relocate"]
+        assert [copy.where for copy in seen if copy.way == "wait"] == ["models/scene/mcmc.py:drift"]
+        assert {copy.where for copy in noted["drift"]} == {"models/scene/mcmc.py:drift"}
+
+
+def test_what_is_not_finite_is_found_in_one_look(world):
+    """On another device nothing is looked at before the whole step is there, and the first fault is named as on the CPU."""
+    with pretend_device() as there:
+        table = Table({"means": torch.zeros(3, 3), "logits": torch.zeros(3)}).to(there)
+        model = SceneModel(table, (StaticNode(),), None, (), 0)
+        check = FiniteCheck(7, at_once=False)
+        with transfers() as seen:
+            table["means"].grad = torch.zeros(3, 3, device=there)
+            table["logits"].grad = torch.full((3,), torch.inf, device=there)
+            check.terms("front/1", {"color": torch.ones((), device=there), "sky": torch.ones((), device=there)})
+            check.gradients("front/1", model, Appearance({}))
+            assert not [copy for copy in seen if copy.way == "back"]
+            with pytest.raises(NumericsError, match=r"gaussians.logits, view front/1, step 7[\s\S]*3 values"):
+                check.refuse()
+        assert table["logits"].grad is None
+        check.terms("front/2", {"color": torch.ones((), device=there), "sky": torch.full((), torch.nan, device=there)})
+        with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/2, step 7"):
+            check.refuse()
+
+
+# ---- parts ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_table_moves_with_moments_labels_and_nothing_else():
+    table = Table({"a": torch.arange(6.0).view(3, 2)}, {"node": torch.tensor([0, 1, 2])})
+    table.moment1["a"] += 1
+    assert table.to(CPU) is table
+    with pretend_device() as there:
+        moved = table.to(there)
+        assert moved.device == there
+        assert moved["a"].requires_grad
+        back = moved.to(CPU)
+    for name, value in table.state().items():
+        assert torch.equal(back.state()[name], value), name
+
+
+def test_a_fitted_scene_moves_and_renders_the_same(plain_fit):
+    model = fit.load_model(plain_fit)
+    assert model.to(CPU) is model
+    view = view_at(0.45, camera(width=SIZE[0], height=SIZE[1]), left_m=1.0)
+    raster = RasterConfig(backend="torch", near_m=fit.NEAR_M)
+    with twins():
+        here = fit.render_view(model, view, raster)
+    with pretend_device() as there:
+        moved = model.to(there)
+        with transfers() as seen:
+            made = fit.render_view(moved, view, raster)
+        planes = render_planes(moved, view)
+        again = moved.to(CPU)
+        assert fit.render_view(moved.without_nodes(["walker"]), view, raster).rgb.device == CPU
+    large = [copy for copy in seen if copy.values > NUMBERS]
+    assert {(copy.way, copy.where.partition(":")[0]) for copy in large} == {("back", "stages/fitting/rendering.py")}
+    for name in ("rgb", "depth", "semantics", "confidence", "mask"):
+        torch.testing.assert_close(getattr(made, name), getattr(here, name), atol=1e-6, rtol=1e-6, equal_nan=True)
+    assert planes.color.device == planes.semantics.device == CPU
+    for mine, theirs in zip(again.table.state().items(), model.table.state().items()):
+        assert torch.equal(mine[1], theirs[1])
+
+
+def test_objects_stand_on_another_device_where_they_do_here(plain_fit):
+    model = fit.load_model(plain_fit)
+    node = model.dynamic_object("walker")
+    node.add_offsets(*(0.1 * values + 0.05 for values in node.offset_values()))
+    with pretend_device() as there:
+        moved = model.to(there)
+        for time_s in (0.0, 0.25, 0.4, 9.0):
+            torch.testing.assert_close(
+                compose(moved, time_s).means.cpu(), compose(model, time_s).means, atol=1e-6, rtol=1e-6
+            )
+        far = moved.dynamic_object("walker")
+        with transfers() as seen:
+            first = far.pose_matrix(0.25)
+            for _ in range(3):
+                assert (far.pose_matrix(0.25) == first).all()
+        assert len(seen) == 0
+        assert (first == node.pose_matrix(0.25)).all()
+        far.add_offsets(*far.offset_values())
+        node.add_offsets(*node.offset_values())
+        torch.testing.assert_close(compose(moved, 0.25).means.cpu(), compose(model, 0.25).means, atol=1e-6, rtol=1e-6)
+
+
+def test_the_sky_is_drawn_there_without_a_copy():
+    sky = SkyNode.uniform(8)
+    sky.table["panorama"].detach().copy_(torch.rand(1, 3, 8, 16, generator=torch.Generator().manual_seed(0)))
+    for yaw_rad in (0.0, 2.0):
+        view = view_at(0.3, camera(width=50, height=30), yaw_rad=yaw_rad)
+        here = sky.coarse_picture(view)
+        with pretend_device() as there:
+            moved = sky.to(there)
+            with transfers() as seen:
+                made = moved.coarse_picture(view)
+            assert not seen
+            torch.testing.assert_close(made.cpu(), here, atol=1e-5, rtol=1e-5)
+
+
+def test_colors_of_cameras_are_mapped_there():
+    colors = CameraColors("front", {"rear": ColorMap((1.1, 0.9, 1.3), (0.02, -0.01, 0.1))})
+    rgb = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0))
+    with pretend_device() as there:
+        moved = rgb.to(there)
+        assert colors.image_of("front", moved) is moved
+        assert torch.equal(colors.image_of("rear", moved).cpu(), colors.image_of("rear", rgb))
+        with transfers() as seen:
+            colors.image_of("rear", moved)
+        assert not seen
+
+
+def test_rows_are_put_in_the_order_of_their_place_with_ties_as_they_come():
+    means = torch.tensor([[1.0, 2, 3], [1, 2, 3], [0, 5, 5], [1, 2, 1], [-0.0, 5, 5], [1, 0, 9]])
+    assert order_of_place(means).tolist() == [2, 4, 5, 3, 0, 1]
+
+
+@pytest.mark.parametrize("kind", ["filters", "codec", "lpips"])
+def test_perceptual_distances_are_those_of_the_cpu(tmp_path, kind):
+    store.write_safetensors(tmp_path / "lpips.safetensors", lpips_state())
+    config = VirtualConfig(perception=kind, lpips_weights=str(tmp_path / "lpips.safetensors"))
+    draw = torch.Generator().manual_seed(0)
+    rgb, truth_rgb, weight = (torch.rand(count, 40, 48, generator=draw) for count in (3, 3, 1))
+    with twins():
+        here = perception_of(config)(rgb, truth_rgb, weight)
+    with pretend_device() as there:
+        made = perception_of(config, there)(*(image.to(there) for image in (rgb, truth_rgb, weight)))
+        assert made.device == there
+        torch.testing.assert_close(made.cpu(), here, atol=1e-6, rtol=1e-5)
+
+
+# ---- which device -----------------------------------------------------------------------------------------------------
+
+
+def test_auto_draws_with_cuda_only_if_gsplat_can(monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(place.log, "info_once", said.append)
+    monkeypatch.setattr(
+        place, "choose_device", lambda wanted, purpose: torch.device({"auto": "cuda:0"}.get(wanted, wanted))
+    )
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(place, "available", lambda backend: "the package gsplat is not installed")
+    assert place.drawing_device("auto", "fit") == CPU
+    assert "gsplat" in said[0]
+    assert place.drawing_device("cuda:0", "fit").type == "cuda"
+    assert place.drawing_device("auto", "fit", "torch").type == "cuda"
+    assert place.drawing_device("auto", "fit", "cpu") == CPU
+    monkeypatch.setattr(place, "available", lambda backend: "")
+    assert place.drawing_device("auto", "fit").type == "cuda"
+    assert place.drawing_device("auto", "fit", "gsplat").type == "cuda"
+
+
+def test_a_backend_that_does_not_draw_on_the_device_is_refused(world, tmp_path):
+    with pytest.raises(ResourceError, match="--device"):
+        fitted(world, tmp_path / "fit", settings("street_gaussians", "cuda"))
+    with pytest.raises(UsageError, match="--raster"):
+        fitted(world, tmp_path / "fit", replace(settings("street_gaussians", "cpu"), raster="gsplat"))
+
+
+def test_every_step_of_a_run_follows_its_device_unless_it_has_its_own():
+    made = with_device(RunConfig(device="cuda:1", fit=FitConfig(device="cpu")))
+    assert (made.fit.device, made.render.device, made.score.device) == ("cpu", "cuda:1", "cuda:1")
+    assert made.fuse == RunConfig().fuse
+    assert with_device(RunConfig()) == RunConfig()
+    assert result_settings(made) == result_settings(RunConfig())
+    assert "device" not in json.dumps(result_settings(made))
+
+
+def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
+    config = BenchConfig(device="cuda:1", methods=("street_gaussians",), variant=("wide=width_px:64",))
+    fits = [row.fit for row in bench_shift.rows_of(config)] + [
+        row.changes for row in bench_real.rows_of(config) if row.changes
+    ]
+    assert len(fits) == 3
+    assert {
+        fitted.device for fitted in (*fits, bench_shift.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
+    } == {"cuda:1"}
+    monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
+    assert chain.at_once(config) == 1
+    assert chain.at_once(replace(config, processes=3)) == 3
+    assert chain.at_once(replace(config, device="cpu")) == os.cpu_count()
+
+
+# ---- render and score -------------------------------------------------------------------------------------------------
+
+
+def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypatch):
+    drawn = RenderConfig(cameras=("front",), shifts_m=(0.0,), video=False, raster="torch", device="cpu")
+    with twins():
+        here = render.run(drawn, world["scene"], plain_fit, tmp_path / "here")
+    with pretend_device():
+        there = render.run(replace(drawn, device="pretend"), world["scene"], plain_fit, tmp_path / "there")
+        assert (
+            render.run(replace(drawn, device="pretend"), world["scene"], plain_fit, here) == here
+        )  # a result is one on any device
+    mine, theirs = (read_observations(folder / "front_recorded") for folder in (there, here))
+    for index in range(len(mine)):
+        torch.testing.assert_close(mine[index].rgb, theirs[index].rgb, atol=1 / 254, rtol=0)
+    config = ScoreConfig(baseline=False, perceptual_views=2, error_pictures=False, device="cpu")
+    monkeypatch.setattr(score, "computed_ahead", lambda compute, count, threads: map(compute, range(count)))
+    with twins():
+        score.run(config, world["scene"], {"fit": here}, tmp_path / "score_here")
+    with pretend_device(), transfers() as seen:
+        score.run(replace(config, device="pretend"), world["scene"], {"fit": here}, tmp_path / "score_there")
+    assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"models/featnets.py"}
+    found = [store.read_json(tmp_path / name / "metrics.json") for name in ("score_here", "score_there")]
+    values = [document["by_distance"][0]["values"] for document in found]
+    assert values[0]["perceptual"] == pytest.approx(values[1]["perceptual"], rel=1e-5)
+    assert {**values[0], "perceptual": 0} == {**values[1], "perceptual": 0}
