@@ -420,14 +420,14 @@ def views_of(job: SplitJob, row: RealMethod, cameras: tuple[str, ...]) -> tuple[
 
 
 def fitted(job: SplitJob, row: RealMethod, use: DiffusionUse | None, cameras: tuple[str, ...]) -> Path:
-    """The fit of a method, made if need be, with the generated views that it learns from: beside the recorded path, and, of cameras that
-    are not shown, where they are asked for."""
+    """The fit of a method, made if need be, with the generated views that it learns from: beside the recorded path, and where views
+    of hidden frames are asked for."""
     settings = row.changes or configuration.load(FitConfig, job.usual, overrides={"method": row.fit})
     virtual: list[Path] = []
     if use is not None:
         camera = first_camera(read_scene(job.scene), job.shown)
         virtual.append(generated(job, use, (camera,), job.generator.shifts_m, job.folder / "virtual" / use.sees))
-        if job.split.by_camera:
+        if job.split.by_camera or job.split.block:
             virtual.append(generated(job, use, cameras, job.split.shifts_m, job.folder / "generated" / use.sees))
     return job.fits.fitted(row.name, settings, virtual)
 

@@ -156,6 +156,7 @@ def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path
     if not lesson.shift_m:
         cloud = fuse.run(FuseConfig(), folder / "scene", folder / "fuse")
     camera = next(iter(scene.cameras.values()))
-    settings = short_fit(config.fit_iterations, log.width_px, camera.width, config.seed)
+    device = "auto" if config.device.startswith("cuda") else "cpu"  # a GPU that lacks gsplat cannot draw
+    settings = short_fit(config.fit_iterations, log.width_px, camera.width, config.seed, device)
     fit.run(settings, folder / "scene", cloud, folder / "fit")
     return folder
