@@ -12,12 +12,14 @@ from pandas_pickles import write_frame
 from test_bench import SMALL
 
 from mudg.base import store
+from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
 from mudg.bench import real, real_measure, real_points, real_protocols, real_tables, real_truth
 from mudg.bench.real_protocols import SPLITS
 from mudg.bench.shift import write_fill
+from mudg.core import color_match
 from mudg.core.fusion import STATIC
 from mudg.data.city import CityWorld
 from mudg.data.importers.pandaset.pandas_frame import read_frame
@@ -259,18 +261,18 @@ def test_a_color_map_is_found_under_noise_and_outliers():
     given = true + rng.normal(0, 0.04, true.shape)
     wanted = true * [0.8, 1.0, 1.1] + [0.1, 0.0, -0.05] + rng.normal(0, 0.04, true.shape)
     wanted[:2000] = rng.uniform(0.1, 0.9, (2000, 3))
-    found = real_points.color_map(*((np.clip(c, 0, 1) * 255).round().astype(np.uint8) for c in (given, wanted)))
+    found = color_match.color_map(*((np.clip(c, 0, 1) * 255).round().astype(np.uint8) for c in (given, wanted)))
     assert found.gain == pytest.approx((0.8, 1.0, 1.1), abs=0.03)
     assert found.offset == pytest.approx((0.1, 0.0, -0.05), abs=0.02)
     loose = [rng.uniform(90, 110, (1000, 3)).astype(np.uint8) for _ in range(2)]
-    loosely = real_points.color_map(loose[0], (loose[1] * 1.5).astype(np.uint8))
+    loosely = color_match.color_map(loose[0], (loose[1] * 1.5).astype(np.uint8))
     assert loosely.gain == pytest.approx((1.5, 1.5, 1.5), abs=0.03) and loosely.offset == (0, 0, 0)
-    few = real_points.color_map(np.full((10, 3), 50, np.uint8), np.full((10, 3), 90, np.uint8))
+    few = color_match.color_map(np.full((10, 3), 50, np.uint8), np.full((10, 3), 90, np.uint8))
     assert (few.gain, few.pairs) == ((1.0, 1.0, 1.0), 10)
 
 
 def sight(maps, *, depth=None, rgb=None, semantics=None, photo=None):
-    target = real_truth.Target("front", None, VIEW, maps, real_points.ColorMap())
+    target = real_truth.Target("front", None, VIEW, maps, ColorMap())
     rgb = torch.full((3, 30, 40), 0.5) if rgb is None else rgb
     return real_measure.Sight(target, rgb, depth, semantics, photo, None)
 

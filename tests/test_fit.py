@@ -266,6 +266,20 @@ def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
         fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "empty")
 
 
+def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_path):
+    names = sorted(path.name for path in world["virtual"].iterdir())
+    for name in names:
+        shutil.copytree(world["virtual"] / name, tmp_path / f"of {name}" / name)
+    several = [tmp_path / f"of {name}" for name in names]
+    arguments = (settings("mudg_s", iterations=4, virtual__start=0.0), world["scene"], world["fuse"])
+    together = fit.run(*arguments, tmp_path / "together", observations=world["virtual"])
+    apart = fit.run(*arguments, tmp_path / "apart", observations=several)
+    assert fitted_bytes(apart) == fitted_bytes(together)
+    with pytest.raises(InputError, match=r"same name[\s\S]*front_shift"):
+        fit.run(*arguments, tmp_path / "twice", observations=[world["virtual"], several[0]])
+    assert not (tmp_path / "twice").exists()
+
+
 def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
     """The truth that `mudg score` keeps shows held-out frames: nothing may be fitted to it."""
     sets = tmp_path / "sets"

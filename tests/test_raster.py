@@ -16,7 +16,7 @@ from mudg import native
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.base.types import Camera, Gaussians, Render, View
-from mudg.core.raster import gsplat_cuda, torch_twin
+from mudg.core.raster import gsplat_cuda, gsplat_package, torch_twin
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import BACKENDS, RasterConfig, rasterize
 
@@ -604,7 +604,7 @@ def test_without_the_library_auto_takes_torch_and_cpu_is_refused(monkeypatch: py
 
 
 def test_gsplat_is_refused_where_it_is_missing() -> None:
-    if not gsplat_cuda.problem():
+    if not gsplat_package.problem():
         pytest.skip("gsplat is installed here")
     with pytest.raises(ResourceError, match="gsplat"):
         rasterize(_gaussians(_parameters(5)), _view(), RasterConfig(backend="gsplat"))
@@ -628,7 +628,8 @@ class _FakeGsplat(SimpleNamespace):
         if means2d.requires_grad:
             means2d.retain_grad()
             means2d.register_hook(lambda g: setattr(means2d, "absgrad", 2 * g.abs()))
-        channels = torch.cat([colors.sum(1), means2d.sum((1, 2))[:, None]], 1)
+        channels = colors.sum(1)
+        channels = torch.cat([channels[:, :-1], channels[:, -1:] + means2d.sum((1, 2))[:, None]], 1)
         image = channels[:, None, None].expand(views, height, width, -1)
         alpha = torch.full((views, height, width, 1), 0.25)
         radii = torch.ones(views, colors.shape[1], 2, dtype=torch.int32)
@@ -644,25 +645,30 @@ def test_the_gsplat_adapter_maps_every_argument() -> None:
     out = gsplat_cuda.render(request, module=fake)  # type: ignore[arg-type]
     (_, degree, directions), (_, draw) = fake.calls
     assert degree == 2
-    torch.testing.assert_close(directions[0], torch.nn.functional.normalize(p["means"] - pose[:3, 3], dim=1))
+    # Everything is handed over relative to the camera, so that float32 serves far from the world's origin.
+    offset = p["means"] - pose[:3, 3]
+    torch.testing.assert_close(directions, offset)
+    torch.testing.assert_close(draw["means"], offset)
     assert draw["near_plane"] == 0.2
     assert draw["far_plane"] == 90.0
     assert draw["eps2d"] == 0.1
     assert draw["rasterize_mode"] == "antialiased"
-    assert draw["render_mode"] == "RGB+D"
+    assert draw["render_mode"] == "RGB"
     assert draw["absgrad"] is True
     assert draw["packed"] is False
     assert draw["sh_degree"] is None
     assert (draw["width"], draw["height"]) == (6, 4)
-    torch.testing.assert_close(draw["viewmats"][0], torch.tensor(view.cam_from_world, dtype=torch.float32))
+    seen = draw["means"] @ draw["viewmats"][0, :3, :3].T + draw["viewmats"][0, :3, 3]
+    torch.testing.assert_close(seen, p["means"] @ pose[:3, :3] - pose[:3, 3] @ pose[:3, :3])
     np.testing.assert_allclose(draw["Ks"][0].numpy(), view.camera.matrix, rtol=1e-6)
     torch.testing.assert_close(draw["opacities"], p["opacity"])
-    torch.testing.assert_close(draw["colors"][0, :, 3:], p["extra"])
     torch.testing.assert_close(draw["colors"][0, :, :3], (p["sh"][:, 0] + 0.5).clamp_min(0))
+    torch.testing.assert_close(draw["colors"][0, :, 3:-1], p["extra"])
+    torch.testing.assert_close(draw["colors"][0, :, -1], seen[:, 2])
     assert out.extra is not None
     torch.testing.assert_close(out.extra[:, 0, 0], p["extra"].sum(0))
     torch.testing.assert_close(out.rgb[2, 0, 0], (p["sh"][:, 0, 2] + 0.5).clamp_min(0).sum() + 0.75)
-    torch.testing.assert_close(out.depth * out.alpha, p["means"][:, :2].sum().expand(1, 4, 6))
+    torch.testing.assert_close(out.depth * out.alpha, (seen[:, 2].sum() + offset[:, :2].sum()).expand(1, 4, 6))
     out.depth.sum().backward()
     assert out.trace.means2d.grad is not None
     torch.testing.assert_close(out.trace.means2d.grad, torch.full((7, 2), 4 * 24.0))
@@ -676,13 +682,14 @@ def test_gsplat_draws_several_views_in_one_call() -> None:
     p = _leaves(_parameters(7, degree=1, channels=2))
     request = raster.Request(_gaussians(p), views, True, RasterConfig(), 1, (None, torch.ones(3)), (None, None), True)
     out = gsplat_cuda.render(request, module=fake)  # type: ignore[arg-type]
-    assert [name for name, *_ in fake.calls] == ["sh", "draw"]
-    draw = fake.calls[1][1]
+    assert [name for name, *_ in fake.calls] == ["sh", "sh", "draw"]
+    draw = fake.calls[2][1]
     for index, view in enumerate(views):
-        torch.testing.assert_close(draw["viewmats"][index], torch.tensor(view.cam_from_world, dtype=torch.float32))
+        seen = draw["means"] @ draw["viewmats"][index, :3, :3].T + draw["viewmats"][index, :3, 3]
+        cam_from_world = torch.tensor(view.cam_from_world, dtype=torch.float32)
+        torch.testing.assert_close(seen, p["means"] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3])
         np.testing.assert_allclose(draw["Ks"][index].numpy(), view.camera.matrix, rtol=1e-6)
-        offset = p["means"] - torch.tensor(view.world_from_cam[:3, 3], dtype=torch.float32)
-        torch.testing.assert_close(fake.calls[0][2][index], torch.nn.functional.normalize(offset, dim=1))
+        torch.testing.assert_close(fake.calls[index][2], p["means"] - torch.tensor(view.world_from_cam[:3, 3], dtype=torch.float32))
     assert out.rgb.shape == (2, 3, 4, 6)
     assert out.depth.shape == out.alpha.shape == (2, 1, 4, 6)
     torch.testing.assert_close(out.rgb[1] - out.rgb[0], torch.full((3, 4, 6), 0.75))

@@ -156,8 +156,8 @@ class Fit(Output):
     """Scene directory written by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
     """Point clouds written by fuse."""
-    observations: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Virtual views written by synthesize; required by method mudg_s."""
+    observations: Annotated[tuple[Path, ...], arg(metavar="FOLDER")] = ()
+    """Virtual views written by synthesize, in one folder or several; required by method mudg_s."""
     start_from: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views are used
     from the first of them on."""

@@ -95,7 +95,7 @@ def synthesize(
 
 def fit(
     scene: Location, fused: Location, out: Location, *,
-    observations: Location | None = None, start_from: Location | None = None, overwrite: bool = False,
+    observations: Location | Sequence[Location] = (), start_from: Location | None = None, overwrite: bool = False,
     config: Location | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Fit a dynamic Gaussian scene to recorded and, with ``observations``, generated views; returns the model's folder.
@@ -108,7 +108,7 @@ def fit(
     made = _settings(stage_config.FitConfig, config, settings)
     return stage.run(
         made, Path(scene), Path(fused), Path(out),
-        observations=_optional(observations), start=_optional(start_from), overwrite=overwrite,
+        observations=_several(observations), start=_optional(start_from), overwrite=overwrite,
     )  # fmt: skip
 
 
@@ -205,6 +205,10 @@ def _with_text_paths(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_with_text_paths(inner) for inner in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def _several(paths: Location | Sequence[Location]) -> tuple[Path, ...]:
+    return (Path(paths),) if isinstance(paths, (str, Path)) else tuple(map(Path, paths))
 
 
 def _optional(path: Location | None) -> Path | None:

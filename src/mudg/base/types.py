@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import checks, geometry
+from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 
@@ -334,10 +335,14 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedCloud:
-    """The static world, and one cloud per dynamic object: track id -> cloud in its box frame."""
+    """The static world, and one cloud per dynamic object: track id -> cloud in its box frame.
+
+    The points' colours are common ones; ``colors`` says how the cameras of the log show them.
+    """
 
     static: PointCloud
     objects: Mapping[str, PointCloud]
+    colors: CameraColors = SAME_COLORS
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "objects", _freeze(self.objects))

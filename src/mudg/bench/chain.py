@@ -5,7 +5,7 @@ OUT/fit/<method>   every fit      OUT/start/<method>   what a variant with other
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -55,7 +55,7 @@ class FitChain:
         """The fit on recorded views with the usual settings, made if need be."""
         return self._made(fits_of(self.usual)[0], self.out / "fit" / WITHOUT_DIFFUSION)
 
-    def fitted(self, name: str, settings: FitConfig, virtual: Path | None) -> Path:
+    def fitted(self, name: str, settings: FitConfig, virtual: Sequence[Path]) -> Path:
         """The fit of a method, made if need be.
 
         Args:
@@ -70,7 +70,7 @@ class FitChain:
         begun = self.first() if plain == fits_of(self.usual)[0] else self._made(plain, self.out / "start" / name)
         return self._made(guided, out, virtual, begun)
 
-    def _made(self, settings: FitConfig, out: Path, virtual: Path | None = None, begun: Path | None = None) -> Path:
+    def _made(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
         def make(overwrite: bool) -> Path:
             return fit.run(
                 settings, self.scene, self.fused, out, observations=virtual, start=begun, overwrite=overwrite

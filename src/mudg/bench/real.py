@@ -415,17 +415,20 @@ def views_of(job: SplitJob, row: RealMethod, cameras: tuple[str, ...]) -> tuple[
     use = diffusion_use(job, row.sees) if row.sees else None
     if use is not None and not row.fit:
         return generated(job, use, cameras, job.split.shifts_m, job.folder / "generated" / use.sees), use
-    model, views = fitted(job, row, use), job.folder / "render" / row.name
+    model, views = fitted(job, row, use, cameras), job.folder / "render" / row.name
     return made(lambda o: render.run(drawn, places, model, views, overwrite=o), job.overwrite), use
 
 
-def fitted(job: SplitJob, row: RealMethod, use: DiffusionUse | None) -> Path:
-    """The fit of a method, made if need be, with the generated views that it learns from."""
+def fitted(job: SplitJob, row: RealMethod, use: DiffusionUse | None, cameras: tuple[str, ...]) -> Path:
+    """The fit of a method, made if need be, with the generated views that it learns from: beside the recorded path, and, of cameras that
+    are not shown, where they are asked for."""
     settings = row.changes or configuration.load(FitConfig, job.usual, overrides={"method": row.fit})
-    virtual = None
+    virtual: list[Path] = []
     if use is not None:
         camera = first_camera(read_scene(job.scene), job.shown)
-        virtual = generated(job, use, (camera,), job.generator.shifts_m, job.folder / "virtual" / use.sees)
+        virtual.append(generated(job, use, (camera,), job.generator.shifts_m, job.folder / "virtual" / use.sees))
+        if job.split.by_camera:
+            virtual.append(generated(job, use, cameras, job.split.shifts_m, job.folder / "generated" / use.sees))
     return job.fits.fitted(row.name, settings, virtual)
 
 

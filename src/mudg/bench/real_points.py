@@ -5,7 +5,6 @@ Points in the boxes of dynamic objects travel with their box; all others stand s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -29,9 +28,6 @@ MERGED_SWEEPS: Final = 6
 """Sweeps of each LiDAR whose points tell what the shown cameras saw."""
 SPREAD_SHARE: Final = 0.03
 """A pixel takes the answer of the nearest point within this share of the image's width."""
-TRIM_DEVIATIONS: Final = 2.5
-FEWEST_PAIRS: Final = 200
-LEAST_CORRELATION: Final = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,46 +183,3 @@ def spread(
     row, column = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
     here_row, here_column = np.indices(shape)
     return mask[row, column] & (np.hypot(row - here_row, column - here_column) <= max(2.0, SPREAD_SHARE * shape[1]))
-
-
-@dataclass(frozen=True)
-class ColorMap:
-    """Gain and offset of each channel, for colours in 0..1, and the number of pairs of colours that they were fitted to."""
-
-    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    pairs: int = 0
-
-
-def color_map(given: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> ColorMap:
-    """The affine map per channel from colours u8[N, 3] to those of another camera, by trimmed orthogonal least squares: both sides are
-    photographs, as noisy as each other, and plain least squares would find too little contrast.
-
-    Six rounds, the first a guess from medians; each leaves out pairs that are farther than ``TRIM_DEVIATIONS`` robust standard
-    deviations from the last line. The identity where there are fewer than ``FEWEST_PAIRS`` pairs.
-    """
-    usable = ((given > 4) & (given < 251) & (wanted > 4) & (wanted < 251)).all(1)
-    x, y = given[usable] / 255.0, wanted[usable] / 255.0
-    if len(x) < FEWEST_PAIRS:
-        return ColorMap(pairs=len(x))
-    gains, offsets = [], []
-    for channel in range(3):
-        a, b = x[:, channel], y[:, channel]
-        gain, offset = 1.0, float(np.median(b) - np.median(a))
-        for _ in range(5):
-            error = np.abs(b - gain * a - offset)
-            kept = error <= TRIM_DEVIATIONS * 1.4826 * max(float(np.median(error)), 1e-3)
-            gain, offset = _line(a[kept], b[kept])
-        gains.append(round(float(gain), 5))
-        offsets.append(round(float(offset), 5))
-    return ColorMap((gains[0], gains[1], gains[2]), (offsets[0], offsets[1], offsets[2]), len(x))
-
-
-def _line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Gain and offset of the line y = gain x + offset from which points are least far. Where the two are loosely correlated, so that no
-    line stands out, the gain alone: the ratio of the means."""
-    (xx, xy), (_, yy) = np.cov(x, y)
-    if xy < LEAST_CORRELATION * math.sqrt(xx * yy) or xy <= 0:
-        return float(y.mean() / x.mean()), 0.0
-    gain = float((yy - xx + np.hypot(yy - xx, 2 * xy)) / (2 * xy))
-    return gain, float(y.mean() - gain * x.mean())

@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import log, palette, store
+from mudg.base.camera_colors import ColorMap
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Scene, View
 from mudg.bench import real_points
-from mudg.bench.real_points import ColorMap, LogPoints, OwnedPoints, ShownFrame
+from mudg.bench.real_points import LogPoints, OwnedPoints, ShownFrame
 from mudg.bench.real_protocols import Protocol
-from mudg.core import trajectory
+from mudg.core import color_match, trajectory
 from mudg.core.fusion import STATIC
 from mudg.core.pictures import class_colors, depth_colors
 from mudg.data.exporters.video import jpeg_bytes
@@ -270,7 +271,7 @@ class _Maker:
     def color_map(self, frames: Sequence[Frame]) -> ColorMap:
         """The colour map of a camera, from the points that its training frames share with the shown cameras."""
         pairs = [self._seen(frame)[1:] for frame in frames]
-        return real_points.color_map(*(np.concatenate([pair[side] for pair in pairs]) for side in (0, 1)))
+        return color_match.color_map(*(np.concatenate([pair[side] for pair in pairs]) for side in (0, 1)))
 
 
 # ---- pictures ----------------------------------------------------------------------------------------------------------

@@ -12,7 +12,8 @@ The rules, stated once:
   floor, so that the road stays road) belong to the object and are kept in its frame. In overlapping boxes the smaller wins.
 * **Colour.** A point takes the pixel (nearest, no interpolation) of an image taken at about the sweep's time, the object's
   motion between sweep and image taken into account. If several cameras see it, the one whose optical axis points
-  closest to it wins. Points that no camera sees have no colour and are left out.
+  closest to it wins. Points that no camera sees have no colour and are left out. Cameras whose exposure or white balance differs are
+  brought to the colours of one of them first (``core/color_match.py``).
 * **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects included,
   the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
 * **Semantics.** A point keeps the class that people gave it. For others the cameras that see a point vote, weighted by the cosine to their
@@ -31,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import palette
+from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, pinhole, yaw_of
 from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
@@ -240,8 +242,9 @@ def color_points(
     owned: dict[int, NDArray[np.float32]],
     dynamic: Sequence[Track],
     rules: FusionRules,
+    cameras: CameraColors = SAME_COLORS,
 ) -> Colors:
-    """Colours (and semantics) of a sweep's points from the images beside it; see the module text for the rules."""
+    """Common colours (and semantics) of a sweep's points from the images beside it; see the module text for the rules."""
     count = len(owner)
     best = np.full(count, -1.0, np.float32)
     rgb = np.zeros((count, 3), np.uint8)
@@ -263,7 +266,7 @@ def color_points(
         chosen = ids[better]
         best[chosen] = cosine[better]
         depth_m[chosen] = z[better]
-        rgb[chosen] = shot.rgb[row[better], column[better]]
+        rgb[chosen] = cameras.bytes_to_common(shot.view.camera.name, shot.rgb[row[better], column[better]])
         if shot.semantics is not None:
             votes.append((ids, shot.semantics[row, column], cosine))
     seen = best > 0
@@ -515,7 +518,7 @@ DEFAULT_RULES: Final = FusionRules()
 
 
 def fuse_sweeps(
-    sweeps: Iterable[SweepShots], tracks: Sequence[Track], rules: FusionRules = DEFAULT_RULES
+    sweeps: Iterable[SweepShots], tracks: Sequence[Track], rules: FusionRules = DEFAULT_RULES, cameras: CameraColors = SAME_COLORS
 ) -> tuple[FusedCloud, FusionReport]:
     """Fuse sweeps and images; one sweep is held in memory at a time.
 
@@ -523,6 +526,7 @@ def fuse_sweeps(
         sweeps: sweeps with the images that may colour them, in any order.
         tracks: all tracked boxes; which of them move is decided here.
         rules: see ``FusionRules``.
+        cameras: maps of the images' colours to common ones (``core/color_match.py``).
 
     Returns:
         The fused cloud (static: world frame; objects: box frame, by track id) and a report. ``semantics`` are None
@@ -537,7 +541,7 @@ def fuse_sweeps(
     for sweep in sweeps:
         labelled |= sweep.points.classes is not None or any(shot.semantics is not None for shot in sweep.shots)
         owner, owned = separate(sweep, dynamic, rules)
-        colors = color_points(sweep, owner, owned, dynamic, rules)
+        colors = color_points(sweep, owner, owned, dynamic, rules, cameras)
         semantics = _classes_first(sweep.points.classes, colors.semantics)
         keep = colors.seen & (owner == STATIC)
         static.add(
@@ -568,4 +572,4 @@ def fuse_sweeps(
             report.left_out[track.id] = f"{len(cloud)} coloured points, fewer than {rules.min_object_points}"
         else:
             clouds[track.id] = cloud
-    return FusedCloud(static_cloud, clouds), report
+    return FusedCloud(static_cloud, clouds, cameras), report

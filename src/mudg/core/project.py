@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -101,7 +101,7 @@ def project_cloud(
     view: View,
     config: ProjectConfig | None = None,
 ) -> SparseView:
-    """Draw a fused cloud, its objects placed at the given poses, composed by depth.
+    """Draw a fused cloud, its objects placed at the given poses, composed by depth, in the colours of the view's camera.
 
     Args:
         cloud: the static world and one cloud per object in its box frame.
@@ -113,7 +113,9 @@ def project_cloud(
     for name, points in drawn_objects(cloud, world_from_object):
         layers.append(PointLayer(points.xyz, world_from_object[name], config.object_splat_px))
         colors.append(points.rgb)
-    return _draw(layers, colors, view, config)
+    drawn = _draw(layers, colors, view, config)
+    shown = cloud.colors.image_of(view.camera.name, drawn.color)
+    return drawn if shown is drawn.color else replace(drawn, color=shown.clamp(0, 1) * drawn.valid)
 
 
 def drawn_objects(

@@ -97,6 +97,30 @@ def at_shift(
     return shifted(scene, camera, shift_m, height_m=height_m, yaw_rad=yaw_rad)
 
 
+def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:
+    """Poses of a rolling shutter: world_from_cam f64[2, 4, 4] when the first and when the last row (or column) is read.
+
+    The middle one is read at the view's time; ``camera.readout_s`` lies between first and last. The camera moves as the
+    vehicle does; before the first and after the last recorded pose the motion next to it goes on.
+
+    Raises:
+        InputError: the view's time is more than 0.2 s outside the vehicle's path.
+    """
+    _ego_pose(path, view)
+    times, poses = path.times_s, path.world_from_ego
+
+    def ego(time_s: float) -> NDArray[np.float64]:
+        if len(times) == 1:
+            return poses[0]
+        after = int(np.clip(np.searchsorted(times, time_s), 1, len(times) - 1))
+        fraction = (time_s - times[after - 1]) / (times[after] - times[after - 1])
+        return geometry.interpolate_pose(poses[after - 1], poses[after], float(fraction))
+
+    ego_from_cam = geometry.invert(ego(view.time_s)) @ view.world_from_cam
+    half = view.camera.readout_s / 2
+    return np.stack([ego(view.time_s - half) @ ego_from_cam, ego(view.time_s + half) @ ego_from_cam])
+
+
 def _frames(scene: Scene, camera: str) -> tuple:
     if camera not in scene.cameras:
         raise UsageError(f"the scene has no camera named {camera!r}", where=f"scene {scene.id}",

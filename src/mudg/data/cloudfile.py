@@ -2,7 +2,7 @@
 
 static.safetensors       xyz f32[N, 3] metres (world), rgb u8[N, 3], semantics u8[N] if there were labels
 objects/000.safetensors  the same in the frame of one tracked box; fuse.json says which
-fuse.json                counts, rules, a verdict per track
+fuse.json                counts, rules, a verdict per track; how the cameras show the points' colours
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mudg.base import store
+from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, IntegrityError
 from mudg.base.types import FusedCloud, PointCloud
 
@@ -27,6 +28,8 @@ def write_fused(folder: Path | str, cloud: FusedCloud, report: Mapping[str, Any]
         for index, (track_id, points) in enumerate(cloud.objects.items())
     }
     head = {"format": "mudg-fused", "schema_version": 1, "static": static, "objects": files}
+    if cloud.colors.to_common:
+        head["camera_colors"] = cloud.colors.record()
     store.write_json(folder / "fuse.json", {**head, **report})
 
 
@@ -53,9 +56,10 @@ def read_fused(folder: Path | str) -> FusedCloud:
     try:
         static = _read_cloud(folder, index["static"], "world")
         objects = {str(track_id): _read_cloud(folder, entry, "object") for track_id, entry in index["objects"].items()}
-    except (KeyError, TypeError, AttributeError) as error:
+        colors = CameraColors.of_record(index["camera_colors"]) if "camera_colors" in index else SAME_COLORS
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError("fuse.json is malformed", where=str(folder / "fuse.json"), got=repr(error)) from error
-    return FusedCloud(static, objects)
+    return FusedCloud(static, objects, colors)
 
 
 def _read_cloud(folder: Path, entry: Mapping[str, Any], frame: str) -> PointCloud:

@@ -209,10 +209,15 @@ def _packages(problems: list[str]) -> dict[str, str]:
 
 
 def _optional() -> dict[str, str]:
-    return {
+    rows = {
         name: found if (found := _installed(name)) else f"not installed ({use}; {how})"
         for name, (use, how) in _OPTIONAL.items()
     }
+    if _installed("gsplat") and find_spec("torch") is not None:
+        from mudg.core.raster import gsplat_package
+
+        rows["gsplat"] += f"; {gsplat_package.status()}"
+    return rows
 
 
 def _video(problems: list[str]) -> dict[str, str]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -89,7 +89,7 @@ MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
 
 def run(
     config: FitConfig, scene: Path, fused: Path, out: Path, *,
-    observations: Path | None = None, start: Path | None = None, overwrite: bool = False,
+    observations: Path | Sequence[Path] | None = None, start: Path | None = None, overwrite: bool = False,
 ) -> Path:  # fmt: skip
     """Fit a scene.
 
@@ -98,7 +98,7 @@ def run(
         scene: scene directory (ingest).
         fused: fused clouds (fuse).
         out: folder for the model.
-        observations: folder of virtual observation sets (synthesize); needed by methods that use them, ignored by others.
+        observations: folder of virtual observation sets (synthesize), or several; needed by methods that use them, ignored by others.
         start: folder of a finished fit of street_gaussians to the same scene and clouds to go on with: ``config.iterations`` more
             steps, virtual views from the first of them on. None: a fit from nothing.
 
@@ -110,11 +110,13 @@ def run(
         finite. InputError: damaged inputs, recorded views among ``observations``, or a ``start`` that does not fit.
     """
     learns_virtual = "virtual" in METHODS[config.method].supervision
-    if learns_virtual and observations is None:
+    folders = (observations,) if isinstance(observations, Path) else tuple(map(Path, observations or ()))
+    named = {"observations" + f" {n}" * (n > 0): folder for n, folder in enumerate(folders)}
+    if learns_virtual and not folders:
         remedy = "run `mudg synthesize` and give its folder as --observations, or choose --method street_gaussians"
         raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
     refuse_overlap(out, {
-        "scene": scene, "fused": fused, "observations": observations, "start": start,
+        "scene": scene, "fused": fused, **named, "start": start,
         "virtual.lpips-weights": config.virtual.lpips_weights,
     })  # fmt: skip
     inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
@@ -122,9 +124,9 @@ def run(
     if begun is not None:
         inputs["start"] = begun.digest
     virtual: Mapping[str, ObservationSet] = {}
-    if learns_virtual and observations is not None:
-        virtual = virtual_sets(Path(observations))
-        inputs["observations"] = store.digest(Path(observations))
+    if learns_virtual:
+        virtual = virtual_sets(folders)
+        inputs |= {name: store.digest(folder) for name, folder in named.items()}
     if config.virtual.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
     folder = RunDir.open(out, OUTPUT, to_dict(config), inputs, overwrite)

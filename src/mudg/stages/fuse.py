@@ -16,18 +16,31 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mudg.base import log, store
+from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.config import to_dict
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
-from mudg.core.fusion import FusionReport, FusionRules, SweepShots, fuse_sweeps
+from mudg.core.color_match import match_cameras
+from mudg.core.fusion import (
+    STATIC,
+    FusionReport,
+    FusionRules,
+    SweepShots,
+    fuse_sweeps,
+    judge_track,
+    points_in_image,
+    separate,
+)
 from mudg.data.cloudfile import write_fused
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.report.top_view import TopView, draw_top_view
 from mudg.stages import batch
 from mudg.stages.config import FuseConfig
 
-_OUTPUT = VerbOutput("fuse", 1, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
+_OUTPUT = VerbOutput("fuse", 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
 _TOP_VIEW_PX = (1400, 1000)
+MATCHED_SWEEPS, MATCHED_IMAGES, MATCHED_WITHIN_S = 8, 5, 1.0
+"""To match the cameras' colours: sweeps, images of each camera per sweep, and how far in time they may be."""
 
 
 def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) -> Path:
@@ -47,12 +60,13 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
         return folder.reused()
     loaded = read_scene(scene)
     rules = rules_of(config)
-    cloud, report = fuse_sweeps(scene_sweeps(loaded, config), loaded.tracks, rules)
+    cameras = camera_colors(loaded, config, rules) if config.match_colors else SAME_COLORS
+    cloud, report = fuse_sweeps(scene_sweeps(loaded, config), loaded.tracks, rules, cameras)
     if report.sweeps and not len(cloud.static):
         log.warn(
             "fuse: no static point projects into any image; check calibration and clocks with `mudg doctor`"
         )
-    for words in describe(report):
+    for words in (*describe(report), *describe_colors(cameras)):
         log.info(f"fuse: {words}")
     write_fused(folder.path, cloud, report_record(report, rules))
     store.write_image(folder.path / "top.png", top_view(loaded, cloud, report))
@@ -88,6 +102,53 @@ def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
         shots = [_photo(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= config.max_image_gap_s]
         points = read_points(scene, sweep)
         yield SweepShots(sweep.time_s, sweep.world_from_lidar, points, shots)
+
+
+def camera_colors(scene: Scene, config: FuseConfig, rules: FusionRules) -> CameraColors:
+    """How the colours of the scene's cameras differ, from static points of some sweeps in images of about the same time."""
+    frames = [f for f in scene.frames if config.color_from_held_out or scene.split.get(f.id, "train") == "train"]
+    by_camera = {name: found for name in scene.cameras if (found := [f for f in frames if f.view.camera.name == name])}
+    if len(by_camera) < 2 or not scene.sweeps:
+        return SAME_COLORS
+    dynamic = [track for track in scene.tracks if judge_track(track, rules).moving]
+    chosen = np.unique(np.linspace(0, len(scene.sweeps) - 1, MATCHED_SWEEPS).round().astype(int))
+    found: list[dict[str, tuple[NDArray[np.intp], NDArray[np.uint8]]]] = []
+    for sweep in log.progress([scene.sweeps[i] for i in chosen], len(chosen), "matching colours"):
+        points = read_points(scene, sweep)
+        shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
+        still = separate(shots, dynamic, rules)[0] == STATIC
+        seen: dict[str, tuple[NDArray[np.intp], NDArray[np.uint8]]] = {}
+        for name, images in by_camera.items():
+            near = sorted(images, key=lambda frame: abs(frame.view.time_s - sweep.time_s))[:MATCHED_IMAGES]
+            ids, colors = np.zeros(0, np.intp), np.zeros((0, 3), np.uint8)
+            for frame in near:
+                if abs(frame.view.time_s - sweep.time_s) > MATCHED_WITHIN_S:
+                    continue
+                rows, column, row, _ = points_in_image(shots, frame.view, dynamic, rules)
+                new = still[rows] & ~np.isin(rows, ids)
+                ids = np.concatenate([ids, rows[new]])
+                colors = np.concatenate([colors, mean_around(read_image(scene, frame), row[new], column[new])])
+            seen[name] = ids, colors
+        found.append(seen)
+    return match_cameras(by_camera, found)
+
+
+def mean_around(rgb: NDArray[np.uint8], row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.uint8]:
+    """Mean colours u8[n, 3] of the 5x5 pixels around places of an image: a point that is a pixel off has about its colour."""
+    height, width = rgb.shape[:2]
+    total = np.zeros((len(row), 3), np.uint32)
+    for down in range(-2, 3):
+        for right in range(-2, 3):
+            total += rgb[(row + down).clip(0, height - 1), (column + right).clip(0, width - 1)]
+    return ((total + 12) // 25).astype(np.uint8)
+
+
+def describe_colors(cameras: CameraColors) -> list[str]:
+    """Which cameras' colours differ, in sentences."""
+    return [
+        f"colours of {name} brought to those of {cameras.reference}: gain {' '.join(f'{g:.2f}' for g in found.gain)}"
+        for name, found in cameras.to_common.items()
+    ]
 
 
 def _nearest(frames: list[Frame], time_s: float) -> Frame:

@@ -136,7 +136,7 @@ def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
 def without_classes(cloud: FusedCloud) -> FusedCloud:
     """The cloud without its points' classes."""
     bare = lambda points: replace(points, semantics=None)  # noqa: E731
-    return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()})
+    return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()}, cloud.colors)
 
 
 def make_trajectory(

@@ -1,104 +1,232 @@
 """Backend "gsplat": an adapter to the CUDA rasteriser of the same mathematics (gsplat >= 1.5.3). Importable without it.
 
-Differences that gsplat does not let us set: it caps alpha at 0.999 whatever ``alpha_max`` says, and it drops Gaussians by a radius of
-3.33 standard deviations, which equals the alpha cut to within rounding. Colours are evaluated here with gsplat's
-spherical harmonics, so that colours and features go through one pass.
+What differs: gsplat caps alpha at 0.999 whatever ``alpha_max`` says, calls a Gaussian visible whose rectangle reaches the
+image's border before its first pixel centre, and rounds radii up without our thousandth of a pixel. Everything else agrees to
+rounding. Colours are evaluated here with gsplat's spherical harmonics, and depths here, so that colours, features and
+depth go through one pass whose gradients are complete in every mode.
 """
 
 from __future__ import annotations
 
-import importlib
-import importlib.metadata
-import importlib.util
+import weakref
+from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
 from mudg.base import log
-from mudg.base.errors import NumericsError, ResourceError
-from mudg.base.types import RasterTrace, Render
+from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.types import Gaussians, RasterTrace, Render
+from mudg.core.raster import torch_twin
+from mudg.core.raster.gsplat_package import load
 from mudg.core.raster.request import Request, harmonics
 
-MINIMUM_VERSION: Final = (1, 5, 3)
 ALPHA_MAX: Final = 0.999
+_FARTHEST_M: Final = 1e30
+_SMALLEST_M: Final = 1e-9
+_LARGEST_PX: Final = 1e9
+"""Means and scales are held within these bounds: what lies beyond would overflow in gsplat's float32 and spread NaN."""
 
 
-def problem() -> str:
-    """Why gsplat cannot be used here, or "" if it can."""
-    if importlib.util.find_spec("gsplat") is None:
-        return "the package gsplat is not installed"
-    version = importlib.metadata.version("gsplat")
-    numbers = tuple(int(part) for part in version.split("+")[0].split(".")[:3] if part.isdigit())
-    if numbers < MINIMUM_VERSION:
-        return f"gsplat {version} is older than {'.'.join(map(str, MINIMUM_VERSION))}"
-    return "" if torch.cuda.is_available() else "no CUDA device is available"
+@dataclass(frozen=True, slots=True)
+class _Cameras:
+    """The views relative to ``origin`` [3]: viewmats [V, 4, 4] (cam from world; with a rolling shutter when the first row is
+    read, and ``last`` when the last one is), centers [V, 3], optical axes ``forward`` [V, 3], intrinsics [V, 3, 3]."""
+
+    origin: Tensor
+    viewmats: Tensor
+    last: Tensor | None
+    centers: Tensor
+    forward: Tensor
+    intrinsics: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _Splats:
+    """What gsplat receives of the Gaussians; channels [V, N, 3 + features + 1]: colour, features, depth."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacity: Tensor
+    channels: Tensor
 
 
 def render(request: Request, module: ModuleType | None = None) -> Render:
-    """Draw all views with one call of gsplat. ``module`` stands in for the gsplat package in tests. See
-    ``core.raster.rasterize``."""
-    gsplat = module or _load()
-    g, config, camera = request.gaussians, request.config, request.views[0].camera
-    if config.alpha_max != ALPHA_MAX:
-        log.info_once(f"rasterizer: gsplat caps alpha at {ALPHA_MAX}, not at {config.alpha_max}")
-    for name in ("means", "quats", "scales", "opacity"):
-        if not torch.isfinite(getattr(g, name)).all():
-            raise NumericsError("a Gaussian is not finite", where=f"gaussians.{name}")
-    poses = torch.stack([request.pose(index).to(g.means) for index in range(len(request.views))])
-    rotation, center = poses[:, :3, :3].transpose(1, 2), poses[:, :3, 3]
-    last_row = poses.new_tensor([0, 0, 0, 1.0]).expand(len(poses), 1, 4)
-    cam_from_world = torch.cat([torch.cat([rotation, -rotation @ center[:, :, None]], 2), last_row], 1)
-    directions = torch.nn.functional.normalize(g.means - center[:, None], dim=2)
-    sh = harmonics(g)
-    sh_per_view = sh.expand(len(poses), *sh.shape)
-    rgb = (gsplat.spherical_harmonics(request.sh_degree, directions, sh_per_view) + 0.5).clamp_min(0)
-    colors = rgb if g.extra is None else torch.cat([rgb, g.extra.expand(len(poses), *g.extra.shape)], 2)
-    intrinsics = torch.stack([torch.from_numpy(view.camera.matrix) for view in request.views]).to(g.means)
-    image, alpha, meta = gsplat.rasterization(
-        means=g.means, quats=g.quats, scales=g.scales, opacities=g.opacity, colors=colors,
-        viewmats=cam_from_world, Ks=intrinsics, width=camera.width, height=camera.height,
-        near_plane=config.near_m, far_plane=config.far_m, eps2d=config.blur_px2, sh_degree=None, packed=False,
-        render_mode="RGB+D", rasterize_mode="antialiased" if config.antialias else "classic", absgrad=request.absgrad,
-    )  # fmt: skip
+    """Draw all views. ``module`` stands in for the gsplat package in tests. See ``core.raster.rasterize``."""
+    _refuse(request)
+    if not len(request.gaussians):  # gsplat divides by their number
+        return torch_twin.render(replace(request, poses=(None,) * len(request.views)))
+    gsplat, g, cameras = module or load(), request.gaussians, _cameras(request)
+    if request.config.alpha_max != ALPHA_MAX:
+        log.info_once(f"rasterizer: gsplat caps alpha at {ALPHA_MAX}, not at {request.config.alpha_max}")
+    g, colorless = _finite(g)
+    image, alpha, meta = _draw(gsplat, request, cameras, _splats(gsplat, request, g, cameras))
+    trace = _trace(meta, request)
+    if colorless is not None and (trace.visible & colorless).any():
+        raise NumericsError(
+            "the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra"
+        )
     planes, alpha = image.permute(0, 3, 1, 2), alpha.permute(0, 3, 1, 2)
-    color, extra, depth_sum = planes[:, :3], planes[:, 3:-1], planes[:, -1:]
+    features = 0 if g.extra is None else g.extra.shape[1]
+    color, extra, depth_sum = planes[:, :3], planes[:, 3 : 3 + features], planes[:, 3 + features : 4 + features]
     if any(background is not None for background in request.backgrounds):
         behind = torch.stack([color.new_zeros(3) if b is None else b.to(color) for b in request.backgrounds])
         color = color + (1 - alpha) * behind[:, :, None, None]
     depth = depth_sum / alpha.clamp_min(1e-10)
-    trace = _trace(meta, request)
     if request.batched:
         return Render(rgb=color, depth=depth, alpha=alpha, extra=None if g.extra is None else extra, trace=trace)
-    return Render(rgb=color[0], depth=depth[0], alpha=alpha[0], extra=None if g.extra is None else extra[0], trace=trace)
+    return Render(
+        rgb=color[0], depth=depth[0], alpha=alpha[0], extra=None if g.extra is None else extra[0], trace=trace
+    )
 
 
-def _trace(meta: dict[str, Tensor], request: Request) -> RasterTrace:
-    """Trace whose means2d is a leaf: a hook copies the gradient of gsplat's own tensor [V, N, 2] to it."""
+def _refuse(request: Request) -> None:
+    g, config = request.gaussians, request.config
+    if g.means.dtype != torch.float32:
+        raise InputError("gsplat works on float32 tensors", where="gaussians.means", got=str(g.means.dtype))
+    if request.absgrad and (config.projection, config.primitive) != ("linear", "ellipsoid"):
+        raise UsageError("gsplat gives absolute gradients of projected means only of linearly projected ellipsoids",
+                         got=f"projection={config.projection!r}, primitive={config.primitive!r}",
+                         remedy="densify without them (mcmc), or draw linearly projected ellipsoids")  # fmt: skip
+    if config.projection == "unscented" and any(pose is not None and pose.requires_grad for pose in request.poses):
+        raise UsageError("gsplat gives no gradients of camera poses with projection='unscented'",
+                         remedy="keep the poses fixed, or set projection='linear'")  # fmt: skip
+
+
+def _finite(g: Gaussians) -> tuple[Gaussians, Tensor | None]:
+    """Refuse geometry that is not finite. Harmonics and features that are not are replaced by 0, since only those of drawn
+    Gaussians count; the second value [N] says where. One transfer to the CPU."""
+    colors = {"sh": g.sh, "sh_rest": g.sh_rest, "extra": g.extra}
+    given = {name: tensor for name, tensor in colors.items() if tensor is not None}
+    geometry = {name: getattr(g, name) for name in ("means", "quats", "scales", "opacity")}
+    flags = torch.stack([torch.isfinite(tensor).all() for tensor in (*geometry.values(), *given.values())]).tolist()
+    for name, fine in zip(geometry, flags, strict=False):
+        if not fine:
+            raise NumericsError("a Gaussian is not finite", where=f"gaussians.{name}")
+    if all(flags):
+        return g, None
+    bad = torch.stack([~torch.isfinite(tensor).flatten(1).all(1) for tensor in given.values()]).any(0)
+    clean = {n: torch.where(bad.view(-1, *[1] * (t.ndim - 1)), 0, t) for n, t in given.items()}
+    return Gaussians(means=g.means, quats=g.quats, scales=g.scales, opacity=g.opacity, sh=clean["sh"],
+                     extra=clean.get("extra"), node=g.node, sh_rest=clean.get("sh_rest")), bad  # fmt: skip
+
+
+def _cameras(request: Request) -> _Cameras:
+    """Poses are inverted in float64 and taken relative to the first camera, so that float32 serves far from the world's origin."""
+    like = request.gaussians.means
+    poses = torch.stack([request.pose(i).to(like.device, torch.float64) for i in range(len(request.views))])
+    origin = poses.detach().reshape(-1, 4, 4)[0, :3, 3].to(like.dtype)
+    rotation, centers = poses[..., :3, :3].transpose(-1, -2), poses[..., :3, 3] - origin.double()
+    last_row = poses.new_tensor([0, 0, 0, 1.0]).expand(*poses.shape[:-2], 1, 4)
+    viewmats = torch.cat([torch.cat([rotation, -rotation @ centers[..., None]], -1), last_row], -2).to(like.dtype)
+    last, forward = None, poses[..., :3, 2]
+    if poses.ndim == 4:
+        viewmats, last = viewmats.unbind(1)
+        centers, forward = centers.mean(1), torch.nn.functional.normalize(forward.mean(1), dim=1)
+    intrinsics = torch.stack([torch.from_numpy(view.camera.matrix) for view in request.views]).to(like)
+    return _Cameras(origin, viewmats, last, centers.to(like.dtype), forward.to(like.dtype), intrinsics)
+
+
+def _splats(gsplat: Any, request: Request, g: Gaussians, cameras: _Cameras) -> _Splats:
+    focal = max(max(view.camera.fx, view.camera.fy) for view in request.views)
+    means = (g.means - cameras.origin).clamp(-_FARTHEST_M, _FARTHEST_M)
+    scales = g.scales.clamp(_SMALLEST_M, _LARGEST_PX * request.config.near_m / focal)
+    usable = g.quats.square().sum(1, keepdim=True) > 1e-24
+    quats = torch.where(usable, g.quats, g.quats.new_tensor([1.0, 0, 0, 0]))
+    sh = harmonics(g)
+    channels = []
+    for center, forward in zip(cameras.centers, cameras.forward, strict=True):
+        offset = means - center
+        at_center = (offset == 0).all(1, keepdim=True)  # has no direction: gsplat would make NaN of it
+        direction = torch.where(at_center, forward.detach(), offset)
+        rgb = (gsplat.spherical_harmonics(request.sh_degree, direction, sh) + 0.5).clamp_min(0)
+        depth = offset @ forward[:, None]
+        channels.append(torch.cat([rgb, depth] if g.extra is None else [rgb, g.extra, depth], 1))
+    together = channels[0][None] if len(channels) == 1 else torch.stack(channels)
+    return _Splats(means, quats, scales, g.opacity, together)
+
+
+def _draw(gsplat: Any, request: Request, cameras: _Cameras, splats: _Splats) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Image [V, H, W, C or more], alpha [V, H, W, 1] and gsplat's intermediate results."""
+    config, camera = request.config, request.views[0].camera
+    common: dict[str, Any] = {
+        "means": splats.means, "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacity,
+        "width": camera.width, "height": camera.height, "near_plane": config.near_m, "far_plane": config.far_m,
+        "eps2d": config.blur_px2, "sh_degree": None, "render_mode": "RGB",
+    }  # fmt: skip
+    if config.primitive == "disc":
+        return _draw_discs(gsplat, common, cameras, splats)
+    if config.projection == "unscented":
+        return _draw_unscented(gsplat, common, cameras, splats, config.shutter)
+    return gsplat.rasterization(
+        **common, colors=splats.channels, viewmats=cameras.viewmats, Ks=cameras.intrinsics, packed=config.packed,
+        rasterize_mode="antialiased" if config.antialias else "classic", absgrad=request.absgrad,
+    )  # fmt: skip
+
+
+def _draw_discs(
+    gsplat: Any, common: dict[str, Any], cameras: _Cameras, splats: _Splats
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    # gsplat pads channels to a power of two with memory as it comes, which may hold NaN: padded here with zeros.
+    missing = (1 << (splats.channels.shape[2] - 1).bit_length()) - splats.channels.shape[2]
+    colors = torch.nn.functional.pad(splats.channels, (0, missing))
+    with torch.cuda.device_of(splats.means):  # gsplat makes tensors on the current device
+        image, alpha, *_, meta = gsplat.rasterization_2dgs(
+            **common, colors=colors, viewmats=cameras.viewmats, Ks=cameras.intrinsics, packed=False
+        )
+    return image, alpha, meta
+
+
+def _draw_unscented(
+    gsplat: Any, common: dict[str, Any], cameras: _Cameras, splats: _Splats, shutter: str
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """View by view: gsplat's kernel for responses in space is made for one camera."""
+    name = "GLOBAL" if shutter == "global" else f"ROLLING_{shutter.upper()}"
+    drawn = []
+    for index in range(len(cameras.viewmats)):
+        one = slice(index, index + 1)
+        drawn.append(gsplat.rasterization(
+            **common, rolling_shutter=gsplat.RollingShutterType[name], colors=splats.channels[one], viewmats=cameras.viewmats[one].detach(),
+            viewmats_rs=None if cameras.last is None else cameras.last[one].detach(), Ks=cameras.intrinsics[one],
+            packed=False, with_ut=True, with_eval3d=True,
+        ))  # fmt: skip
+    images, alphas, metas = zip(*drawn, strict=True)
+    meta = {name: torch.cat([one[name] for one in metas]) for name in ("means2d", "radii")}
+    return torch.cat(images), torch.cat(alphas), meta
+
+
+def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
+    """Trace whose means2d is a leaf: a hook copies the gradient of gsplat's own tensor to it. Rows that are not drawn are 0:
+    gsplat leaves them uninitialised, and out if it packs."""
     means2d, radii = meta["means2d"], meta["radii"]
-    if radii.ndim == 2:
-        radii = radii[:, :, None].expand(-1, -1, 2)
+    shape = (len(request.views), len(request.gaussians), 2)
+    rows = None if meta.get("gaussian_ids") is None else (meta["camera_ids"], meta["gaussian_ids"])
 
     def shaped(tensor: Tensor) -> Tensor:
-        return tensor if request.batched else tensor[0]
+        full = tensor if rows is None else tensor.new_zeros(shape).index_put(rows, tensor)
+        return full if request.batched else full[0]
 
-    leaf = shaped(means2d.detach()).clone().requires_grad_(means2d.requires_grad)
-    absolute = torch.zeros_like(leaf) if request.absgrad else None
-    trace = RasterTrace(leaf, shaped(radii.int()), shaped((radii > 0).all(2)), absolute)
+    size = shaped(radii)
+    visible = (size > 0).all(-1)
+    leaf = torch.where(visible[..., None], shaped(means2d.detach()), 0).requires_grad_(means2d.requires_grad)
+    absolute = torch.zeros_like(leaf) if request.absgrad and means2d.requires_grad else None
+    trace = RasterTrace(leaf, torch.where(visible[..., None], size, 0).int(), visible, absolute)
+    if not means2d.requires_grad:
+        return trace
+    # The trace owns gsplat's tensor and the hook knows the trace's only weakly: in a circle, both would outlive their use.
+    leaf.drawn_by_gsplat = means2d  # type: ignore[attr-defined]
+    reference = weakref.ref(leaf)
 
     def keep(gradient: Tensor) -> None:
-        leaf.grad = shaped(gradient) if leaf.grad is None else leaf.grad + shaped(gradient)
-        if trace.abs_grad2d is not None:
-            trace.abs_grad2d += shaped(means2d.absgrad)  # type: ignore[attr-defined]  # set by gsplat in its backward
+        mine = reference()
+        if mine is None:
+            return
+        mine.grad = shaped(gradient) if mine.grad is None else mine.grad + shaped(gradient)
+        if absolute is not None:
+            absolute.add_(shaped(mine.drawn_by_gsplat.absgrad))  # type: ignore[attr-defined]  # set by gsplat in its backward
 
-    if means2d.requires_grad:
-        means2d.register_hook(keep)
+    meta.get("gradient_2dgs", means2d).register_hook(keep)  # of discs gsplat keeps it beside
     return trace
-
-
-def _load() -> ModuleType:
-    reason = problem()
-    if reason:
-        raise ResourceError("raster backend 'gsplat' is not available", got=reason, remedy="pip install 'mudg[gsplat]'")
-    return importlib.import_module("gsplat")

@@ -55,8 +55,12 @@ class ConditionRules:
     """Side of the square a point covers, in pixels."""
     same_time_s: float = 0.06
     """Recorded images nearer in time than this may also colour dynamic objects."""
-    images_per_view: int = 4
+    images_per_view: int = 6
     """How many recorded images are tried per view, nearest in time (then in place) first."""
+    other_camera_s: float = 0.1
+    """Images of other cameras count as farther away in time by this."""
+    least_overlap: float = 0.02
+    """Images that show less than this share of a view are not tried."""
     hidden_share: float = 0.08
     """A pixel is hidden in a recorded image if a surface there is nearer by this share of its depth plus 0.3 m."""
     warp: bool = True
@@ -89,6 +93,8 @@ class ProjectedPoints:
     semantics: Tensor
 
 
+OVERLAP_GRID = 24, 16
+"""Columns and rows of the places of a view by which it is told how much of it another image shows."""
 RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
 
@@ -190,7 +196,8 @@ def warp(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WarpSource:
-    """A recorded image made ready for warping: rgb f32[3,h,w] in [0,1], depth f32[h,w] m (filled), moving bool[h,w],
+    """A recorded image made ready for warping: rgb f32[3,h,w] in common colours (of 0..1 or a little beyond), depth f32[h,w] m (filled),
+    moving bool[h,w],
     semantics u8[h,w] (255 = unknown)."""
 
     view: View
@@ -296,15 +303,18 @@ def _condition_of_view(
     color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     if not (rules.warp and recorded):
         return (color, depth[None], here.measured[None], found[None], color, ids[None], ids[None]), here.render
-    order = _order_of_images(view, recorded, rules)
+    order = _order_of_images(view, depth, recorded, rules)
     nearest = source(order[0])
     x, y, _ = carry(view, torch.full((1, *depth.shape), rules.backdrop_m), nearest.view)
     backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
+    shown = points.cloud.colors
+    backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
     for number in order:
         image = source(number)
         fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
         rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
+        rgb = shown.image_of(view.camera.name, rgb).clamp(0, 1) if shown.to_common else rgb
         new = new & ~found if fresh else new & ~found & ~here.moving
         color = torch.where(new, rgb, color)
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
@@ -354,15 +364,27 @@ def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
 
 
-def _order_of_images(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
-    """The images to try for a view: nearest in time first (steps of 20 ms), the same camera before others, then by distance."""
+def _order_of_images(view: View, depth: Tensor, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
+    """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the same camera
+    before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
 
     def rank(number: int) -> tuple[float, bool, float]:
         other = recorded[number].view
         distance_m = float(np.linalg.norm(other.center_world - view.center_world))
-        return round(abs(other.time_s - view.time_s) / 0.02), other.camera.name != view.camera.name, distance_m
+        elsewhere = other.camera.name != view.camera.name
+        return round((abs(other.time_s - view.time_s) + rules.other_camera_s * elsewhere) / 0.02), elsewhere, distance_m
 
-    return sorted(range(len(recorded)), key=rank)[: rules.images_per_view]
+    columns, rows = min(view.camera.width, OVERLAP_GRID[0]), min(view.camera.height, OVERLAP_GRID[1])
+    coarse = view.resized(columns, rows)
+    there = functional.interpolate(depth[None, None], size=(rows, columns), mode="nearest-exact")[0]
+    chosen: list[int] = []
+    for number in sorted(range(len(recorded)), key=rank):
+        if len(chosen) == rules.images_per_view:
+            break
+        other = recorded[number].view
+        if not chosen or float(inside(other, *carry(coarse, there, other)).float().mean()) >= rules.least_overlap:
+            chosen.append(number)
+    return chosen
 
 
 def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: ConditionRules) -> WarpSource:
@@ -373,7 +395,8 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     view = recorded.view.resized(width, height)
     here = points.look(view)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
-    return WarpSource(view, rgb, here.depth, here.moving, _ids_at(recorded, width, height))
+    common = points.cloud.colors.image_to_common(camera.name, rgb)
+    return WarpSource(view, common, here.depth, here.moving, _ids_at(recorded, width, height))
 
 
 def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:

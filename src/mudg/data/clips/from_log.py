@@ -231,7 +231,7 @@ def thinned_cloud(cloud: FusedCloud, share: float, rng: np.random.Generator) -> 
         semantics = None if points.semantics is None else points.semantics[keep]
         return PointCloud(points.xyz[keep], points.rgb[keep], points.frame, semantics)
 
-    return FusedCloud(part(cloud.static), {name: part(points) for name, points in cloud.objects.items()})
+    return FusedCloud(part(cloud.static), {name: part(points) for name, points in cloud.objects.items()}, cloud.colors)
 
 
 def _stacked(parts: Sequence[Condition]) -> Condition:

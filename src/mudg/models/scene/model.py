@@ -26,6 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
@@ -54,6 +55,7 @@ class SceneModel:
         classes: train ids of the semantic channels, in channel order; empty = no semantics.
         sh_degree: of the colour columns.
         facts: JSON values kept with the model (method, scene id, ...).
+        colors: how the cameras of the log show the Gaussians' colours, which are common ones.
     """
 
     table: Table
@@ -62,6 +64,7 @@ class SceneModel:
     classes: tuple[int, ...]
     sh_degree: int
     facts: dict[str, Any] = field(default_factory=dict)
+    colors: CameraColors = SAME_COLORS
     _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
 
     def counts(self) -> list[int]:
@@ -139,6 +142,8 @@ class SceneModel:
             tensors |= {f"{index}/{name}": value for name, value in own.items()}
         tensors.setdefault("none", torch.zeros(1))
         values = {"nodes": nodes, "classes": list(self.classes), "sh_degree": self.sh_degree, "facts": self.facts}
+        if self.colors.to_common:
+            values["camera_colors"] = self.colors.record()
         return values, {"gaussians": self.table.state(), "nodes": tensors}
 
     @classmethod
@@ -168,7 +173,8 @@ class SceneModel:
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
-        return cls(table, tuple(nodes), sky, classes, int(values["sh_degree"]), dict(values["facts"]))
+        colors = CameraColors.of_record(values["camera_colors"]) if "camera_colors" in values else SAME_COLORS
+        return cls(table, tuple(nodes), sky, classes, int(values["sh_degree"]), dict(values["facts"]), colors)
 
 
 def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussians:
@@ -208,8 +214,9 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
 
 
 def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> Tensor:
-    """Colours ``[3, H, W]`` over the sky: ``rgb + (1 - alpha) * sky``."""
-    return rgb if model.sky is None else native_ops.over(rgb, alpha, model.sky.coarse_picture(view))
+    """Colours ``[3, H, W]`` over the sky, ``rgb + (1 - alpha) * sky``, as the view's camera shows them."""
+    common = rgb if model.sky is None else native_ops.over(rgb, alpha, model.sky.coarse_picture(view))
+    return model.colors.image_of(view.camera.name, common)
 
 
 def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:

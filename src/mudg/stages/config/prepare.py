@@ -92,6 +92,9 @@ class FuseConfig:
     """Do not colour points that lie behind a nearer surface."""
     max_image_gap_s: float = Field(default=0.06, ge=0)
     """A sweep's points are coloured only from images within this time, in seconds."""
+    match_colors: bool = True
+    """Find how exposure and white balance differ between cameras, from points that several of them saw, and correct it in clouds, fits and
+    generated views. A camera's own views keep its colours."""
     color_from_held_out: bool = False
     """Also take colours from held-out images. Scores at held-out frames are then not meaningful."""
     box_growth_m: float = Field(default=0.1, ge=0, le=2)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mudg.base import geometry, log, seeds
+from mudg.base.camera_colors import CameraColors
 from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
@@ -75,7 +76,7 @@ def start_model(
     if len(fused.static) == 0:
         raise InputError("the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene")
     kinds = METHODS[config.method].nodes
-    blocks = [_static_columns(fused.static, views, classes, config)]
+    blocks = [_static_columns(fused, views, classes, config)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]
     if "objects" in kinds:
         share = config.start.gaussians // max(1, len(fused.objects))
@@ -85,19 +86,20 @@ def start_model(
             nodes.append(node)
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
-    sky = _painted_sky(views) if "sky" in kinds else None
+    sky = _painted_sky(views, fused.colors) if "sky" in kinds else None
     static = len(blocks[0]["means"])
     log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
-    return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree)
+    return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors)
 
 
 def _static_columns(
-    cloud: PointCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
+    fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
 ) -> Mapping[str, torch.Tensor]:
+    cloud = fused.static
     centers = np.stack([view.view.center_world for view in views]).astype(np.float32)
     rows = _thinned(cloud.xyz, centers, config)
     points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
-    filled = _fill_unreached(views, points.xyz, classes, config.start.far_m)
+    filled = _fill_unreached(views, points.xyz, classes, config.start.far_m, fused.colors)
     return (points if filled is None else StartPoints.joined([points, filled])).columns(classes, config.sh_degree)
 
 
@@ -150,18 +152,20 @@ def _object_columns(
 
 
 def _fill_unreached(
-    views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float
+    views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float, cameras: CameraColors
 ) -> StartPoints | None:
     """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
     labelled = [view for view in views if view.channels is not None]
     if not labelled or not classes:
         return None
     chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
-    points = StartPoints.joined([_fill_view(view, xyz, classes, far_m) for view in chosen])
+    points = StartPoints.joined([_fill_view(view, xyz, classes, far_m, cameras) for view in chosen])
     return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))] if len(points) else None
 
 
-def _fill_view(stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float) -> StartPoints:
+def _fill_view(
+    stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float, cameras: CameraColors
+) -> StartPoints:
     view, cell = stored.view, FILL_CELL_PX
     rows, columns = view.camera.height // cell, view.camera.width // cell
     center_row = (np.arange(rows) * cell + cell // 2)[:, None]
@@ -185,7 +189,7 @@ def _fill_view(stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int,
     row, column = wanted.nonzero()
     uv = np.stack([column * cell + cell / 2, row * cell + cell / 2], 1)
     z = guess[row, column]
-    color = stored.rgb[row * cell + cell // 2, column * cell + cell // 2]
+    color = cameras.bytes_to_common(view.camera.name, stored.rgb[row * cell + cell // 2, column * cell + cell // 2])
     points = geometry.unproject(view, uv, z).astype(np.float32)
     return StartPoints(points, color, label[row, column], (0.5 * cell * z / view.camera.fx).astype(np.float32))
 
@@ -203,8 +207,8 @@ def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns
     return np.where(np.isfinite(depth), depth, np.minimum(padded[:, :-2], padded[:, 2:]))
 
 
-def _painted_sky(views: Sequence[StoredView]) -> SkyNode:
-    """A sky that starts with the mean recorded colour per direction."""
+def _painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
+    """A sky that starts with the mean recorded colour per direction, in common colours."""
     sky = SkyNode.uniform(SKY_ROWS)
     directions, colors = [], []
     for stored in views:
@@ -215,7 +219,7 @@ def _painted_sky(views: Sequence[StoredView]) -> SkyNode:
         row, column = row * 2, column * 2
         rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
         directions.append(rays @ stored.view.world_from_cam[:3, :3].T)
-        colors.append(stored.rgb[row, column].astype(np.float32) / 255)
+        colors.append(cameras.bytes_to_common(camera.name, stored.rgb[row, column]).astype(np.float32) / 255)
     if directions:
         sky.fill(np.concatenate(directions), np.concatenate(colors))
     return sky

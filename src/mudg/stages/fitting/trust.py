@@ -107,7 +107,7 @@ def unseen_rows(
     objects = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
     found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
     for stored, unseen_here in zip(virtual, unseen):
-        for index, seeds_here in _seeds_of(stored, unseen_here, objects, model.classes):
+        for index, seeds_here in _seeds_of(stored, unseen_here, objects, model):
             found[index].append(seeds_here)
     columns, owners = [], []
     total = sum(len(part) for parts in found.values() for part in parts)
@@ -126,7 +126,7 @@ def unseen_rows(
 
 
 def _seeds_of(
-    stored: StoredView, unseen: NDArray[np.bool_], objects: dict[int, RigidNode], classes: tuple[int, ...]
+    stored: StoredView, unseen: NDArray[np.bool_], objects: dict[int, RigidNode], model: SceneModel
 ) -> list[tuple[int, StartPoints]]:
     """Points of one virtual view's unseen pixels, by node index."""
     if stored.depth is None:
@@ -144,9 +144,9 @@ def _seeds_of(
     row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
     channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channels is None else stored.channels[row, column]
-    train_id = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))[np.minimum(channel, len(classes))]
+    train_id = np.append(np.array(model.classes, np.uint8), np.uint8(UNLABELLED))[np.minimum(channel, len(model.classes))]
     scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
-    rgb = stored.rgb[row, column]
+    rgb = model.colors.bytes_to_common(stored.view.camera.name, stored.rgb[row, column])
     owner = np.zeros(len(row), np.int64)
     local = points.copy()
     for index, node in objects.items():

@@ -197,15 +197,21 @@ def load_recorded(
     return tuple(stored)
 
 
-def virtual_sets(path: Path) -> dict[str, ObservationSet]:
-    """The sets of virtual observations below ``path``, by name; only their indices are read.
+def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
+    """The sets of virtual observations below some folders, by name; only their indices are read.
 
     Raises:
-        InputError: there is none, or one of them holds recorded views.
+        InputError: a folder has none, two have sets of one name, or one of them holds recorded views.
     """
-    sets = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
-    if not sets:
-        raise InputError("this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first")
+    sets: dict[str, ObservationSet] = {}
+    for path in folders:
+        found = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
+        if not found:
+            raise InputError("this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first")
+        if twice := sorted(set(found) & set(sets)):
+            raise InputError("two folders hold virtual views of the same name", where=str(path), got=", ".join(twice[:4]),
+                             remedy="give one of them")  # fmt: skip
+        sets |= found
     for found in sets.values():
         if found.kind == "recorded":
             raise InputError("recorded views among the virtual ones: held-out views must not be trained on", where=str(found.path),

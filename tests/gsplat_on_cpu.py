@@ -1,0 +1,393 @@
+"""gsplat without CUDA: the real package with stand-ins for its compiled kernels.
+
+Everything that gsplat does in Python runs as it is: argument checks, autograd functions, packing, tiles, what it returns. Only
+the compiled functions are replaced, by gsplat's own references in torch (`gsplat.cuda._torch_impl`) and, where those need further
+packages, by the formulas of the kernels' source (alpha cut 1/255, cap 0.999, stop at a transmittance of 1e-4, radii that know the
+opacity). Backward kernels are autograd of the forward ones. As on a GPU, what a kernel does not write is whatever was in memory:
+here NaN.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+ALPHA_MIN, ALPHA_MAX, STOP = 1 / 255, 0.999, 1e-4
+
+
+def install(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The package gsplat, drawing with the stand-ins until the test ends."""
+    gsplat = pytest.importorskip(
+        "gsplat", reason="gsplat is not installed (pip install gsplat; it needs no CUDA for this test)"
+    )
+    backend = ModuleType("gsplat.cuda._backend")
+    backend._C = Kernels()  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
+    monkeypatch.setattr("gsplat.rendering.torch", _TorchOnCpu())
+    monkeypatch.setattr("torch.cuda.synchronize", lambda *_: None)
+    return gsplat
+
+
+class _TorchOnCpu:
+    """torch, but for one call of gsplat that names the device "cuda"."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(torch, name)
+
+    def zeros_like(self, tensor: Tensor, device: str | None = None, **other: Any) -> Tensor:
+        assert device == "cuda"
+        return torch.zeros_like(tensor, **other)
+
+
+def _gradients(outputs: list[Tensor], cotangents: list[Tensor], inputs: list[Tensor]) -> list[Tensor]:
+    found = torch.autograd.grad(outputs, inputs, cotangents, allow_unused=True)
+    return [torch.zeros_like(one) if g is None else g for one, g in zip(inputs, found, strict=True)]
+
+
+def _leaves(*tensors: Tensor) -> list[Tensor]:
+    return [tensor.detach().clone().requires_grad_() for tensor in tensors]
+
+
+def _tiles(width: int, height: int, tile: int, offsets: Tensor, ids: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """For every tile of every image: image, flat pixel indices, entries front to back."""
+    down, across = offsets.shape[-2:]
+    ends = [*offsets.flatten().tolist(), len(ids)]
+    for index in range(len(ends) - 1):
+        image, place = divmod(index, down * across)
+        ys = torch.arange(place // across * tile, min((place // across + 1) * tile, height))
+        xs = torch.arange(place % across * tile, min((place % across + 1) * tile, width))
+        yield image, (ys[:, None] * width + xs).flatten(), ids[ends[index] : ends[index + 1]].long()
+
+
+def _blend(alpha: Tensor, sigma: Tensor, channels: Tensor) -> tuple[Tensor, Tensor]:
+    """alpha, sigma [P, M] and channels [M, C] to [P, C] and accumulated alpha [P, 1], as the kernels do it."""
+    alpha = alpha.clamp_max(ALPHA_MAX)
+    alpha = torch.where((alpha >= ALPHA_MIN) & (sigma >= 0), alpha, 0)
+    alpha = torch.where(torch.cumprod(1 - alpha.detach(), 1) > STOP, alpha, 0)
+    left = torch.cumprod(torch.cat([alpha.new_ones(len(alpha), 1), 1 - alpha], 1), 1)
+    return (alpha * left[:, :-1]) @ channels, 1 - left[:, -1:]
+
+
+def _centers(pixels: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    return pixels % width + 0.5, pixels // width + 0.5
+
+
+class Kernels:
+    """The functions of gsplat's compiled module that this project reaches."""
+
+    CameraModelType = ShutterType = None  # gsplat looks their members up in the module
+    PINHOLE = "pinhole"
+
+    def __init__(self) -> None:
+        for name in (
+            "GLOBAL",
+            "ROLLING_TOP_TO_BOTTOM",
+            "ROLLING_LEFT_TO_RIGHT",
+            "ROLLING_BOTTOM_TO_TOP",
+            "ROLLING_RIGHT_TO_LEFT",
+        ):
+            setattr(self, name, name)
+        self.UnscentedTransformParameters = self.FThetaCameraDistortionParameters = SimpleNamespace
+
+    # ---- harmonics ----
+
+    def spherical_harmonics_fwd(self, degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None) -> Tensor:
+        from gsplat.cuda._torch_impl import _spherical_harmonics
+
+        return _spherical_harmonics(degree, dirs, coeffs)
+
+    def spherical_harmonics_bwd(self, bases: int, degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None,
+                                v_colors: Tensor, wants_dirs: bool) -> tuple[Tensor, Tensor]:  # fmt: skip
+        assert dirs.norm(dim=-1).min() > 0  # the kernel divides by it
+        with torch.enable_grad():
+            dirs, coeffs = _leaves(dirs, coeffs)
+            v_coeffs, v_dirs = _gradients(
+                [self.spherical_harmonics_fwd(degree, dirs, coeffs, masks)], [v_colors], [coeffs, dirs]
+            )
+        return v_coeffs, v_dirs
+
+    # ---- projection of ellipsoids ----
+
+    def _project(
+        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, rest: tuple[Any, ...]
+    ) -> Any:
+        from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+
+        covars, _ = _quat_scale_to_covar_preci(quats, scales, True, False)
+        return _fully_fused_projection(means, covars, viewmats, Ks, *rest)  # type: ignore[arg-type]
+
+    def projection_ewa_3dgs_fused_fwd(self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, opacities: Tensor,
+                                      viewmats: Tensor, Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
+        width, height, eps2d, near, far, clip, compensate, model = rest
+        for tensor in (means, quats, scales, opacities, viewmats, Ks):
+            assert tensor.dtype == torch.float32
+            assert tensor.is_contiguous()
+            assert torch.isfinite(tensor).all()
+        settings = (width, height, eps2d, near, far, True, model)
+        _, means2d, depths, conics, factor = self._project(means, quats, scales, viewmats, Ks, settings)
+        seen = opacities * factor if compensate else opacities.expand_as(depths)
+        det = conics[..., 0] * conics[..., 2] - conics[..., 1] ** 2
+        extend = (2 * (seen / ALPHA_MIN).clamp_min(1e-9).log()).clamp_min(0).sqrt().clamp_max(3.33)
+        size = torch.ceil(extend[..., None] * (conics[..., [2, 0]] / det[..., None]).sqrt())
+        limit = torch.tensor([width, height])
+        drawn = (depths >= near) & (depths <= far) & (seen >= ALPHA_MIN) & (size > clip).any(-1)
+        drawn &= ((means2d + size > 0) & (means2d - size < limit)).all(-1)
+        radii = torch.where(drawn[..., None], size, 0).int()
+        poisoned = [
+            torch.where(drawn.view(*drawn.shape, *[1] * (t.ndim - 2)), t, torch.nan) for t in (means2d, depths, conics)
+        ]
+        return radii, *poisoned, torch.where(drawn, factor, 0) if compensate else None
+
+    def _projection_gradients(
+        self, where: tuple[Tensor, ...], inputs: tuple[Any, ...], cotangents: list[Any]
+    ) -> list[Tensor]:
+        means, quats, scales, viewmats, Ks, width, height, eps2d, model = inputs
+        used, row = torch.unique(where[1], return_inverse=True)  # a kernel touches no other rows
+        with torch.enable_grad():
+            leaves = _leaves(means, quats, scales, viewmats)
+            parts = [leaf[used] for leaf in leaves[:3]]
+            _, *outputs = self._project(
+                *parts, leaves[3], Ks, (width, height, eps2d, 0.0, 1e10, cotangents[3] is not None, model)
+            )
+            pairs = [(out[where[0], row], v) for out, v in zip(outputs, cotangents, strict=True) if v is not None]
+            return _gradients([out for out, _ in pairs], [v for _, v in pairs], leaves)
+
+    def projection_ewa_3dgs_fused_bwd(self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor,
+                                      Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
+        width, height, eps2d, model, radii, _, _, v_means2d, v_depths, v_conics, v_factor, _ = rest
+        drawn = torch.nonzero((radii > 0).all(-1), as_tuple=True)
+        cotangents = [None if v is None else v[drawn] for v in (v_means2d, v_depths, v_conics, v_factor)]
+        v = self._projection_gradients(
+            drawn, (means, quats, scales, viewmats, Ks, width, height, eps2d, model), cotangents
+        )
+        return v[0], None, v[1], v[2], v[3]
+
+    def projection_ewa_3dgs_packed_fwd(
+        self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, *rest: Any
+    ) -> Any:
+        radii, *values = self.projection_ewa_3dgs_fused_fwd(means, covars, quats, scales, *rest)
+        camera, gaussian = torch.nonzero((radii > 0).all(-1), as_tuple=True)
+        rows = [None if value is None else value[camera, gaussian] for value in (radii, *values)]
+        return torch.zeros(0), torch.zeros_like(camera), camera, gaussian, *rows
+
+    def projection_ewa_3dgs_packed_bwd(self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor,
+                                       Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
+        width, height, eps2d, model, _, camera, gaussian, _, _, *cotangents, _, sparse = rest
+        assert not sparse
+        inputs = (means, quats, scales, viewmats, Ks, width, height, eps2d, model)
+        v = self._projection_gradients((camera, gaussian), inputs, cotangents)
+        return v[0], None, v[1], v[2], v[3]
+
+    # ---- tiles ----
+
+    def intersect_tile(self, means2d: Tensor, radii: Tensor, depths: Tensor, images: Tensor | None, gaussians: Tensor | None,
+                       count: int, *rest: Any) -> Any:  # fmt: skip
+        from gsplat.cuda._torch_impl import _isect_tiles
+
+        tile, across, down, sort, _ = rest
+        if images is None or gaussians is None:
+            return _isect_tiles(means2d.nan_to_num(), radii, depths.nan_to_num(), tile, across, down, sort)
+        most, place = int(gaussians.max()) + 1 if len(gaussians) else 1, (images, gaussians)
+        full = [v.new_zeros(count, most, *v.shape[1:]).index_put(place, v) for v in (means2d, radii, depths)]
+        per_gauss, codes, ids = _isect_tiles(*full, tile, across, down, sort)
+        row = torch.full((count, most), -1).index_put(place, torch.arange(len(images)))
+        return per_gauss[place], codes, row.flatten()[ids.long()].int()
+
+    def intersect_offset(self, codes: Tensor, count: int, across: int, down: int) -> Tensor:
+        from gsplat.cuda._torch_impl import _isect_offset_encode
+
+        return _isect_offset_encode(codes, count, across, down)
+
+    # ---- pixels: linear projection ----
+
+    def _pixels(self, colors: Tensor, size: tuple[int, int, int], offsets: Tensor, ids: Tensor, response: Any,
+                masked: tuple[Any, Any]) -> tuple[Tensor, Tensor]:  # fmt: skip
+        assert masked == (None, None)  # backgrounds and masks
+        width, height, tile = size
+        images = offsets.numel() // offsets.shape[-1] // offsets.shape[-2]
+        blended, image_of, pixels_of = [], [], []
+        for image, pixels, entries in _tiles(width, height, tile, offsets, ids):
+            alpha, sigma = response(image, pixels, entries)
+            blended.append(_blend(alpha, sigma, colors[entries]))
+            image_of.append(torch.full_like(pixels, image))
+            pixels_of.append(pixels)
+        place = (torch.cat(image_of), torch.cat(pixels_of))
+        made = []
+        for part in range(2):
+            values = torch.cat([one[part] for one in blended])
+            canvas = values.new_zeros(images, width * height, values.shape[1]).index_put(place, values)
+            made.append(canvas.view(*offsets.shape[:-2], height, width, -1))
+        return made[0], made[1]
+
+    def _flat_response(self, means: Tensor, conics: Tensor, opacity: Tensor, width: int, spread: list[Any]) -> Any:
+        def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
+            x, y = _centers(pixels, width)
+            # A copy of the means per pixel, so that absolute gradients can be summed over pixels.
+            here = (
+                means[entries].detach().expand(len(pixels), -1, -1).clone().requires_grad_()
+                if spread
+                else means[entries][None]
+            )
+            if spread:
+                spread.append((here, entries))
+            dx, dy = here[..., 0] - x[:, None], here[..., 1] - y[:, None]
+            c = conics[entries]
+            sigma = 0.5 * (c[:, 0] * dx * dx + c[:, 2] * dy * dy) + c[:, 1] * dx * dy
+            return opacity[entries] * torch.exp(-sigma), sigma
+
+        return response
+
+    def rasterize_to_pixels_3dgs_fwd(
+        self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
+    ) -> Any:
+        background, mask, width, height, tile, offsets, ids = rest
+        means, conics, colors, opacity = (t.reshape(-1, *shape) for t, shape in
+                                          ((means2d, (2,)), (conics, (3,)), (colors, colors.shape[-1:]), (opacities, ())))  # fmt: skip
+        response = self._flat_response(means, conics, opacity, width, [])
+        image, alpha = self._pixels(colors, (width, height, tile), offsets, ids, response, (background, mask))
+        return image, alpha, torch.zeros(0)
+
+    def rasterize_to_pixels_3dgs_bwd(
+        self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
+    ) -> Any:
+        background, mask, width, height, tile, offsets, ids, _, _, v_image, v_alpha, absolute = rest
+        with torch.enable_grad():
+            flat = [
+                t.reshape(-1, *shape) for t, shape in ((conics, (3,)), (colors, colors.shape[-1:]), (opacities, ()))
+            ]
+            leaves = _leaves(*flat)
+            spread: list[Any] = [None]
+            response = self._flat_response(means2d.reshape(-1, 2), leaves[0], leaves[2], width, spread)
+            image, alpha = self._pixels(leaves[1], (width, height, tile), offsets, ids, response, (background, mask))
+            copies = spread[1:]
+            v = _gradients([image, alpha], [v_image, v_alpha], [*leaves, *(here for here, _ in copies)])
+        v_means = torch.zeros(means2d.reshape(-1, 2).shape)
+        v_abs = torch.zeros_like(v_means)
+        for gradient, (_, entries) in zip(v[3:], copies, strict=True):
+            v_means.index_add_(0, entries, gradient.sum(0))
+            v_abs.index_add_(0, entries, gradient.abs().sum(0))
+        return (v_abs.view_as(means2d) if absolute else None, v_means.view_as(means2d), v[0].view_as(conics),
+                v[1].view_as(colors), v[2].view_as(opacities))  # fmt: skip
+
+    # ---- responses in space ----
+
+    def projection_ut_3dgs_fused(self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor,
+                                 viewmats_rs: Tensor | None, Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
+        """Only what the pixels need of it: the order, and rectangles that certainly hold every response (the whole image)."""
+        width, height, _, near, far, *_ = rest
+        middle = viewmats if viewmats_rs is None else (viewmats + viewmats_rs) / 2
+        here = means @ middle[:, :3, :3].transpose(1, 2) + middle[:, None, :3, 3]
+        means2d = (here @ Ks.transpose(1, 2))[..., :2] / here[..., 2:]
+        drawn = (here[..., 2] >= near) & (here[..., 2] <= far) & (opacities >= ALPHA_MIN)
+        radii = torch.where(drawn[..., None], width + height + means2d.abs(), 0).int()
+        conics = torch.full((*drawn.shape, 3), torch.nan)
+        return (
+            radii,
+            torch.where(drawn[..., None], means2d, torch.nan),
+            torch.where(drawn, here[..., 2], torch.nan),
+            conics,
+            None,
+        )
+
+    def rasterize_to_pixels_from_world_3dgs_fwd(self, means: Tensor, quats: Tensor, scales: Tensor, colors: Tensor,
+                                                opacities: Tensor, *rest: Any) -> Any:  # fmt: skip
+        from gsplat.cuda._torch_impl import _quat_to_rotmat
+
+        background, mask, width, height, tile, first, last, Ks, _, _, shutter, *lens, offsets, ids = rest
+        assert first.shape[0] == 1
+        rotation = _quat_to_rotmat(quats)
+        opacity = opacities.reshape(-1)
+
+        def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
+            x, y = _centers(pixels, width)
+            rows = {"TOP_TO_BOTTOM": y.floor() / (height - 1), "LEFT_TO_RIGHT": x.floor() / (width - 1),
+                    "BOTTOM_TO_TOP": (height - y.ceil()) / (height - 1), "RIGHT_TO_LEFT": (width - x.ceil()) / (width - 1)}  # fmt: skip
+            time = rows.get(shutter.removeprefix("ROLLING_"), torch.zeros_like(x))[:, None]
+            end = first if last is None else last
+            assert torch.equal(end[0, :3, :3], first[0, :3, :3])  # a turning camera would need spherical interpolation
+            turn, shift = first[0, :3, :3], (1 - time) * first[0, :3, 3] + time * end[0, :3, 3]
+            ray = (
+                torch.stack([(x - Ks[0, 0, 2]) / Ks[0, 0, 0], (y - Ks[0, 1, 2]) / Ks[0, 1, 1], torch.ones_like(x)], 1)
+                @ turn
+            )
+            origin = -shift @ turn
+            whiten = rotation[entries].transpose(1, 2) / scales[entries][:, :, None]
+            offset = torch.einsum("mij,pmj->pmi", whiten, origin[:, None] - means[entries])
+            along = torch.nn.functional.normalize(torch.einsum("mij,pj->pmi", whiten, ray), dim=2)
+            power = 0.5 * torch.linalg.cross(along, offset).square().sum(2)
+            return opacity[entries] * torch.exp(-power), power
+
+        flat = colors.reshape(-1, colors.shape[-1])
+        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, (background, mask))
+        return image, alpha, torch.zeros(0)
+
+    def rasterize_to_pixels_from_world_3dgs_bwd(self, *arguments: Any) -> Any:
+        *inputs, _, _, v_image, v_alpha = arguments
+        with torch.enable_grad():
+            leaves = _leaves(*inputs[:5])
+            image, alpha, _ = self.rasterize_to_pixels_from_world_3dgs_fwd(*leaves, *inputs[5:])
+            return _gradients([image, alpha], [v_image, v_alpha], leaves)
+
+    # ---- discs ----
+
+    def projection_2dgs_fused_fwd(
+        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
+    ) -> Any:
+        from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs
+
+        width, height, _, near, far, _ = rest
+        return _fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near, far)
+
+    def projection_2dgs_fused_bwd(
+        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
+    ) -> Any:
+        width, height, radii, _, v_means2d, v_depths, v_normals, v_rays, _ = rest
+        drawn = (radii > 0).all(-1)
+        with torch.enable_grad():
+            leaves = _leaves(means, quats, scales, viewmats)
+            _, means2d, depths, rays, normals = self.projection_2dgs_fused_fwd(
+                *leaves, Ks, width, height, 0.3, 0.01, 1e10, 0.0
+            )
+            pairs = ((means2d, v_means2d), (depths, v_depths), (rays, v_rays), (normals, v_normals))
+            return _gradients([out[drawn] for out, _ in pairs], [v[drawn] for _, v in pairs], leaves)
+
+    def _disc_response(self, means: Tensor, rays: Tensor, opacity: Tensor, width: int) -> Any:
+        def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
+            x, y = _centers(pixels, width)
+            ray = rays[entries]
+            across = torch.linalg.cross(
+                -ray[:, 0] + ray[:, 2] * x[:, None, None], -ray[:, 1] + ray[:, 2] * y[:, None, None]
+            )
+            in_space = (across[..., :2] / across[..., 2:]).square().sum(-1)
+            in_image = 2 * (torch.stack([x, y], 1)[:, None] - means[entries]).square().sum(-1)
+            sigma = 0.5 * torch.minimum(in_space, in_image)
+            return opacity[entries] * torch.exp(-sigma), sigma
+
+        return response
+
+    def rasterize_to_pixels_2dgs_fwd(self, means2d: Tensor, rays: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor,
+                                     *rest: Any) -> Any:  # fmt: skip
+        background, mask, width, height, tile, offsets, ids = rest
+        assert torch.isfinite(colors).all()  # gsplat pads with uninitialised memory
+        response = self._disc_response(means2d.reshape(-1, 2), rays.reshape(-1, 3, 3), opacities.reshape(-1), width)
+        flat = torch.cat([colors, normals], -1).reshape(-1, colors.shape[-1] + 3)
+        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, (background, mask))
+        nothing = torch.zeros_like(alpha)
+        return image[..., :-3], alpha, image[..., -3:], nothing, nothing.clone(), torch.zeros(0), torch.zeros(0)
+
+    def rasterize_to_pixels_2dgs_bwd(self, means2d: Tensor, rays: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor,
+                                     densify: Tensor, *rest: Any) -> Any:  # fmt: skip
+        *settings, _, _, _, _, v_image, v_alpha, v_normals, _, _, _ = rest
+        with torch.enable_grad():
+            leaves = _leaves(means2d, rays, colors, opacities, normals)
+            image, alpha, seen, *_ = self.rasterize_to_pixels_2dgs_fwd(*leaves, *settings)
+            v = _gradients([image, alpha, seen], [v_image, v_alpha, v_normals], leaves)
+        depth = rays[..., 2, 2]
+        v_densify = torch.stack([v[1][..., 0, 2] * depth, v[1][..., 1, 2] * depth], -1)
+        return None, *v, v_densify
