@@ -24,10 +24,10 @@ of the rasteriser between 50,000 and 200,000 Gaussians and between 480x320 and 9
 SHARED: Final = 0.79
 """Share of a step that is divided among the cores: 101 ms on one core became 61 on two (bench/fit.py)."""
 CLIP_STEP_S: Final = 0.0225
-CLIP_S: Final = 0.07
-"""The small diffusion model, per view on one core: a denoising step, and all else (bench/mdm.py, bfloat16)."""
-FULL_VIEW_S: Final = 3.2e-6
-"""The same, per pixel of the camera: 144 views of 384x256 took 31 s on two cores (docs/results.md)."""
+CLIP_S: Final = 0.2
+FULL_VIEW_S: Final = 8.3e-6
+"""The small diffusion model with renders, per view on one core: a denoising step (bench/mdm.py, bfloat16), all else at its own size, and per
+pixel of the camera: 72 views of 240x160 took 39 s of processor time (`mudg demo --fast`)."""
 RENDER_S: Final = 1.6e-6
 SCORE_S: Final = 1.2e-6
 REPORT_S: Final = 0.42e-6
@@ -37,8 +37,8 @@ FUSE_S: Final = 0.055
 START_S: Final = 2.0
 """Any step, before it computes."""
 
-PIXELS_PER_GAUSSIAN: Final = 50
-"""A scene needs no more Gaussians than one per so many recorded pixels: a rule of thumb, with which limits beyond all scenes count."""
+PIXELS_PER_GAUSSIAN: Final = 3
+"""No more Gaussians than one per so many recorded pixels are counted: 120,000 came of 12 images of 240x160 (`mudg demo --fast`), their limit."""
 PROGRAM_BYTES: Final = 600_000_000
 """Python, torch and the native library: resident after import and a first step."""
 COPIES: Final = 4.85
@@ -143,7 +143,9 @@ def of_presets(size: SceneSize, cores: int, device: str = "cpu") -> dict[PresetN
 
 def in_words(found: Mapping[PresetName, Estimate], free_bytes: int, device: str = "cpu") -> list[str]:
     """A line per preset: time, memory, and whether that fits into what is free (0: unknown)."""
-    lines = [f"estimates for mudg run on this scene ({device}; right within a factor of three, without annotate and adapt)"]
+    lines = [
+        f"estimates for mudg run on this scene ({device}; right within a factor of three, without annotate and adapt)"
+    ]
     for name, one in found.items():
         unknown = [step for step, value in one.seconds.items() if value is None]
         known_s = sum(value for value in one.seconds.values() if value is not None)

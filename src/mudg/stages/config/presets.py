@@ -33,14 +33,14 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
         "ingest.city.n_frames": 60, "ingest.city.width": 960, "ingest.city.height": 640,
         "fit.iterations": 30_000, "fit.checkpoint_every": 2500, "fit.preview_every": 2500,
         "fit.start.gaussians": 1_000_000, "fit.start.voxel_m": 0.08, "fit.densify.max_gaussians": 3_000_000,
-        "fit.appearance.exposure": "camera", "fit.loss.semantic_every": 1, "fit.virtual.gaussians": 200_000,
+        "fit.loss.semantic_every": 1, "fit.virtual.gaussians": 200_000,
         "synthesize.steps": 2,  # of the shipped model; more lowered its scores (docs/diffusion.md)
     },
     "paper": {
         "adaptation": "off", "continue_fit": False,
         "ingest.city.n_frames": 60, "ingest.city.width": 960, "ingest.city.height": 640,
-        "fuse.occlusion_test": False, "fuse.box_growth_m": 0.0, "fuse.floor_margin_m": 0.25, "fuse.moving_distance_m": 0.5,
-        "fuse.min_object_points": 100,
+        "fuse.match_colors": False, "fuse.occlusion_test": False, "fuse.box_growth_m": 0.0, "fuse.floor_margin_m": 0.25,
+        "fuse.moving_distance_m": 0.5, "fuse.min_object_points": 100,
         "synthesize.model": NO_MODEL, "synthesize.steps": 50, "synthesize.sampler": "ddim", "synthesize.eta": 1.0,
         "synthesize.guidance": 7.5, "synthesize.guidance_rescale": 0.7, "synthesize.overlap": 8, "synthesize.align_depth": False,
         "synthesize.full_size": False,
