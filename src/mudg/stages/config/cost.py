@@ -26,8 +26,8 @@ SHARED: Final = 0.79
 CLIP_STEP_S: Final = 0.0225
 CLIP_S: Final = 0.2
 FULL_VIEW_S: Final = 8.3e-6
-"""The small diffusion model with renders, per view on one core: a denoising step (bench/mdm.py, bfloat16), all else at its own size, and per
-pixel of the camera: 72 views of 240x160 took 39 s of processor time (`mudg demo --fast`)."""
+"""The small diffusion model with renders, per view on one core: a denoising step (bench/mdm.py, bfloat16), all else at its own size,
+and per pixel of the camera: 72 views of 240x160 took 39 s of processor time (`mudg demo --fast`)."""
 RENDER_S: Final = 1.6e-6
 SCORE_S: Final = 1.2e-6
 REPORT_S: Final = 0.42e-6
@@ -38,7 +38,8 @@ START_S: Final = 2.0
 """Any step, before it computes."""
 
 PIXELS_PER_GAUSSIAN: Final = 3
-"""No more Gaussians than one per so many recorded pixels are counted: 120,000 came of 12 images of 240x160 (`mudg demo --fast`), their limit."""
+"""No more Gaussians than one per so many recorded pixels are counted: 12 images of 240x160 led to 120,000, the limit there
+(`mudg demo --fast`)."""
 PROGRAM_BYTES: Final = 600_000_000
 """Python, torch and the native library: resident after import and a first step."""
 COPIES: Final = 4.85
