@@ -31,7 +31,7 @@ from mudg.models.scene.densify import DensifyStats
 from mudg.stages import fit, fuse, ingest
 from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
 from mudg.stages.config.fit import DensifyConfig
-from mudg.stages.fitting.views import ViewSet
+from mudg.stages.fitting.views import StoredView, ViewSet
 
 FORWARD = ("project", "sort", "bin", "blend")
 BACKWARD = ("blend_backward", "project_backward")
@@ -100,6 +100,7 @@ def instrument(clock: Clock) -> None:
     fit.rasterize = timed_rasterize
     torch.Tensor.backward = timed_backward  # type: ignore[method-assign]
     ViewSet.choose = clock.wrapped("view loading", ViewSet.choose)  # type: ignore[method-assign]
+    StoredView.as_tensors = clock.wrapped("view loading", StoredView.as_tensors)  # type: ignore[method-assign]
     DensifyStats.observe = clock.wrapped("densify", DensifyStats.observe)  # type: ignore[method-assign]
 
 

@@ -49,6 +49,12 @@ def test_more_pixels_images_and_gaussians_take_more_memory() -> None:
     assert cost.estimate(smaller, large, 1).memory_bytes < cost.estimate(config, large, 1).memory_bytes
 
 
+def test_views_count_as_a_fit_keeps_them() -> None:
+    from mudg.stages.fitting import kept
+
+    assert cost.VIEWS_BYTES == kept.IN_MEMORY_BYTES
+
+
 def test_the_demo_is_estimated_within_a_factor_of_three() -> None:
     """Synthesize 31 s, render 31, score 34, report 12 on two cores; 1500 steps of a fit at 44 to 74 ms (docs/results.md)."""
     found = cost.estimate(run_preset(), DEMO, 2).seconds

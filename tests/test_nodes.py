@@ -263,7 +263,7 @@ def test_sky_filled_from_measured_colours():
     directions = generator.normal(size=(4000, 3))
     directions[:, 2] = np.abs(directions[:, 2])
     red = directions[:, 1] > 0
-    sky.fill(directions, np.where(red[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]).astype(np.float32))
+    sky.fill([(directions, np.where(red[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]).astype(np.float32))])
     left, right = sky_picture(sky, looking(math.pi / 2)), sky_picture(sky, looking(-math.pi / 2))
     assert left[0, 5, 20] > 0.95
     assert right[2, 5, 20] > 0.95

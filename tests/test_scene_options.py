@@ -194,8 +194,8 @@ def test_no_sky_at_all_and_nothing_but_sky(world, share):
 def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
     sample = fit_views.StoredView.as_tensors
 
-    def poisoned(self):
-        made = sample(self)
+    def poisoned(self, *device):
+        made = sample(self, *device)
         if made.name == "front/000002":
             made.rgb[0, 3, 4] = float("nan")
         return made

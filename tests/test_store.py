@@ -12,6 +12,7 @@ import torch
 
 from mudg.base import checkpoint, errors, store
 from mudg.base.errors import InputError, IntegrityError, ResourceError
+from mudg.base.run_folder import is_temporary
 
 
 def test_atomic_path_leaves_the_old_file_when_the_writer_fails(tmp_path: Path) -> None:
@@ -103,6 +104,63 @@ def test_checkpoints_keep_two_and_fall_back_past_a_damaged_one(tmp_path: Path) -
     with pytest.raises(IntegrityError, match="no checkpoint verifies"):
         checkpoint.latest(tmp_path)
     assert damaged.exists()
+
+
+def test_large_checkpoints_take_a_small_share_of_the_time_and_small_ones_are_always_due(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
+
+    def taking(seconds: float) -> None:
+        with pace.saving():
+            now[0] += seconds
+
+    pace = checkpoint.Pace()
+    assert pace.due()
+    taking(0.9)
+    assert pace.due()
+    taking(7.0)
+    due = []
+    for _ in range(200):
+        now[0] += 1.0
+        due.append(pace.due())
+    assert due.index(True) + 1 == 140  # a twentieth of 140 s is 7 s
+    assert all(due[139:])
+    taking(0.5)
+    assert pace.due()
+
+
+def test_safetensors_are_the_library_s_own_bytes_and_a_killed_writer_leaves_names_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import safetensors.numpy
+
+    arrays = {"b": np.arange(7, dtype=np.uint8), "a": np.ones((3, 2), np.float32), "z": np.zeros((0, 4), np.int64)}
+    store.write_safetensors(tmp_path / "a.safetensors", arrays)
+    assert (tmp_path / "a.safetensors").read_bytes() == safetensors.numpy.save(arrays)
+    seen: list[str] = []
+    write = safetensors.numpy.save_file
+
+    def looked_at(found: dict[str, np.ndarray], path: Path) -> None:
+        write(found, path)
+        seen.extend(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file())
+
+    monkeypatch.setattr(safetensors.numpy, "save_file", looked_at)
+    store.write_safetensors(tmp_path / "b.safetensors", arrays)
+    assert sorted(map(is_temporary, seen)) == [False, True, True]  # a.safetensors, and what is being written
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.safetensors", "b.safetensors"]
+
+
+def test_a_full_disk_is_a_resource_error_of_safetensors_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import safetensors.numpy
+
+    def full(arrays: object, path: Path) -> None:
+        path.write_bytes(b"half")
+        raise safetensors.SafetensorError("I/O error: No space left on device")
+
+    monkeypatch.setattr(safetensors.numpy, "save_file", full)
+    with pytest.raises(ResourceError, match=r"a\.safetensors[\s\S]*No space left[\s\S]*free disk space"):
+        store.write_safetensors(tmp_path / "a.safetensors", {"x": np.zeros(3)})
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_half_written_and_foreign_folders_are_not_checkpoints(tmp_path: Path) -> None:

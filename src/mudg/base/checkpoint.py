@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,29 @@ def save(
         for name, group in tensors.items():
             store.write_safetensors(partial / f"{name}.safetensors", dict(group))
     return _path(folder, step)
+
+
+class Pace:
+    """Keeps large checkpoints to a small share of the time: one is due again when ``SHARE`` of the time since the last makes up for
+    what that took. Those of under ``FREE_S`` seconds are always due."""
+
+    SHARE, FREE_S = 0.05, 1.0
+
+    def __init__(self) -> None:
+        self._took_s = 0.0
+        self._ended_s = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether enough time has passed since the last one."""
+        return self._took_s <= self.FREE_S or self.SHARE * (time.monotonic() - self._ended_s) >= self._took_s
+
+    @contextlib.contextmanager
+    def saving(self) -> Iterator[None]:
+        """The block that saves one."""
+        began = time.monotonic()
+        yield
+        self._ended_s = time.monotonic()
+        self._took_s = self._ended_s - began
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ import threading
 import time
 import types
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -212,16 +212,19 @@ def _exit_with_parent() -> None:
         os._exit(1)
 
 
-def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Iterator[Result]:
+def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Generator[Result, None, None]:
     """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads, each with one torch thread."""
     with one_torch_thread(), concurrent.futures.ThreadPoolExecutor(threads) as pool:
         waiting: deque[concurrent.futures.Future[Result]] = deque()
-        for number in range(count):
-            waiting.append(pool.submit(compute, number))
-            if len(waiting) > 2 * threads:
+        try:
+            for number in range(count):
+                waiting.append(pool.submit(compute, number))
+                if len(waiting) > 2 * threads:
+                    yield waiting.popleft().result()
+            while waiting:
                 yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+        finally:  # whoever stops asking, or fails, does not wait for what has not begun
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 # ---- one call under a limit of memory --------------------------------------------------------------------------------

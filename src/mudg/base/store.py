@@ -13,6 +13,7 @@ import os
 import shutil
 import tempfile
 import threading
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -219,6 +220,55 @@ def append_line(path: Path, text: str) -> None:
         handle.write(text.rstrip("\n") + "\n")
 
 
+class ScratchFile:
+    """A file without a name, for what does not fit into memory. The system removes it with the process, however that ends.
+
+    Blocks are appended by one thread; any thread may read them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.where = str(folder)
+        with disk_errors("cannot make a scratch file", folder):
+            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)
+        self._end = 0
+        self._lock = threading.Lock()
+        weakref.finalize(self, self._file.close)
+
+    def append(self, content: NDArray[np.uint8]) -> int:
+        """Write a block, u8[N], at the end; returns where it begins. ResourceError if the disk is full."""
+        left, began = content.data, self._end
+        with self._lock, _writing(Path(self.where)):
+            self._file.seek(began)
+            while len(left):
+                left = left[self._file.write(left) :]
+        self._end += len(content)
+        return began
+
+    def read(self, begins: int, size: int) -> NDArray[np.uint8]:
+        """The bytes of a block. ResourceError if the disk does not give them back."""
+        found = np.empty(size, np.uint8)
+        left, remedy = found.data, "check the disk, then repeat the command to resume"
+        with disk_errors("a scratch file cannot be read", Path(self.where), remedy):
+            while len(left):
+                count = self._read_into(left, begins + size - len(left))
+                if count == 0:
+                    raise ResourceError("a scratch file ended early", where=self.where, expected=f"{begins + size} bytes",
+                        got=f"{begins + size - len(left)}", remedy=remedy)  # fmt: skip
+                left = left[count:]
+        return found
+
+    def _read_into(self, buffer: memoryview, position: int) -> int:
+        if hasattr(os, "preadv"):
+            return os.preadv(self._file.fileno(), [buffer], position)
+        with self._lock:
+            self._file.seek(position)
+            return self._file.readinto(buffer)
+
+    def close(self) -> None:
+        """Give the space back."""
+        self._file.close()
+
+
 def sha256_file(path: Path) -> str:
     """Hex sha256 of a file's bytes."""
     digest = hashlib.sha256()
@@ -229,15 +279,25 @@ def sha256_file(path: Path) -> str:
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, NDArray[Any] | Tensor]) -> None:
-    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically."""
-    from safetensors.numpy import save as save_numpy
+    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically; without a copy of them in memory."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import save_file
 
     arrays: dict[str, NDArray[Any]] = {}
     for name, value in tensors.items():
         if not isinstance(value, np.ndarray):
             value = value.detach().cpu().numpy()
         arrays[name] = np.ascontiguousarray(value)
-    atomic_write(path, save_numpy(arrays))
+    path = Path(path)
+    with (
+        atomic_path(path) as temporary,
+        tempfile.TemporaryDirectory(prefix=f".{path.stem}.", suffix=".part", dir=path.parent) as own,
+    ):  # the library writes beside its target, under a name of its own
+        try:
+            save_file(arrays, Path(own) / path.name)
+        except SafetensorError as error:  # what it makes of a full disk
+            raise OSError(str(error)) from error
+        (Path(own) / path.name).replace(temporary)
 
 
 def read_safetensors(path: Path) -> dict[str, NDArray[Any]]:

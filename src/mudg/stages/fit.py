@@ -14,6 +14,7 @@ With ``start`` it goes on with a finished fit (``fitting/continued.py``).
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shutil
 import time
@@ -54,6 +55,7 @@ from mudg.stages.fitting.continued import (
     continued_model,
     whole_run,
 )
+from mudg.stages.fitting.kept import chosen_ahead, keep, recorded_bytes, scratch_folder, virtual_bytes
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
 from mudg.stages.fitting.poses import refine_poses
@@ -65,10 +67,12 @@ from mudg.stages.fitting.storage import load_model as load_model
 from mudg.stages.fitting.storage import save_appearance, save_model
 from mudg.stages.fitting.trust import unseen_maps, unseen_rows
 from mudg.stages.fitting.views import (
+    StoredView,
     TrainView,
     ViewSet,
     classes_of,
     fused_lidar,
+    heads_of,
     load_recorded,
     load_virtual,
     training_frames,
@@ -136,8 +140,9 @@ def run(
         config = whole_run(config)
     with one_torch_thread():
         state = _prepare(config, FitInputs(Path(scene), Path(fused), virtual, begun), folder.path)
-        optimise(state, config, folder)
-        add_certainty(state, config)
+        with contextlib.closing(state.views):
+            optimise(state, config, folder)
+            add_certainty(state, config)
     save_model(state.model, folder.path)
     save_appearance(state.appearance, folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
@@ -179,10 +184,13 @@ class FitInputs:
 def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
     scene, fused, start = read_scene(given.scene), read_fused(given.fused), given.start
-    views, classes = recorded_views(config, scene, given.virtual, start)
+    frames, invented = training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
+    needed = recorded_bytes(frames, config.width_px) + virtual_bytes(given.virtual)
+    scratch = scratch_folder(len(frames) + invented, needed, out)
+    views, classes = recorded_views(config, scene, given.virtual, start, scratch)
     if given.virtual:
         measured = fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
-        views = replace(views, virtual=load_virtual(given.virtual, classes, measured))
+        views = replace(views, virtual=keep(load_virtual(given.virtual, classes, measured), invented, scratch))
     found = checkpoint.latest(out / "steps")
     if found is None:
         return start_state(config, scene, fused, views, classes) if start is None else continued_state(config, start, views, classes)
@@ -196,15 +204,17 @@ def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
 
 
 def recorded_views(
-    config: FitConfig, scene: Scene, virtual: Mapping[str, ObservationSet] | None = None, start: StartFit | None = None
-) -> tuple[ViewSet, tuple[int, ...]]:
+    config: FitConfig, scene: Scene, virtual: Mapping[str, ObservationSet] | None = None, start: StartFit | None = None,
+    scratch: Path | None = None,
+) -> tuple[ViewSet, tuple[int, ...]]:  # fmt: skip
     """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels (those that
-    ``virtual`` shows and ``start`` knows included)."""
+    ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in a file in this folder, not in memory."""
     frames = training_frames(scene, config.cameras)
     classes = classes_of(scene, frames, virtual or {}) if config.semantics else ()
     classes = classes if start is None else all_classes(start, classes)
     with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
-    return ViewSet(load_recorded(scene, frames, classes, config.width_px, with_lidar), ()), classes
+    loaded = load_recorded(scene, frames, classes, config.width_px, with_lidar)
+    return ViewSet(keep(loaded, len(frames), scratch), ()), classes
 
 
 def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]) -> FitState:
@@ -228,7 +238,8 @@ def continued_state(config: FitConfig, start: StartFit, views: ViewSet, classes:
 def _nothing_corrected(config: FitConfig, views: ViewSet) -> Appearance:
     wanted = config.appearance
     return Appearance.of_views(
-        [view.name for view in views.recorded], [view.name for view in views.virtual], wanted.exposure, wanted.cameras, wanted.virtual
+        [head.name for head in heads_of(views.recorded)], [head.name for head in heads_of(views.virtual)],
+        wanted.exposure, wanted.cameras, wanted.virtual,
     )
 
 
@@ -249,15 +260,23 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """
     raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
-    virtual_from = state.begun_at or virtual_from
-    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
+    virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
+
+    def choose(step: int) -> tuple[StoredView, ...]:
+        probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
+        return state.views.choose(config.seed, step, probability, config.virtual.beside)
+
+    with (
+        log.task(f"fit {config.method}", config.iterations, state.step) as bar,
+        Interruption() as interruption,
+        chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1)) as upcoming,
+    ):
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
             if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
                 start_unseen_gaussians(state, config, raster)
-            probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
-            views = state.views.choose(config.seed, step, probability, config.virtual.beside)
+            views = next(upcoming)
             learnt = [_learn_from(state, view, config, raster, perception, step, view is views[0]) for view in views]
             adam_step(state.model, step, config.iterations, state.begun_at)
             state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
@@ -276,8 +295,9 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
                 write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
-            if step % config.checkpoint_every == 0 or interruption.requested:
-                save_checkpoint(state, folder.path / "steps")
+            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
+                with pace.saving():
+                    save_checkpoint(state, folder.path / "steps")
             bar.advance()
             if interruption.requested:
                 folder.pause(state.summary())
@@ -316,12 +336,12 @@ def _learn_from(
 
 def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
     """When virtual views join: start Gaussians at the surfaces that only they show (see ``fitting/trust.py``)."""
-    maps = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
-    columns, labels = unseen_rows(state.model, state.views.virtual, maps, config.virtual.gaussians, config.seed)
+    unseen = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
+    columns, labels, share = unseen_rows(state.model, unseen, config.virtual.gaussians, config.seed)
     state.model.table.append(columns, labels)
     state.model.sort_rows()
     state.stats = DensifyStats.zeros(len(state.model.table))
-    log.info(f"virtual views: {float(np.mean([found.mean() for found in maps])):.0%} of their pixels show what no recorded view saw")
+    log.info(f"virtual views: {share:.0%} of their pixels show what no recorded view saw")
 
 
 def _picture(state: FitState, render: Render, view: TrainView) -> Tensor:

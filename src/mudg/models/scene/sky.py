@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,21 +70,26 @@ class SkyNode:
         x = (longitude / np.pi) * columns / (columns + 2 * padding)
         return np.stack([x, -2 * elevation / np.pi], -1).astype(np.float32)
 
-    def fill(self, directions_world: NDArray[np.float64], rgb: NDArray[np.float32]) -> None:
+    def fill(self, measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float32]]]) -> None:
         """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
 
         Args:
-            directions_world: ``[M, 3]``. rgb: f32[M, 3] in [0, 1].
+            measured: portions of directions in the world ``[M, 3]`` and their colours f32[M, 3] in [0, 1]. How they are divided
+                makes no difference.
         """
-        if len(rgb) == 0:
-            return
         rows, columns = self.rows, 2 * self.rows
-        grid = self.panorama_grid(directions_world)
-        column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
-        row = np.clip(((grid[:, 1] + 1) / 2 * rows).astype(np.int64), 0, rows - 1)
-        texel = row * columns + column
-        count = np.bincount(texel, minlength=rows * columns).astype(np.float64)
-        mean = np.stack([np.bincount(texel, rgb[:, c], rows * columns) for c in range(3)]) / np.maximum(count, 1)
+        total, count = np.zeros((3, rows * columns)), np.zeros(rows * columns)
+        for directions_world, rgb in measured:
+            grid = self.panorama_grid(directions_world)
+            column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
+            row = np.clip(((grid[:, 1] + 1) / 2 * rows).astype(np.int64), 0, rows - 1)
+            texel = row * columns + column
+            count += np.bincount(texel, minlength=rows * columns)
+            for channel in range(3):  # one after the other, as a single sum over all portions would be
+                np.add.at(total[channel], texel, rgb[:, channel].astype(np.float64))
+        if not count.any():
+            return
+        mean = total / np.maximum(count, 1)
         seen = (count > 0).reshape(rows, columns)
         tiled = np.concatenate([seen, seen, seen], 1)  # longitude wraps round
         nearest = distance_transform_edt(~tiled, return_distances=False, return_indices=True)

@@ -47,6 +47,8 @@ COPIES: Final = 4.85
 RECORDED_BYTES: Final = 7
 VIRTUAL_BYTES: Final = 10
 """Per pixel of a view that a fit keeps: colour, classes, masks, LiDAR; virtual ones have depth and confidence, too."""
+VIEWS_BYTES: Final = 2**30
+"""No more of them are held in memory: the others lie in a file (stages/fitting/kept.py)."""
 STEP_PIXEL_BYTES: Final = 600
 """Per pixel of the view of a step: images, gradients and what losses keep."""
 MODEL_BYTES: Final = 1_000_000_000
@@ -131,8 +133,9 @@ def _fit_pixels(config: RunConfig, size: SceneSize) -> int:
 def _memory(config: RunConfig, size: SceneSize, processes: int, device: str) -> int:
     columns = 11 + 3 * (config.fit.sh_degree + 1) ** 2 + len(CLASSES) * config.fit.semantics
     virtual = size.path_images * len(config.synthesize.shifts_m)
-    views = RECORDED_BYTES * size.images + VIRTUAL_BYTES * virtual if device == "cpu" else 0
-    fitting = 4 * COPIES * columns * _gaussians(config, size) + (views + STEP_PIXEL_BYTES) * _fit_pixels(config, size)
+    fit_pixels = _fit_pixels(config, size)
+    views = min((RECORDED_BYTES * size.images + VIRTUAL_BYTES * virtual) * fit_pixels, VIEWS_BYTES) if device == "cpu" else 0
+    fitting = 4 * COPIES * columns * _gaussians(config, size) + views + STEP_PIXEL_BYTES * fit_pixels
     model = PUBLISHED_BYTES[device] if _published(config) else MODEL_BYTES * processes
     return round(PROGRAM_BYTES + max(fitting, model))
 

@@ -182,7 +182,8 @@ class FitConfig:
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
     checkpoint_every: int = Field(default=500, ge=1)
-    """Steps between checkpoints; an interrupted fit resumes at the last one."""
+    """Steps between checkpoints; an interrupted fit resumes at the last one. Large ones are rarer: they take at most a twentieth of
+    the time."""
     preview_every: int = Field(default=500, ge=1)
     """Steps between preview images."""
     start: StartConfig = Field(default_factory=StartConfig)

@@ -80,10 +80,10 @@ def evidence_of(
 ) -> PhotoEvidence:
     """What recorded views tell about every Gaussian, those that are left out like the others; see ``certainty_of``."""
     count = min(most or len(views), len(views))
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))]
+    chosen = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
     total = torch.zeros(5, len(model.table))
-    for stored in chosen:
-        sums = weight_sums(model, stored.as_tensors(), raster, appearance)
+    for index in chosen:
+        sums = weight_sums(model, views[int(index)].as_tensors(), raster, appearance)
         total += torch.cat([(sums[:1] / (sums[:1] + 1)), sums])
     total *= len(views) / len(chosen)
     return PhotoEvidence(*total)

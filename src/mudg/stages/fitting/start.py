@@ -8,7 +8,7 @@ there is none it is put on a far shell. This needs semantic labels; without them
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -28,7 +28,7 @@ from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode, StaticNode, object_node
 from mudg.models.scene.sky import SkyNode
 from mudg.stages.config import FitConfig
-from mudg.stages.fitting.views import StoredView
+from mudg.stages.fitting.views import StoredView, heads_of
 
 UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation"))
 GROUND_IDS = tuple(ID[n] for n in ("road", "sidewalk", "terrain"))
@@ -56,8 +56,9 @@ class StartPoints:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def __getitem__(self, rows: NDArray[np.integer]) -> StartPoints:
-        """The points at these indices."""
+    def __getitem__(self, rows: NDArray[np.integer] | slice) -> StartPoints:
+        """Copies of the points at these indices."""
+        rows = np.arange(len(self))[rows] if isinstance(rows, slice) else rows
         return StartPoints(self.xyz[rows], self.rgb[rows], self.semantics[rows], self.scale_m[rows])
 
     def columns(self, classes: tuple[int, ...], sh_degree: int) -> dict[str, torch.Tensor]:
@@ -96,7 +97,7 @@ def _static_columns(
     fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
 ) -> Mapping[str, torch.Tensor]:
     cloud = fused.static
-    centers = np.stack([view.view.center_world for view in views]).astype(np.float32)
+    centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
     rows = _thinned(cloud.xyz, centers, config)
     points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
     filled = _fill_unreached(views, points.xyz, classes, config.start.far_m, fused.colors)
@@ -155,11 +156,11 @@ def _fill_unreached(
     views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float, cameras: CameraColors
 ) -> StartPoints | None:
     """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
-    labelled = [view for view in views if view.channels is not None]
+    labelled = [index for index, head in enumerate(heads_of(views)) if head.labelled]
     if not labelled or not classes:
         return None
     chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
-    points = StartPoints.joined([_fill_view(view, xyz, classes, far_m, cameras) for view in chosen])
+    points = StartPoints.joined([_fill_view(views[index], xyz, classes, far_m, cameras) for index in chosen])
     return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))] if len(points) else None
 
 
@@ -210,7 +211,14 @@ def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns
 def _painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
     """A sky that starts with the mean recorded colour per direction, in common colours."""
     sky = SkyNode.uniform(SKY_ROWS)
-    directions, colors = [], []
+    sky.fill(_sky_pixels(views, cameras))
+    return sky
+
+
+def _sky_pixels(
+    views: Sequence[StoredView], cameras: CameraColors
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32]]]:
+    """Directions and common colours of every second row and column of the sky, view by view."""
     for stored in views:
         if stored.sky is None:
             continue
@@ -218,8 +226,5 @@ def _painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
         row, column = stored.sky[::2, ::2].nonzero()
         row, column = row * 2, column * 2
         rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
-        directions.append(rays @ stored.view.world_from_cam[:3, :3].T)
-        colors.append(cameras.bytes_to_common(camera.name, stored.rgb[row, column]).astype(np.float32) / 255)
-    if directions:
-        sky.fill(np.concatenate(directions), np.concatenate(colors))
-    return sky
+        rgb = cameras.bytes_to_common(camera.name, stored.rgb[row, column])
+        yield rays @ stored.view.world_from_cam[:3, :3].T, rgb.astype(np.float32) / 255

@@ -9,7 +9,7 @@ something behind it, the pixel is *seen*. Points that are hidden in every record
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,7 @@ from mudg.models.scene.initial import voxel_filter
 from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages.fitting.start import StartPoints
-from mudg.stages.fitting.views import StoredView
+from mudg.stages.fitting.views import StoredView, heads_of
 
 WITNESSES = 36
 """Number of recorded views that are compared, spread evenly over cameras and time."""
@@ -36,6 +36,8 @@ SEED_STRIDE_PX = 3
 SEED_NEAREST_M, SEED_FARTHEST_M = 2.0, 80.0
 SEED_CONFIDENCE = 0.2
 """Least confidence of a virtual pixel that may become a Gaussian."""
+MOST_SEEDS = 8_000_000
+"""Points held at once; thinning them takes about 150 bytes each."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +51,17 @@ class _Witness:
 @torch.no_grad()
 def unseen_maps(
     model: SceneModel, recorded: Sequence[StoredView], virtual: Sequence[StoredView], raster: RasterConfig
-) -> list[NDArray[np.bool_]]:
-    """For every virtual view: bool[H, W], True where no recorded view saw the surface it shows.
+) -> Iterator[tuple[StoredView, NDArray[np.bool_]]]:
+    """Every virtual view with bool[H, W], True where no recorded view saw the surface it shows; one at a time.
 
     Pixels without depth count as sky, far away. Depends on the geometry the model has by now.
     """
-    chosen = [recorded[i] for i in np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))]
-    witnesses = [_witness(model, stored.view, raster) for stored in chosen]
+    heads = heads_of(recorded)
+    chosen = np.unique(np.linspace(0, len(heads) - 1, min(WITNESSES, len(heads))).round().astype(int))
+    witnesses = [_witness(model, heads[i].view, raster) for i in chosen]
     objects = [node for node in model.nodes if isinstance(node, RigidNode)]
-    return [_unseen(stored, witnesses, objects) for stored in log.progress(virtual, len(virtual), "finding unseen surfaces")]
+    for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
+        yield stored, _unseen(stored, witnesses, objects)
 
 
 def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
@@ -98,19 +102,25 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
 
 
 def unseen_rows(
-    model: SceneModel, virtual: Sequence[StoredView], unseen: Sequence[NDArray[np.bool_]], most: int, run_seed: int
-) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-    """Table rows (columns, labels) at the surfaces that only virtual views show, thinned to one per place, at most ``most``.
+    model: SceneModel, unseen: Iterable[tuple[StoredView, NDArray[np.bool_]]], most: int, run_seed: int
+) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], float]:
+    """Table rows (columns, labels) at the surfaces that only virtual views show, thinned to one per place, at most ``most``; and the
+    mean share of pixels that show them.
 
-    A point in the box of a dynamic object belongs to that object.
+    A point in the box of a dynamic object belongs to that object. Above ``MOST_SEEDS`` points, every second one goes on.
     """
     objects = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
     found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
-    for stored, unseen_here in zip(virtual, unseen):
+    shares, stride, total = [], 1, 0
+    for stored, unseen_here in unseen:
+        shares.append(unseen_here.mean())
         for index, seeds_here in _seeds_of(stored, unseen_here, objects, model):
-            found[index].append(seeds_here)
+            found[index].append(seeds_here[::stride])
+            total += len(found[index][-1])
+        while total > MOST_SEEDS:
+            found, stride = {index: [part[::2] for part in parts] for index, parts in found.items()}, 2 * stride
+            total = sum(len(part) for parts in found.values() for part in parts)
     columns, owners = [], []
-    total = sum(len(part) for parts in found.values() for part in parts)
     for index, parts in found.items():
         if not parts:
             continue
@@ -121,8 +131,9 @@ def unseen_rows(
         columns.append(points[rows].columns(model.classes, model.sh_degree))
         owners.append(torch.full((len(rows),), index, dtype=torch.int32))
     if not columns:
-        return {name: value.detach()[:0] for name, value in model.table.columns.items()}, {"node": torch.zeros(0, dtype=torch.int32)}
-    return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}
+        none = {name: value.detach()[:0] for name, value in model.table.columns.items()}
+        return none, {"node": torch.zeros(0, dtype=torch.int32)}, float(np.mean(shares))
+    return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}, float(np.mean(shares))
 
 
 def _seeds_of(

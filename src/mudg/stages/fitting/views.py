@@ -1,23 +1,29 @@
-"""The views a fit learns from: recorded frames with their LiDAR depths, and virtual observations; kept small in memory.
+"""The views a fit learns from: recorded frames with their LiDAR depths, and virtual observations.
 
 Everything is stored as bytes (8-bit colour and labels) and becomes tensors when a step asks for one view. Which view a step
-gets is a function of (run seed, step) alone.
+gets is a function of (run seed, step) alone. Where the bytes lie, in memory or in a file, is decided in ``kept.py``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from abc import abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mudg import native
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
+from mudg.base.processes import computed_ahead
 from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
@@ -27,8 +33,12 @@ from mudg.data import scene as scenefile
 from mudg.data.clips.condition import ConditionRules, project_sparse
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 
+CPU = torch.device("cpu")
 MAX_LIDAR_M = 100.0
 NEAREST_SWEEP_S = 0.1
+READERS = 8
+"""Threads that read views, at most; each holds one, and two wait for each."""
+SWEEPS_PER_SENSOR = 6
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,10 @@ class LidarPixels:
 
     pixel: Tensor
     depth_m: Tensor
+
+    def to(self, device: torch.device) -> LidarPixels:
+        """The same pixels on a device."""
+        return LidarPixels(self.pixel.to(device, non_blocking=True), self.depth_m.to(device, non_blocking=True))
 
 
 @dataclass(frozen=True)
@@ -68,6 +82,16 @@ class TrainView:
 
 
 @dataclass(frozen=True)
+class ViewHead:
+    """What is known of a view without its pixels; ``labelled``: whether it has class channels."""
+
+    name: str
+    view: View
+    kind: ObservationKind
+    labelled: bool
+
+
+@dataclass(frozen=True)
 class StoredView:
     """A ``TrainView`` in bytes: rgb u8[H, W, 3]; channels u8[H, W]; sky, mask bool[H, W]; depth f32[H, W]; confidence u8[H, W] (255 =
     1). None where there is none; no mask: all pixels, no confidence: 1."""
@@ -83,31 +107,66 @@ class StoredView:
     depth: NDArray[np.float32] | None = None
     confidence: NDArray[np.uint8] | None = None
 
-    def as_tensors(self) -> TrainView:
-        """The view for a step."""
-        everywhere = torch.ones(1, *self.rgb.shape[:2])
+    @property
+    def head(self) -> ViewHead:
+        """The view without its pixels."""
+        return ViewHead(self.name, self.view, self.kind, self.channels is not None)
+
+    def as_tensors(self, device: torch.device = CPU) -> TrainView:
+        """The view for a step, on a device. The bytes travel and grow there: a fifth of what the tensors take."""
+
+        def sent(array: NDArray[Any]) -> Tensor:
+            return torch.from_numpy(array).to(device, non_blocking=True)
+
+        everywhere = torch.ones(1, *self.rgb.shape[:2], device=device)
         return TrainView(
             name=self.name,
             view=self.view,
             kind=self.kind,
-            rgb=torch.from_numpy(self.rgb).permute(2, 0, 1).contiguous().float().div_(255),
-            channels=None if self.channels is None else torch.from_numpy(self.channels).long(),
-            confidence=everywhere if self.confidence is None else torch.from_numpy(self.confidence)[None].float().div_(255),
-            mask=everywhere.bool() if self.mask is None else torch.from_numpy(self.mask)[None],
-            sky=None if self.sky is None else torch.from_numpy(self.sky)[None],
-            depth=None if self.depth is None else torch.from_numpy(self.depth)[None],
-            lidar=self.lidar,
+            rgb=sent(self.rgb).permute(2, 0, 1).contiguous().float().div_(255),
+            channels=None if self.channels is None else sent(self.channels).long(),
+            confidence=everywhere if self.confidence is None else sent(self.confidence)[None].float().div_(255),
+            mask=everywhere.bool() if self.mask is None else sent(self.mask)[None],
+            sky=None if self.sky is None else sent(self.sky)[None],
+            depth=None if self.depth is None else sent(self.depth)[None],
+            lidar=None if self.lidar is None else self.lidar.to(device),
         )
+
+
+class FiledViews(Sequence[StoredView]):
+    """Views that do not lie in memory: asking for one reads it."""
+
+    heads: Sequence[ViewHead]
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give the space back; nothing can be read any more."""
+
+
+def heads_of(views: Sequence[StoredView]) -> Sequence[ViewHead]:
+    """All views without their pixels; nothing is read."""
+    return views.heads if isinstance(views, FiledViews) else [view.head for view in views]
 
 
 @dataclass(frozen=True)
 class ViewSet:
     """All views of a fit. ``virtual`` may be empty."""
 
-    recorded: tuple[StoredView, ...]
-    virtual: tuple[StoredView, ...]
+    recorded: Sequence[StoredView]
+    virtual: Sequence[StoredView]
 
-    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[TrainView, ...]:
+    @property
+    def filed(self) -> bool:
+        """Whether some views do not lie in memory."""
+        return any(isinstance(views, FiledViews) for views in (self.recorded, self.virtual))
+
+    def close(self) -> None:
+        """Give back the space of views that do not lie in memory."""
+        for views in (self.recorded, self.virtual):
+            if isinstance(views, FiledViews):
+                views.close()
+
+    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[StoredView, ...]:
         """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
 
         Recorded views come in a fresh random order per round, so that every one is seen equally often.
@@ -117,15 +176,15 @@ class ViewSet:
         """
         generator = seeds.numpy_rng(run_seed, step, "view")
         if self.virtual and generator.random() < virtual_probability:
-            drawn = self.virtual[int(generator.integers(len(self.virtual)))].as_tensors()
+            drawn = self.virtual[int(generator.integers(len(self.virtual)))]
             return (self._recorded_of(run_seed, step), drawn) if beside else (drawn,)
         return (self._recorded_of(run_seed, step),)
 
-    def _recorded_of(self, run_seed: int, step: int) -> TrainView:
+    def _recorded_of(self, run_seed: int, step: int) -> StoredView:
         """The recorded view of a step."""
         turn, place = divmod(step, len(self.recorded))
         order = seeds.numpy_rng(run_seed, turn, "recorded order").permutation(len(self.recorded))
-        return self.recorded[int(order[place])].as_tensors()
+        return self.recorded[int(order[place])]
 
 
 # ---- recorded ----------------------------------------------------------------------------------------------------
@@ -162,17 +221,21 @@ def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, Obse
     return tuple(sorted(found | {ID["sky"]})) if found else ()
 
 
+LoadedViews = Generator[tuple[int, StoredView], None, None]
+"""Views with their places among all, in any order."""
+
+
 def load_recorded(
     scene: Scene, frames: Sequence[Frame], classes: Sequence[int], width_px: int, with_lidar: bool
-) -> tuple[StoredView, ...]:
+) -> LoadedViews:
     """Read frames, labels and LiDAR depths, resized to ``width_px`` (0 = as recorded).
 
-    Frames whose time is further than 0.1 s from every sweep get no LiDAR depth; how many is said once.
+    Several threads read, in the order of time, so that all cameras need a sweep at once. Frames whose time is further than 0.1 s from
+    every sweep get no LiDAR depth; how many is said once.
     """
-    stored = []
-    without_lidar = 0
     points = _SweepCache(scene)
-    for frame in log.progress(frames, len(frames), "reading frames"):
+
+    def read(frame: Frame) -> StoredView:
         view = resized_view(frame.view, width_px)
         size = (view.camera.height, view.camera.width)
         labels = {
@@ -182,19 +245,28 @@ def load_recorded(
         confidence = labels["semantics_confidence"]
         semantics = labels["semantics"]
         sky = labels["sky"] if labels["sky"] is not None else (None if semantics is None else semantics == ID["sky"])
-        lidar = points.pixels_of(view) if with_lidar else None
-        without_lidar += lidar is None
-        stored.append(
-            StoredView(
-                frame.id, view, "recorded", resize_area(scenefile.read_image(scene, frame), *size[::-1]),
-                None if semantics is None or not classes else to_channels(semantics, classes), sky,
-                None if labels["ego"] is None else ~labels["ego"].astype(bool), lidar,
-                confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
-            )
+        return StoredView(
+            frame.id, view, "recorded", resize_area(scenefile.read_image(scene, frame), *size[::-1]),
+            None if semantics is None or not classes else to_channels(semantics, classes), sky,
+            None if labels["ego"] is None else ~labels["ego"].astype(bool), points.pixels_of(view) if with_lidar else None,
+            confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
         )  # fmt: skip
+
+    order = sorted(range(len(frames)), key=lambda index: frames[index].view.time_s)
+    without_lidar = 0
+    for index, stored in _read_by_threads(order, lambda index: read(frames[index]), "reading frames"):
+        without_lidar += stored.lidar is None
+        yield index, stored
     if with_lidar and without_lidar:
         log.warn(f"{without_lidar} of {len(frames)} frames have no LiDAR sweep within {NEAREST_SWEEP_S} s: no depth there")
-    return tuple(stored)
+
+
+def _read_by_threads(order: Sequence[int], read: Callable[[int], StoredView], doing: str) -> LoadedViews:
+    """``read`` of each of these numbers, with progress."""
+    with native.one_thread():
+        views = computed_ahead(lambda turn: read(order[turn]), len(order), min(native.default_threads(), READERS))
+        for turn, stored in enumerate(log.progress(views, len(order), doing)):
+            yield order[turn], stored
 
 
 def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
@@ -222,23 +294,23 @@ def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
 
 def load_virtual(
     sets: Mapping[str, ObservationSet], classes: Sequence[int], measured: Callable[[View], LidarPixels] | None = None
-) -> tuple[StoredView, ...]:
+) -> LoadedViews:
     """All observations of these sets, with the sparse depth that ``measured`` gives for a view."""
-    stored = []
-    for name, observations in sets.items():
-        for index, view in enumerate(observations.views):
-            arrays = observations.arrays(index)
-            semantics, confidence = arrays.get("semantics"), arrays["confidence"].astype(np.float32).clip(0, 1)
-            stored.append(
-                StoredView(
-                    f"{name}/{index:06d}", view, "virtual", observations.rgb_u8(index).copy(),
-                    None if semantics is None or not classes else to_channels(semantics, classes),
-                    None if semantics is None else semantics == ID["sky"], arrays["mask"].astype(bool),
-                    None if measured is None else measured(view), arrays["depth"].copy() if "depth" in arrays else None,
-                    (confidence * 255).round().astype(np.uint8),
-                )
-            )  # fmt: skip
-    return tuple(stored)
+    every = [(name, observations, index) for name, observations in sets.items() for index in range(len(observations))]
+
+    def read(place: int) -> StoredView:
+        name, observations, index = every[place]
+        view, arrays = observations.views[index], observations.arrays(index)
+        semantics, confidence = arrays.get("semantics"), arrays["confidence"].astype(np.float32).clip(0, 1)
+        return StoredView(
+            f"{name}/{index:06d}", view, "virtual", observations.rgb_u8(index).copy(),
+            None if semantics is None or not classes else to_channels(semantics, classes),
+            None if semantics is None else semantics == ID["sky"], arrays["mask"].astype(bool),
+            None if measured is None else measured(view), arrays["depth"].copy() if "depth" in arrays else None,
+            (confidence * 255).round().astype(np.uint8),
+        )  # fmt: skip
+
+    yield from _read_by_threads(range(len(every)), read, "reading virtual views")
 
 
 def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
@@ -284,11 +356,13 @@ class _WorldSweep:
 
 
 class _SweepCache:
-    """World points of the sweeps nearest in time; each sweep is read once (several cameras share it)."""
+    """World points of the sweeps nearest in time; several cameras share a sweep, and the last few are kept. Any thread may ask."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._read: dict[str, _WorldSweep] = {}
+        self._read: OrderedDict[str, _WorldSweep] = OrderedDict()
+        self._lock = threading.Lock()
+        self._most = SWEEPS_PER_SENSOR * len({sweep.sensor for sweep in scene.sweeps})
 
     def pixels_of(self, view: View) -> LidarPixels | None:
         """Depths of the nearest sweep of every sensor as seen by the view; None if no sweep is near in time."""
@@ -297,17 +371,26 @@ class _SweepCache:
             sweeps = [sweep for sweep in self._scene.sweeps if sweep.sensor == sensor]
             nearest = min(sweeps, key=lambda sweep: abs(sweep.time_s - view.time_s))
             if abs(nearest.time_s - view.time_s) <= NEAREST_SWEEP_S:
-                clouds.append(self._points_at(nearest, view.time_s))
-                gap_deg = max(gap_deg, self._read[nearest.id].gap_deg)
+                found = self._world(nearest)
+                clouds.append(self._points_at(found, nearest, view.time_s))
+                gap_deg = max(gap_deg, found.gap_deg)
         return lidar_pixels(view, np.concatenate(clouds), gap_deg) if clouds else None
 
-    def _points_at(self, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
+    def _world(self, sweep: Sweep) -> _WorldSweep:
+        with self._lock:
+            found = self._read.pop(sweep.id, None)
+            if found is None:
+                points = scenefile.read_points(self._scene, sweep)
+                world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
+                found = _WorldSweep(world, points.dt_s, largest_beam_gap(points.xyz))
+            self._read[sweep.id] = found
+            while len(self._read) > self._most:
+                self._read.popitem(last=False)
+        return found
+
+    def _points_at(self, found: _WorldSweep, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
         """World points of a sweep, the points of every tracked box carried from when they were measured to ``time_s``."""
-        if sweep.id not in self._read:
-            points = scenefile.read_points(self._scene, sweep)
-            world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
-            self._read[sweep.id] = _WorldSweep(world, points.dt_s, largest_beam_gap(points.xyz))
-        world, dt_s = self._read[sweep.id].xyz, self._read[sweep.id].dt_s
+        world, dt_s = found.xyz, found.dt_s
         moved = world.copy()
         for track in self._scene.tracks:
             then, soon, now = track.pose_at(sweep.time_s), track.pose_at(sweep.time_s + 0.05), track.pose_at(time_s)
