@@ -41,7 +41,7 @@ def small(config: LearnConfig) -> LearnConfig:
         config, start="", precision="float32", codec=LearnCodec(steps=2, batch=2, fit_batches=1),
         data=replace(config.data, width=48, height=32, window=2, cities=1, first_cities=1, clips_per_city=1, held_out=1, renders=False,
                      realism="plain"),
-        network=replace(config.network, widths=(16, 16), blocks=(1, 1), spatial_attention=(False, False), temporal_attention=(False, True),
+        network=replace(config.network, widths=(32, 32), blocks=(1, 1), spatial_attention=(False, False), temporal_attention=(False, True),
                         refine_widths=(8, 8), refine_blocks=(1, 1), renders=False, finish_widths=(), finish_blocks=()),
         optimizer=replace(config.optimizer, batch_frames=2, warmup_steps=1), score=replace(config.score, every=1000, steps=1),
     )  # fmt: skip
