@@ -132,7 +132,7 @@ def test_a_repeat_makes_no_second_report_unless_it_was_touched(tmp_path: Path, v
 
 
 def test_run_yaml_repeats_the_run(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    config = with_seed(run_preset(fast=True), 5)
+    config = with_seed(run_preset("fast"), 5)
     run.run_chain(config, "city", tmp_path / "out")
     assert configuration.load(RunConfig, None, tmp_path / "out" / "run.yaml") == config
 
@@ -252,3 +252,10 @@ def test_the_real_chain_ends_with_a_report_and_continues_after_a_kill(tmp_path: 
     assert len(page) < 25e6
     scores = [(tmp_path / name / "score" / "metrics.json").read_bytes() for name in ("killed", "whole")]
     assert scores[0] == scores[1]
+
+
+def test_a_fit_from_nothing_is_given_no_start(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    run.run_chain(RunConfig(continue_fit=False), "city", tmp_path / "out")
+    guided = verbs["fit:mudg_s"]
+    assert guided[1]["start"] is None
+    assert guided[0][0].iterations == verbs["fit:street_gaussians"][0][0].iterations

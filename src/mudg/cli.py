@@ -1,6 +1,6 @@
 """The ``mudg`` command: flags to frozen configurations, errors to exit codes. No logic of its own, and no torch.
 
-Precedence: defaults < the preset behind ``--fast`` and ``--seed`` < ``--config`` YAML < flags. Results go to stdout,
+Precedence: defaults < the preset behind ``--preset`` (``--fast``) and ``--seed`` < ``--config`` YAML < flags. Results go to stdout,
 progress and messages to stderr.
 """
 
@@ -175,7 +175,7 @@ VERBS: dict[str, Verb] = {
     ),
     "run": Verb(
         "Run all steps on your own driving log or scene and write a report page.",
-        ("mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti", "mudg run scenes/a --out runs/a --fast"),
+        ("mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti", "mudg run scenes/a --out runs/a --preset quality"),
         _run,
     ),
     "doctor": Verb(

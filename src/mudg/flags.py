@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 from pydantic import ValidationError
@@ -194,8 +194,11 @@ class RunOwn(Output):
 
     source: Annotated[str, tyro.conf.Positional, arg(metavar="SOURCE")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
+    preset: stage_config.PresetName = "default"
+    """Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000
+    iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
     fast: FlagCreatePairsOff[bool] = False
-    """Use smaller images, fewer frames and fewer iterations: a first result in a minute or two."""
+    """The same as --preset fast: a first result in a minute or two."""
     seed: Annotated[int | None, arg(metavar="INT")] = None
     """Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     cameras: tuple[str, ...] = ()
@@ -218,8 +221,11 @@ class DemoOwn(Output):
 
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("mudg_demo")
     """Folder to write. Repeat the same command to resume an interrupted demo."""
+    preset: stage_config.PresetName = "default"
+    """Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores. quality: 30,000
+    iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
     fast: FlagCreatePairsOff[bool] = False
-    """Use smaller images, fewer frames and fewer iterations: about 90 seconds instead of 6 minutes on 2 cores."""
+    """The same as --preset fast: about 90 seconds on 2 cores."""
     seed: Annotated[int | None, arg(metavar="INT")] = None
     """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     shifts_m: tuple[float, ...] = ()
@@ -317,9 +323,10 @@ def _own_help(verb: str, description: str) -> Common:
 
 
 def _settings(kind: type[Any], words: Sequence[str]) -> Any:
-    """The settings before their own flags: preset (--fast), then --config, then the flags that stand for several settings."""
+    """The settings before their own flags: preset (--preset, --fast), then --config, then the flags that stand for several settings."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--config", type=Path)
+    early.add_argument("--preset", choices=tuple(get_args(stage_config.PresetName)))
     early.add_argument("--fast", action="store_true")
     early.add_argument("--seed", type=int)
     early.add_argument("--cameras", nargs="*")
@@ -330,7 +337,7 @@ def _settings(kind: type[Any], words: Sequence[str]) -> Any:
         except SystemExit:  # malformed: the real parser has the better message
             return kind()
     whole_chain = kind is stage_config.RunConfig
-    config = stage_config.run_preset(known.fast) if whole_chain else kind()
+    config = stage_config.run_preset(stage_config.chosen_preset(known.preset, known.fast)) if whole_chain else kind()
     if known.config is not None:
         config = configuration.load(kind, config, known.config)
     if whole_chain and known.seed is not None:

@@ -141,12 +141,14 @@ def score(
 
 def run(
     log: Location, out: Location, *,
-    fast: bool = False, seed: int | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+    preset: stage_config.PresetName | None = None, fast: bool = False, seed: int | None = None, overwrite: bool = False,
+    config: Location | None = None, **settings: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """Run the whole chain on a driving log, a scene or ``"city"``.
 
     Args:
-        fast: smaller pictures, fewer frames and iterations. seed: of the city and of every random draw.
+        preset: ``fast``, ``default``, ``quality`` or ``paper``: what the settings start from. fast: the same as ``preset="fast"``.
+        seed: of the city and of every random draw.
         settings: one dictionary per verb, and ``cameras`` and ``shifts_m`` (metres, positive to the left) for all of them.
 
     Returns:
@@ -154,15 +156,15 @@ def run(
     """
     from mudg.stages import run as stage
 
-    preset = stage_config.run_preset(fast)
+    base = stage_config.run_preset(stage_config.chosen_preset(preset, fast))
     common = {"seed": seed, **{name: settings.pop(name, None) for name in ("cameras", "shifts_m")}}
     given = {name: value for name, value in common.items() if value is not None}
     checked = configuration.load(stage_config.SynthesizeConfig, overrides=given)
     if seed is not None:
-        preset = stage_config.with_seed(preset, checked.seed)
+        base = stage_config.with_seed(base, checked.seed)
     cameras = checked.cameras if "cameras" in given else None
     shifts_m = checked.shifts_m if "shifts_m" in given else None
-    made = _settings(stage_config.RunConfig, config, settings, preset)
+    made = _settings(stage_config.RunConfig, config, settings, base)
     return stage.run_chain(
         stage_config.with_lines(made, cameras=cameras, shifts_m=shifts_m), log, Path(out), overwrite=overwrite
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Mapping
@@ -59,7 +60,8 @@ def report_scene(scene: Path) -> dict[str, Any]:
 
     Returns:
         Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a sound
-        scene, ``alignment`` tells for each camera whether LiDAR and image edges agree.
+        scene, ``alignment`` tells for each camera whether LiDAR and image edges agree, and ``presets`` what every preset of
+        ``mudg run`` will take.
     """
     from mudg.data.importers import RECOGNISERS
     from mudg.data.importers.custom.importer import check_log
@@ -76,19 +78,57 @@ def report_scene(scene: Path) -> dict[str, Any]:
         ]
     alignment: dict[str, Any] = {}
     agreements: list[str] = []
+    costs, cost_lines = {}, []
     if not is_log and not any(f.level == "error" for f in found):
         alignment, agreements, doubts = _alignment(scene)
         found = worst_first([*found, *doubts])
+        costs, cost_lines = _costs(scene)
     count = {level: sum(f.level == level for f in found) for level in ("error", "warning", "note")}
     lines = [f"{f.level}: {f.where}: {f.message}" for f in found] + agreements
     if count["error"]:
         lines.append(f"{scene} cannot be used: {count['error']} errors, {count['warning']} warnings")
     else:
         lines.append(f"{scene} can be used: {count['warning']} warnings, {count['note']} notes")
+    lines += cost_lines
     return {
         "scene": scene, "findings": [{"level": f.level, "where": f.where, "words": f.message} for f in found],
-        "alignment": alignment, "usable": not count["error"], "text": "\n".join(lines), "exit_code": 3 if count["error"] else 0,
+        "alignment": alignment, "presets": costs, "usable": not count["error"], "text": "\n".join(lines),
+        "exit_code": 3 if count["error"] else 0,
     }  # fmt: skip
+
+
+def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """What every preset would take on a scene on this machine's CPU and, if there is one, its first CUDA card: for JSON, and in words."""
+    import torch
+
+    from mudg import native
+    from mudg.data.scene import read_scene
+    from mudg.stages.config import cost
+
+    scene = read_scene(path)
+    first = scene.frames[0].view.camera
+    size = cost.SceneSize(len(scene.frames), len(scene.frames_of(first.name)), first.width, first.height)
+    devices = {"cpu": _free_bytes()}
+    if torch.cuda.is_available():
+        devices["cuda"] = torch.cuda.mem_get_info()[0]
+    records: dict[str, Any] = {}
+    lines = []
+    for device, free in devices.items():
+        found = cost.of_presets(size, native.default_threads(), device)
+        lines += cost.in_words(found, free, device)
+        records[device] = {
+            name: {"seconds": dict(one.seconds), "total_s": one.total_s, "memory_bytes": one.memory_bytes,
+                   "fits": one.memory_bytes <= free if free else None}
+            for name, one in found.items()
+        }  # fmt: skip
+    return records, lines
+
+
+def _free_bytes() -> int:
+    """Memory that programs can still ask for; 0 where the system does not say."""
+    table = Path("/proc/meminfo")
+    found = re.search(r"^MemAvailable:\s+(\d+) kB", table.read_text(), re.MULTILINE) if table.is_file() else None
+    return 1024 * int(found[1]) if found else 0
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:

@@ -18,6 +18,7 @@ from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.run_folder import is_temporary, refuse_overlap
 from mudg.base.versions import environment, version
 from mudg.stages.config import FitConfig, RunConfig, with_device
+from mudg.stages.config.presets import NO_MODEL
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
@@ -27,9 +28,10 @@ CONTINUED_SHARE = 0.5
 """Further steps of the fit with diffusion, as a share of those of the fit that it continues."""
 
 
-def fits_of(config: FitConfig) -> tuple[FitConfig, FitConfig]:
-    """Settings of the chain's two fits: the one on recorded views, and the one under virtual views that goes on with it."""
-    further = max(1, round(CONTINUED_SHARE * config.iterations))
+def fits_of(config: FitConfig, continued: bool = True) -> tuple[FitConfig, FitConfig]:
+    """Settings of the chain's two fits: the one on recorded views, and the one under virtual views, which goes on with it unless
+    ``continued`` is off."""
+    further = max(1, round(CONTINUED_SHARE * config.iterations)) if continued else config.iterations
     return replace(config, method=WITHOUT_DIFFUSION), replace(config, method=WITH_DIFFUSION, iterations=further)
 
 
@@ -70,6 +72,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
         raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
+    _refuse_missing(config)
     _refuse_overlap(config, source, out)
     torch.set_num_threads(native.default_threads())
     ledger = _Ledger.open(out, config, str(source), overwrite)
@@ -96,6 +99,28 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
         "text": _closing_text(out, page, ledger),
     }  # fmt: skip
+
+
+def _refuse_missing(config: RunConfig) -> None:
+    """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion model. Before
+    anything is written: the first of these is needed only after a fit."""
+    from mudg.models.mdm.files import read_description
+    from mudg.models.published.files import is_published
+
+    if config.synthesize.model == NO_MODEL:
+        raise UsageError(
+            "the preset paper needs a published-type diffusion model, which mudg does not ship", where="--synthesize.model",
+            expected="a folder written by mudg convert", remedy="convert a checkpoint that you have (docs/published.md)",
+        )  # fmt: skip
+    if config.fit.virtual.perception == "lpips" and not config.fit.virtual.lpips_weights:
+        raise UsageError(
+            "LPIPS needs a weight file, which mudg does not ship", where="--fit.virtual.lpips-weights", expected="a safetensors file",
+            remedy="give one, or --fit.virtual.perception filters",
+        )  # fmt: skip
+    read_description(config.synthesize.model)
+    if config.synthesize.guidance is not None and not is_published(config.synthesize.model):
+        raise UsageError("guidance applies to published-type models only", where="--synthesize.model", got=config.synthesize.model,
+                         expected="a folder written by mudg convert")  # fmt: skip
 
 
 def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
@@ -187,7 +212,7 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
 
     fused, virtual = out / "fuse", out / "synthesize"
     diffusion = _diffusion_of(config, scene)
-    plain, guided = fits_of(config.fit)
+    plain, guided = fits_of(config.fit, config.continue_fit)
     models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     renders = {name: out / "render" / name for name in models}
 
@@ -203,7 +228,7 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
     def fitted_guided() -> Path:
         return fit.run(
             guided, scene, fused, models[WITH_DIFFUSION],
-            observations=virtual, start=models[WITHOUT_DIFFUSION], overwrite=overwrite,
+            observations=virtual, start=models[WITHOUT_DIFFUSION] if config.continue_fit else None, overwrite=overwrite,
         )  # fmt: skip
 
     def rendered(name: str) -> Path:

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from mudg.stages.config.fit import FitConfig
     from mudg.stages.config.learn import LearnConfig
     from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
-    from mudg.stages.config.run import DEMO_CITY, RunConfig, on_device, run_preset, with_device, with_lines, with_seed
+    from mudg.stages.config.presets import DEMO_CITY, PRESETS, PresetName, chosen_preset, run_preset
+    from mudg.stages.config.run import RunConfig, on_device, with_device, with_lines, with_seed
     from mudg.stages.config.synthesize import SynthesizeConfig
     from mudg.stages.config.views import RenderConfig, ScoreConfig
 
@@ -29,9 +30,12 @@ _HOMES = {
     "AnnotateConfig": "mudg.stages.config.prepare",
     "FuseConfig": "mudg.stages.config.prepare",
     "IngestConfig": "mudg.stages.config.prepare",
-    "DEMO_CITY": "mudg.stages.config.run",
+    "DEMO_CITY": "mudg.stages.config.presets",
+    "PRESETS": "mudg.stages.config.presets",
+    "PresetName": "mudg.stages.config.presets",
+    "chosen_preset": "mudg.stages.config.presets",
     "RunConfig": "mudg.stages.config.run",
-    "run_preset": "mudg.stages.config.run",
+    "run_preset": "mudg.stages.config.presets",
     "on_device": "mudg.stages.config.run",
     "with_device": "mudg.stages.config.run",
     "with_lines": "mudg.stages.config.run",
@@ -43,6 +47,7 @@ _HOMES = {
 
 __all__ = [
     "DEMO_CITY",
+    "PRESETS",
     "AdaptConfig",
     "AnnotateConfig",
     "BenchConfig",
@@ -51,10 +56,12 @@ __all__ = [
     "FuseConfig",
     "IngestConfig",
     "LearnConfig",
+    "PresetName",
     "RenderConfig",
     "RunConfig",
     "ScoreConfig",
     "SynthesizeConfig",
+    "chosen_preset",
     "on_device",
     "run_preset",
     "with_device",

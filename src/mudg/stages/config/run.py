@@ -1,4 +1,4 @@
-"""Settings of ``mudg run`` and ``mudg demo``: those of every verb, and the presets."""
+"""Settings of ``mudg run`` and ``mudg demo``: those of every verb (their presets: ``presets.py``)."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ class RunConfig:
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps
     that one."""
+    continue_fit: bool = True
+    """Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published."""
     ingest: IngestConfig = Field(default_factory=IngestConfig)
     annotate: AnnotateConfig = Field(default_factory=AnnotateConfig)
     fuse: FuseConfig = Field(default_factory=FuseConfig)
@@ -35,29 +37,6 @@ class RunConfig:
     fit: FitConfig = Field(default_factory=FitConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)
     score: ScoreConfig = Field(default_factory=ScoreConfig)
-
-
-DEMO_CITY = 3
-"""Seed of the city that `mudg demo` shows: a crossing by day, much traffic, a cyclist, a car that turns."""
-
-
-def run_preset(fast: bool = False) -> RunConfig:
-    """The chain's settings before any file or flag; the first camera of whatever scene it is.
-
-    Sized for a few minutes on two cores. ``fast`` trades quality for time: a smaller city, fewer denoising steps and
-    iterations.
-    """
-    config = with_lines(RunConfig(), cameras=())
-    frames, width, height, cameras, iterations, steps = 24, 384, 256, config.ingest.city.cameras, 1000, 2
-    if fast:
-        frames, width, height, cameras, iterations, steps = 12, 240, 160, ("front",), 250, 1
-    city = replace(config.ingest.city, seed=DEMO_CITY, n_frames=frames, width=width, height=height, cameras=cameras)
-    return replace(
-        config,
-        ingest=replace(config.ingest, city=city),
-        fit=replace(config.fit, iterations=iterations),
-        synthesize=replace(config.synthesize, steps=steps),
-    )
 
 
 def with_seed(config: RunConfig, seed: int) -> RunConfig:

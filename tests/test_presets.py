@@ -1,0 +1,127 @@
+"""Presets of run and demo: what they hold, precedence, refusals, the same from Python."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from mudg import cli, verbs
+from mudg.base import config as configuration
+from mudg.base.errors import InputError, UsageError
+from mudg.stages import config as stage_config
+from mudg.stages import run
+from mudg.stages.config import PRESETS, PresetName, RunConfig, run_preset
+
+NAMES = get_args(PresetName)
+
+
+def value_of(config: Any, key: str) -> Any:
+    for part in key.split("."):
+        config = getattr(config, part)
+    return config
+
+
+def words(*more: str) -> Any:
+    return cli.parse(["run", "city", "--out", "x", *more]).settings
+
+
+def test_every_preset_has_a_row_and_no_other() -> None:
+    assert set(PRESETS) == set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_preset_is_its_row_over_the_defaults(name: PresetName) -> None:
+    config = run_preset(name)
+    for key, value in PRESETS[name].items():
+        assert value_of(config, key) == value, key
+    back = configuration.load(RunConfig, None, None, configuration.to_dict(config))  # every value passes its check
+    assert back == config
+    assert config.ingest.city.seed == stage_config.DEMO_CITY
+    assert config.synthesize.cameras == config.render.cameras == ()
+    assert words("--preset", name) == config
+
+
+def test_fast_is_a_name_for_a_preset_and_default_is_the_default() -> None:
+    assert words("--fast") == words("--preset", "fast") == words("--fast", "--preset", "fast") == run_preset("fast")
+    assert words() == words("--preset", "default") == run_preset()
+    assert cli.parse(["demo", "--preset", "quality"]).settings == run_preset("quality")
+    for other in set(NAMES) - {"fast"}:
+        with pytest.raises(UsageError, match="another name of --preset fast"):
+            words("--fast", "--preset", other)
+    with pytest.raises(UsageError, match="no such preset"):
+        run_preset("best")  # type: ignore[arg-type]
+
+
+def test_defaults_then_preset_then_file_then_flags(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("fit:\n  iterations: 77\n  sh_degree: 2\n")
+    made = words("--preset", "paper", "--config", str(file), "--fit.sh-degree", "1")
+    assert (made.fit.iterations, made.fit.sh_degree, made.synthesize.steps) == (77, 1, 50)
+    assert made.fit.checkpoint_every != RunConfig().fit.checkpoint_every
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_run_yaml_of_a_preset_gives_it_back_under_any_preset(name: PresetName, tmp_path: Path) -> None:
+    before = words("--preset", name, "--seed", "5")
+    file = tmp_path / "run.yaml"
+    file.write_text(configuration.dump_yaml(before))
+    assert words("--config", str(file)) == words("--preset", "paper", "--config", str(file)) == before
+
+
+def test_an_unknown_preset_is_refused_with_the_list(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["demo", "--preset", "best"])
+    assert stopped.value.code == 2
+    assert "quality" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["demo", "run"])
+def test_help_names_every_preset(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([verb, "--help"])
+    shown = capsys.readouterr().out
+    assert "--preset" in shown
+    for name in NAMES:
+        assert name in shown
+
+
+def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_path: Path) -> None:
+    out, paper = tmp_path / "out", run_preset("paper")
+    with pytest.raises(UsageError, match="published-type diffusion model"):
+        run.run_chain(paper, "city", out)
+    with pytest.raises(UsageError, match="published-type diffusion model"):
+        verbs.run("city", out, preset="paper")
+    weights = replace(paper.fit, virtual=replace(paper.fit.virtual, lpips_weights=str(tmp_path / "lpips.safetensors")))
+    other = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model="embedded"))
+    with pytest.raises(UsageError, match="published-type models only"):
+        run.run_chain(other, "city", out)
+    with pytest.raises(InputError, match="no diffusion model here"):
+        run.run_chain(
+            replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path))), "city", out
+        )
+    with pytest.raises(UsageError, match="LPIPS needs a weight file"):
+        verbs.run("city", out, preset="paper", synthesize={"model": "embedded"})
+    assert not out.exists()
+
+
+def test_the_same_presets_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[RunConfig] = []
+    monkeypatch.setattr(run, "run_chain", lambda config, *_args, **_named: seen.append(config) or {})
+    verbs.run("city", tmp_path, preset="quality", fit={"iterations": 9})
+    verbs.run("city", tmp_path, fast=True)
+    verbs.run("city", tmp_path, seed=4)
+    assert seen[0] == replace(run_preset("quality"), fit=replace(run_preset("quality").fit, iterations=9))
+    assert seen[1] == run_preset("fast")
+    assert seen[2] == stage_config.with_seed(run_preset(), 4)
+    with pytest.raises(UsageError, match="another name of --preset fast"):
+        verbs.run("city", tmp_path, preset="paper", fast=True)
+
+
+def test_the_published_fit_starts_from_nothing_with_all_steps() -> None:
+    config = run_preset("paper")
+    plain, guided = run.fits_of(config.fit, config.continue_fit)
+    assert plain.iterations == guided.iterations == 30_000
+    assert run.fits_of(config.fit)[1].iterations == 15_000
