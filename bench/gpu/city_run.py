@@ -15,7 +15,6 @@ from shared import device_of, finish, flags, work_folder
 
 from mudg import verbs
 from mudg.base import store
-from mudg.stages.config import RunConfig
 
 TINY: dict[str, dict[str, Any]] = {
     "ingest": {"city": {"n_frames": 4, "width": 60, "height": 40, "cameras": ["front"]}},
@@ -31,8 +30,7 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     options = parser.parse_args(words)
     device = device_of(options)
     settings: dict[str, Any] = {name: dict(group) for name, group in TINY.items()} if options.small else {}
-    if "device" in RunConfig.__dataclass_fields__:
-        settings["device"] = str(device)
+    settings["device"] = str(device)
     if options.small:
         settings["shifts_m"] = (2.0,)
     out = work_folder(options) / "run"
