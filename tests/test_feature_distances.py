@@ -1,0 +1,197 @@
+"""Distances of feature sets: closed forms, invariances, and twins written another way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from mudg.base import seeds
+from mudg.base.errors import InputError
+from mudg.core import feature_distances as distances
+
+
+def rows(count: int, width: int, purpose: str) -> np.ndarray:
+    rng = seeds.numpy_rng(0, count, purpose)
+    return rng.standard_normal((count, width)) @ rng.standard_normal((width, width)) * 0.5 + rng.standard_normal(width)
+
+
+def rotation(width: int) -> np.ndarray:
+    return np.linalg.qr(seeds.numpy_rng(0, width, "rotation").standard_normal((width, width)))[0]
+
+
+def exactly(mean: np.ndarray, covariance: np.ndarray, count: int) -> np.ndarray:
+    """Rows whose sample mean and sample covariance are exactly those given."""
+    width = len(mean)
+    noise = seeds.numpy_rng(1, count, "noise").standard_normal((count, width))
+    noise -= noise.mean(0)
+    white = np.linalg.qr(noise)[0] * math.sqrt(count - 1)
+    return white @ np.linalg.cholesky(covariance).T + mean
+
+
+def frechet_by_sqrtm(a: np.ndarray, b: np.ndarray) -> float:
+    """The textbook form, with a matrix root."""
+    s, t = np.cov(a, rowvar=False), np.cov(b, rowvar=False)
+    root = linalg.sqrtm(s @ t)
+    return float(((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(s + t - 2 * root.real))
+
+
+ALL = {
+    "frechet": distances.frechet_distance,
+    "kernel": distances.kernel_distance,
+    "mind": lambda a, b: distances.mind_distance(a, b, seeds.numpy_rng(0, 0, "mind")),
+    "cmmd": distances.cmmd_distance,
+}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_symmetric_and_independent_of_the_order_of_rows(name: str) -> None:
+    a, b = rows(40, 6, "a"), rows(40, 6, "b")
+    value = ALL[name](a, b)
+    assert value > 1e-3
+    assert ALL[name](b, a) == pytest.approx(value, rel=1e-9)
+    assert ALL[name](a[::-1], b) == pytest.approx(value, rel=1e-9)
+    assert ALL[name](a.astype(np.float32), b.astype(np.float32)) == pytest.approx(value, rel=1e-4)
+
+
+@pytest.mark.parametrize(("name", "count"), [(n, c) for n in ("frechet", "mind", "cmmd") for c in (5, 60)])
+def test_a_set_is_0_from_itself(name: str, count: int) -> None:
+    a = rows(count, 12, "a") + 3
+    assert 0 <= ALL[name](a, a[::-1].copy()) < 1e-9 * (a**2).sum()
+
+
+@pytest.mark.parametrize("name", ["frechet", "kernel", "cmmd"])
+def test_rotating_everything_changes_nothing(name: str) -> None:
+    a, b, turn = rows(30, 8, "a"), rows(25, 8, "b"), rotation(8)
+    assert ALL[name](a @ turn, b @ turn) == pytest.approx(ALL[name](a, b), rel=1e-9)
+
+
+def test_frechet_of_known_gaussians() -> None:
+    one, two = np.diag([4.0, 9.0, 1.0]), np.diag([1.0, 16.0, 1.0])
+    a, b = exactly(np.array([1.0, 0, 0]), one, 50), exactly(np.array([0.0, 2, 0]), two, 70)
+    # Commuting covariances: |m|^2 + the squared differences of the standard deviations.
+    assert distances.frechet_distance(a, b) == pytest.approx(5.0 + 1.0 + 1.0, rel=1e-12)
+
+
+def test_frechet_scales_and_moves_as_it_must() -> None:
+    a, b = rows(20, 7, "a"), rows(31, 7, "b")
+    value = distances.frechet_distance(a, b)
+    assert distances.frechet_distance(a + 5, b + 5) == pytest.approx(value, rel=1e-9)
+    assert distances.frechet_distance(3 * a, 3 * b) == pytest.approx(9 * value, rel=1e-9)
+    assert distances.frechet_distance(a, a + np.r_[2.0, np.zeros(6)]) == pytest.approx(4.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(("n", "m"), [(200, 150), (9, 200), (200, 9), (12, 12), (13, 12)])
+def test_frechet_agrees_with_the_matrix_root(n: int, m: int) -> None:
+    a, b = rows(n, 12, "a"), rows(m, 12, "b")
+    # The root of a singular product is known to half of the digits only; ours needs no root.
+    assert distances.frechet_distance(a, b) == pytest.approx(
+        frechet_by_sqrtm(a, b), rel=1e-9 if min(n, m) > 12 else 1e-5
+    )
+
+
+def test_frechet_of_few_rows_is_mostly_bias_and_the_extrapolation_takes_most_of_it() -> None:
+    rng = seeds.numpy_rng(0, 0, "bias")
+    a, b = rng.standard_normal((300, 40)), rng.standard_normal((300, 40))
+    biased = distances.frechet_distance(a, b)
+    assert distances.frechet_distance(a[:60], b[:60]) > 3 * biased > 3.0
+    assert abs(distances.frechet_at_infinity(a, b, seeds.numpy_rng(0, 0, "sizes"))) < biased / 3
+
+
+def test_frechet_at_infinity_of_a_plain_shift_is_the_shift() -> None:
+    a = seeds.numpy_rng(0, 0, "shift").standard_normal((400, 3))
+    found = distances.frechet_at_infinity(a, a + [10.0, 0, 0], seeds.numpy_rng(0, 1, "sizes"))
+    assert found == pytest.approx(100.0, rel=0.02)
+
+
+def kernel_by_loops(a: np.ndarray, b: np.ndarray) -> float:
+    def k(x: np.ndarray, y: np.ndarray) -> float:
+        return (sum(p * q for p, q in zip(x, y)) / len(x) + 1) ** 3
+
+    n, m = len(a), len(b)
+    own_a = sum(k(a[i], a[j]) for i in range(n) for j in range(n) if i != j) / (n * (n - 1))
+    own_b = sum(k(b[i], b[j]) for i in range(m) for j in range(m) if i != j) / (m * (m - 1))
+    return own_a + own_b - 2 * sum(k(x, y) for x in a for y in b) / (n * m)
+
+
+def test_kernel_distance_against_loops_and_by_hand() -> None:
+    a, b = rows(7, 4, "a"), rows(5, 4, "b")
+    assert distances.kernel_distance(a, b) == pytest.approx(kernel_by_loops(a, b), rel=1e-12)
+    # d = 1: k(1,1) = 8, k(0,0) = 1, k(0,1) = 1 -> 8 + 1 - 2.
+    assert distances.kernel_distance([[1.0], [1.0]], [[0.0], [0.0]]) == pytest.approx(7.0, rel=1e-12)
+
+
+def test_kernel_distance_of_one_law_is_0_on_average() -> None:
+    found = []
+    for draw in range(300):
+        rng = seeds.numpy_rng(0, draw, "law")
+        found.append(distances.kernel_distance(rng.standard_normal((8, 5)), rng.standard_normal((12, 5))))
+    assert min(found) < 0 < max(found)
+    assert abs(np.mean(found)) < 3 * np.std(found) / math.sqrt(len(found))
+
+
+def test_kernel_error_agrees_with_the_spread_of_fresh_samples_and_grows_with_blocks() -> None:
+    fresh, found = [], []
+    for draw in range(60):
+        rng = seeds.numpy_rng(0, draw, "fresh")
+        a, b = rng.standard_normal((60, 4)) + 0.8, rng.standard_normal((60, 4))
+        fresh.append(distances.kernel_distance(a, b))
+        if draw < 6:
+            single = (range(60), range(60))
+            found.append(distances.kernel_distance_error(a, b, single, seeds.numpy_rng(0, draw, "boot")))
+    assert np.mean(found) == pytest.approx(np.std(fresh), rel=0.4)
+    rng = seeds.numpy_rng(0, 0, "blocks")
+    a, b = (np.repeat(rng.standard_normal((12, 4)), 5, 0) + shift for shift in (0.8, 0.0))  # five equal frames each
+    blocks = np.repeat(np.arange(12), 5)
+    apart = distances.kernel_distance_error(a, b, (range(60), range(60)), seeds.numpy_rng(0, 0, "boot"))
+    assert distances.kernel_distance_error(a, b, (blocks, blocks), seeds.numpy_rng(0, 0, "boot")) > 1.5 * apart
+
+
+def test_mind_of_a_shift_and_against_loops() -> None:
+    a = rows(30, 3, "a")
+    moved = distances.mind_distance(a, a + [0.0, 2.0, 0.0], seeds.numpy_rng(0, 0, "mind"), 4000)
+    assert moved == pytest.approx(3 * 4.0, rel=0.05)
+    b = rows(30, 3, "b")
+    lines = seeds.numpy_rng(0, 0, "mind").standard_normal((3, 20))
+    total = []
+    for line in lines.T:
+        unit = line / math.sqrt(sum(line**2))
+        total += [(p - q) ** 2 for p, q in zip(sorted(a @ unit), sorted(b @ unit))]
+    assert distances.mind_distance(a, b, seeds.numpy_rng(0, 0, "mind"), 20) == pytest.approx(
+        9 * np.mean(total), rel=1e-12
+    )
+    larger = np.concatenate([b, rows(11, 3, "c")])
+    assert distances.mind_distance(a, larger, seeds.numpy_rng(0, 0, "mind"), 20) > 0
+
+
+def test_cmmd_by_hand() -> None:
+    a, b = np.array([[2.0, 0], [5.0, 0]]), np.array([[0, 3.0]])  # at right angles: squared distance 2
+    assert distances.cmmd_distance(a, b) == pytest.approx(1000 * 2 * (1 - math.exp(-2 / 200)), rel=1e-12)
+    assert distances.cmmd_distance(a, -a) == pytest.approx(1000 * 2 * (1 - math.exp(-4 / 200)), rel=1e-12)
+    assert distances.cmmd_distance(7 * a, b) == distances.cmmd_distance(a, b)
+    with pytest.raises(InputError, match="real, row 0"):
+        distances.cmmd_distance(a, 0 * b)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_what_cannot_be_compared_is_refused(name: str) -> None:
+    a = rows(5, 4, "a")
+    with pytest.raises(InputError, match="differ in width"):
+        ALL[name](a, a[:, :3])
+    with pytest.raises(InputError, match="wrong shape"):
+        ALL[name](a[:0], a)
+    with pytest.raises(InputError, match="wrong shape"):
+        ALL[name](a, a[0])
+    spoilt = a.copy()
+    spoilt[3, 1] = np.nan
+    with pytest.raises(InputError, match="real images, row 3"):
+        ALL[name](a, spoilt)
+
+
+def test_blocks_must_fit() -> None:
+    a, rng = rows(5, 4, "a"), seeds.numpy_rng(0, 0, "boot")
+    for blocks in ((range(5), range(4)), (range(5), [1] * 5)):
+        with pytest.raises(InputError, match="blocks do not fit"):
+            distances.kernel_distance_error(a, a, blocks, rng)
