@@ -1,0 +1,286 @@
+"""FID's feature extractor: the Inception-v3 network of the TensorFlow release of 2015, from tensors under their usual names.
+
+It differs from torchvision's Inception-v3: averages leave padding out of their count, the last block takes maxima where the one
+before averages, there are 1008 classes and no auxiliary head, and the weights are others. Numbers made with another network are
+not FID. How an image is brought to 299x299 is part of the definition, too; five rules are in use (``ResizeRule``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final, Literal, get_args
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mudg.base.errors import InputError
+from mudg.core.pictures import resize_bicubic
+
+SIDE_PX: Final = 299
+NORM_EPSILON: Final = 1e-3
+WIDTH: Final = 2048
+CLASSES: Final = 1008
+KNOWN_SHA256: Final = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"
+"""Hash of the published file, ``pt_inception-2015-12-05-6726825d.pth``."""
+
+ResizeRule = Literal["pytorch-fid", "tf1", "clean", "tm", "neurad"]
+"""How an image u8[H, W, 3] becomes f32[3, 299, 299]; the aspect is not kept by any.
+
+* pytorch-fid: bilinear, half-pixel centres, no antialiasing; 2 x / 255 - 1.
+* tf1: bilinear, pixel k of the result at k * in / out, no antialiasing; (x - 128) / 128, as the other rules. TTUR, torch-fidelity.
+* clean: bicubic with antialiasing, clipped to 0..255, not rounded. clean-fid.
+* tm: bilinear with antialiasing. torchmetrics.
+* neurad: Pillow's bicubic on 8 bits. neurad-studio.
+"""
+RULES: Final[tuple[ResizeRule, ...]] = get_args(ResizeRule)
+
+Tap = Literal["64", "192", "768", "2048", "logits_unbiased"]
+"""Where features are read, by their width: after the first and the second maximum pool and after Mixed_6e, averaged over places; the
+global average that FID uses; its classes without bias."""
+
+_Unit = tuple[str, int, tuple[int, int], int, bool]
+_AVERAGE, _MAXIMUM, _MAXIMUM_HALF = "average", "maximum", "maximum, every second place"
+_Branch = tuple["_Unit | str | tuple[_Unit, ...]", ...]
+"""Units and pools in order; a tuple of units at the end reads the same input and is concatenated."""
+
+
+def _unit(name: str, out: int, size: int | tuple[int, int] = 1, stride: int = 1) -> _Unit:
+    """A convolution with its norm; padded to keep the size unless it takes every second place."""
+    return (name, out, (size, size) if isinstance(size, int) else size, stride, stride == 1)
+
+
+def _block_a(pool: int) -> tuple[_Branch, ...]:
+    return (
+        (_unit("branch1x1", 64),),
+        (_unit("branch5x5_1", 48), _unit("branch5x5_2", 64, 5)),
+        (_unit("branch3x3dbl_1", 64), _unit("branch3x3dbl_2", 96, 3), _unit("branch3x3dbl_3", 96, 3)),
+        (_AVERAGE, _unit("branch_pool", pool)),
+    )
+
+
+def _block_b() -> tuple[_Branch, ...]:
+    return (
+        (_unit("branch3x3", 384, 3, 2),),
+        (_unit("branch3x3dbl_1", 64), _unit("branch3x3dbl_2", 96, 3), _unit("branch3x3dbl_3", 96, 3, 2)),
+        (_MAXIMUM_HALF,),
+    )
+
+
+def _block_c(width: int) -> tuple[_Branch, ...]:
+    flat, tall = (1, 7), (7, 1)
+    return (
+        (_unit("branch1x1", 192),),
+        (_unit("branch7x7_1", width), _unit("branch7x7_2", width, flat), _unit("branch7x7_3", 192, tall)),
+        (_unit("branch7x7dbl_1", width), _unit("branch7x7dbl_2", width, tall), _unit("branch7x7dbl_3", width, flat),
+         _unit("branch7x7dbl_4", width, tall), _unit("branch7x7dbl_5", 192, flat)),
+        (_AVERAGE, _unit("branch_pool", 192)),
+    )  # fmt: skip
+
+
+def _block_d() -> tuple[_Branch, ...]:
+    return (
+        (_unit("branch3x3_1", 192), _unit("branch3x3_2", 320, 3, 2)),
+        (_unit("branch7x7x3_1", 192), _unit("branch7x7x3_2", 192, (1, 7)), _unit("branch7x7x3_3", 192, (7, 1)),
+         _unit("branch7x7x3_4", 192, 3, 2)),
+        (_MAXIMUM_HALF,),
+    )  # fmt: skip
+
+
+def _block_e(pool: str) -> tuple[_Branch, ...]:
+    flat, tall = (1, 3), (3, 1)
+    return (
+        (_unit("branch1x1", 320),),
+        (_unit("branch3x3_1", 384), (_unit("branch3x3_2a", 384, flat), _unit("branch3x3_2b", 384, tall))),
+        (_unit("branch3x3dbl_1", 448), _unit("branch3x3dbl_2", 384, 3),
+         (_unit("branch3x3dbl_3a", 384, flat), _unit("branch3x3dbl_3b", 384, tall))),
+        (pool, _unit("branch_pool", 192)),
+    )  # fmt: skip
+
+
+_STEM: Final[tuple[_Unit | str, ...]] = (
+    ("Conv2d_1a_3x3", 32, (3, 3), 2, False), ("Conv2d_2a_3x3", 32, (3, 3), 1, False), ("Conv2d_2b_3x3", 64, (3, 3), 1, True), "64",
+    ("Conv2d_3b_1x1", 80, (1, 1), 1, False), ("Conv2d_4a_3x3", 192, (3, 3), 1, False), "192",
+)  # fmt: skip
+"""Convolutions from the image on; a name of a tap stands for a maximum pool, 3x3 at every second place, and the tap after it."""
+
+_BLOCKS: Final[dict[str, tuple[_Branch, ...]]] = {
+    "Mixed_5b": _block_a(32), "Mixed_5c": _block_a(64), "Mixed_5d": _block_a(64), "Mixed_6a": _block_b(),
+    "Mixed_6b": _block_c(128), "Mixed_6c": _block_c(160), "Mixed_6d": _block_c(160), "Mixed_6e": _block_c(192),
+    "Mixed_7a": _block_d(), "Mixed_7b": _block_e(_AVERAGE), "Mixed_7c": _block_e(_MAXIMUM),
+}  # fmt: skip
+_MIDDLE_TAP: Final = "Mixed_6e"
+
+
+def tensor_shapes() -> dict[str, tuple[int, ...]]:
+    """Name -> shape of all 472 tensors that a weight file must hold, in the network's order."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, into, (_, out, size, _, _) in _units():
+        shapes[f"{name}.conv.weight"] = (out, into, *size)
+        shapes |= {f"{name}.bn.{leaf}": (out,) for leaf in _NORM}
+    return {**shapes, "fc.weight": (CLASSES, WIDTH), "fc.bias": (CLASSES,)}
+
+
+_NORM: Final = ("weight", "bias", "running_mean", "running_var")
+
+
+def _units() -> Iterator[tuple[str, int, _Unit]]:
+    """Full name, channels in, and unit of every convolution, in order."""
+    width = 3
+    for step in _STEM:
+        if not isinstance(step, str):
+            yield step[0], width, step
+            width = step[1]
+    for block, branches in _BLOCKS.items():
+        total = 0
+        for branch in branches:
+            inner = width
+            for step in branch:
+                if isinstance(step, str):
+                    continue
+                group = step if isinstance(step[0], tuple) else (step,)
+                for unit in group:
+                    yield f"{block}.{unit[0]}", inner, unit
+                inner = sum(unit[1] for unit in group)
+            total += inner
+        width = total
+
+
+class InceptionFeatures(nn.Module):
+    """The network, always in evaluation mode.
+
+    Args:
+        state: the tensors of ``tensor_shapes``. ``num_batches_tracked`` entries are left alone; anything else is refused.
+        where: file name for errors.
+
+    Raises:
+        InputError: a tensor is missing, has another shape, holds values that are not finite or a variance below 0, or is unknown.
+    """
+
+    def __init__(self, state: Mapping[str, Tensor], where: str = "Inception weights") -> None:
+        super().__init__()
+        self._units = {name: unit for name, _, unit in _units()}
+        for name, value in _checked(state, where).items():
+            self.register_buffer(name.replace(".", "/"), value)
+
+    def forward(self, images: Tensor, taps: Sequence[Tap] = ("2048",)) -> dict[str, Tensor]:
+        """Features of prepared images.
+
+        Args:
+            images: ``[n, 3, 299, 299]`` from ``prepared``. taps: what to return; nothing after the last one is computed.
+
+        Returns:
+            Tap -> ``[n, width]``; ``logits_unbiased`` ``[n, 1008]``.
+        """
+        if images.shape[1:] != (3, SIDE_PX, SIDE_PX):
+            raise InputError(
+                "FID's network takes images of one size",
+                expected=f"[n, 3, {SIDE_PX}, {SIDE_PX}]",
+                got=str(tuple(images.shape)),
+            )
+        found: dict[str, Tensor] = {}
+        for name, x in self._places(images):
+            if name in taps:
+                found[name] = x.mean((2, 3)) if x.dim() == 4 else x
+                if len(found) == len(set(taps)):
+                    break
+        return found
+
+    def _places(self, x: Tensor) -> Iterator[tuple[str, Tensor]]:
+        """Taps in the network's order."""
+        for step in _STEM:
+            if isinstance(step, str):
+                x = F.max_pool2d(x, 3, 2)
+                yield step, x
+            else:
+                x = self._convolved(step[0], x)
+        for block in _BLOCKS:
+            x = self.block(block, x)
+            if block == _MIDDLE_TAP:
+                yield "768", x
+        x = x.mean((2, 3))
+        yield "2048", x
+        yield "logits_unbiased", x @ self.get_buffer("fc/weight").T
+
+    def block(self, name: str, x: Tensor) -> Tensor:
+        """One of the blocks Mixed_5b to Mixed_7c: ``[n, C, h, w]`` -> ``[n, C', h', w']``."""
+        return torch.cat([self._branch(name, branch, x) for branch in _BLOCKS[name]], 1)
+
+    def _branch(self, block: str, branch: _Branch, x: Tensor) -> Tensor:
+        for step in branch:
+            if isinstance(step, str):
+                x = _pooled(step, x)
+            elif isinstance(step[0], tuple):
+                x = torch.cat([self._convolved(f"{block}.{unit[0]}", x) for unit in step], 1)  # type: ignore[index]
+            else:
+                x = self._convolved(f"{block}.{step[0]}", x)
+        return x
+
+    def _convolved(self, name: str, x: Tensor) -> Tensor:
+        _, _, (tall, wide), stride, same = self._units[name]
+        path = name.replace(".", "/")
+        padding = (tall // 2, wide // 2) if same else 0
+        x = F.conv2d(x, self.get_buffer(f"{path}/conv/weight"), None, stride, padding)
+        weight, bias, mean, variance = (self.get_buffer(f"{path}/bn/{leaf}") for leaf in _NORM)
+        return F.relu(F.batch_norm(x, mean, variance, weight, bias, training=False, eps=NORM_EPSILON))
+
+
+def _pooled(kind: str, x: Tensor) -> Tensor:
+    if kind == _AVERAGE:
+        return F.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
+    return F.max_pool2d(x, 3, 2) if kind == _MAXIMUM_HALF else F.max_pool2d(x, 3, 1, 1)
+
+
+def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
+    wanted = tensor_shapes()
+    for name, shape in wanted.items():
+        found = state.get(name)
+        if found is None or tuple(found.shape) != shape or not found.is_floating_point():
+            got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
+            raise InputError("Inception weights are incomplete or of another network", where=f"{where}: {name}",
+                expected=str(shape), got=got, remedy="use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors")  # fmt: skip
+        if not bool(torch.isfinite(found).all()) or (name.endswith("running_var") and bool((found < 0).any())):
+            raise InputError("Inception weights hold impossible values", where=f"{where}: {name}",
+                expected="finite numbers, variances of at least 0")  # fmt: skip
+    for name in state:
+        if name not in wanted and not name.endswith(".bn.num_batches_tracked"):
+            raise InputError("Inception weights hold a tensor that FID's network has not", where=f"{where}: {name}",
+                expected=f"{len(wanted)} tensors", remedy="torchvision's Inception-v3 is another network")  # fmt: skip
+    return {name: state[name].detach().float() for name in wanted}
+
+
+# ---- images in ----
+
+
+def prepared(rgb: NDArray[np.uint8], rule: ResizeRule) -> Tensor:
+    """An image u8[H, W, 3] as f32[3, 299, 299], in about [-1, 1], by one of the five rules."""
+    if rule == "neurad":
+        return (_planes(resize_bicubic(rgb, SIDE_PX, SIDE_PX)) - 128) / 128
+    image, size = _planes(rgb)[None], (SIDE_PX, SIDE_PX)
+    if rule == "pytorch-fid":
+        return F.interpolate(image / 255, size=size, mode="bilinear", align_corners=False)[0] * 2 - 1
+    if rule == "tf1":
+        image = _bilinear_from_corner(image)
+    elif rule == "clean":
+        image = F.interpolate(image, size=size, mode="bicubic", align_corners=False, antialias=True).clamp(0, 255)
+    else:
+        image = F.interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)
+    return (image[0] - 128) / 128
+
+
+def _planes(rgb: NDArray[np.uint8]) -> Tensor:
+    return torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float()
+
+
+def _bilinear_from_corner(image: Tensor) -> Tensor:
+    """Bilinear as TensorFlow 1 did it: pixel k of the result lies at k * in / out, with no half-pixel offset."""
+    for axis in (-2, -1):
+        count = image.shape[axis]
+        place = torch.arange(SIDE_PX, dtype=torch.float32) * (count / SIDE_PX)
+        low = place.floor().long().clamp(max=count - 1)
+        high = (low + 1).clamp(max=count - 1)
+        share = (place - low).view([-1, 1] if axis == -2 else [-1])
+        image = image.index_select(axis, low) * (1 - share) + image.index_select(axis, high) * share
+    return image
