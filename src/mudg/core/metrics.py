@@ -356,6 +356,7 @@ METRICS: Final[dict[str, MetricRow]] = {
     "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "lower", Flicker),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
+    "kid": MetricRow("KID", "", ("rgb", "Inception weights"), "lower", None),
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
     "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: DepthError("abs_rel")),
     "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: DepthError("rmse_m")),

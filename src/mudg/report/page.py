@@ -11,7 +11,18 @@ import numpy as np
 
 from mudg.core.pictures import depth_colors
 from mudg.report import html
-from mudg.report.score_tables import best_of, distance_title, number_text, title_of, values_by_distance
+from mudg.report.score_tables import (
+    FLOOR,
+    NOT_COMPUTED,
+    SET_METRICS,
+    WEIGHT_FLAGS,
+    best_of,
+    distance_title,
+    floors_by_distance,
+    number_text,
+    title_of,
+    values_by_distance,
+)
 
 GROUPS: Final = (
     ("Colour", ("psnr", "ssim", "perceptual")),
@@ -188,14 +199,14 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
     values = values_by_distance(scores)
     distances = sorted({d for m, d in values if any(isinstance(v, float) for v in values[m, d].values())})
     metrics = {m["name"]: m for m in scores["metrics"]}
+    absent = [m for m in metrics.values() if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in scores["results"])]
     groups = [
         _score_group(scores, title, [metrics[n] for n in names if n in metrics], distances) for title, names in GROUPS
     ]
-    absent = [
-        m for m in metrics.values() if all(r["values"].get(m["name"]) == "not computed" for r in scores["results"])
-    ]
+    if "distributions" in scores:
+        groups.append(_with_floor(scores, _score_group(scores, "Distribution", [metrics[n] for n in SET_METRICS], distances), distances))
     if absent:
-        cells = [{"text": "not computed", "classes": "absent"}] * len(absent)
+        cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in absent]
         rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]
         groups.append({"title": "Perceptual", "distances": [], "metrics": absent, "rows": rows})
     numeric = [
@@ -203,7 +214,7 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
     ]
     return {
         "score_groups": groups if distances else [],
-        "not_computed": ", ".join(f"{m['title']} ({m['needs'][-1]})" for m in absent),
+        "not_computed": ", ".join(f"{m['title']} ({_remedy_of(m)})" for m in absent),
         "charts": [c for c in (_chart(scores, metrics[n]) for n in CHARTED if n in metrics) if c],
         "result_metrics": numeric,
         "results": [
@@ -236,6 +247,18 @@ def _score_group(
         "metrics": metrics,
         "rows": rows,
     }
+
+
+def _remedy_of(metric: Mapping[str, Any]) -> str:
+    flag = WEIGHT_FLAGS.get(metric["name"])
+    return f"{metric['needs'][-1]}" + (f": mudg score {flag} FILE" if flag else "")
+
+
+def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
+    """The group with a last row: what the truth itself scores."""
+    floors = floors_by_distance(scores)
+    cells = [{"text": number_text(m["name"], floors.get(d, {}).get(m["name"])), "classes": ""} for d in distances for m in group["metrics"]]
+    return {**group, "rows": [*group["rows"], {"method": "truth", "title": FLOOR, "cells": cells}]}
 
 
 def chart_points(scores: Mapping[str, Any], metric: str) -> dict[str, list[tuple[float, float]]]:

@@ -10,13 +10,20 @@ from mudg.methods import METHODS
 
 NO_TRUTH: Final = "no truth"
 NOT_REQUESTED: Final = "not requested"
+NOT_COMPUTED: Final = "not computed"
+TOO_FEW: Final = "too few views"
+UNEQUAL: Final = "unequal n"
+WEIGHT_FLAGS: Final = {"lpips": "--lpips-weights", "fid": "--fid-weights", "kid": "--fid-weights"}
+"""Metric -> the flag of ``mudg score`` that names the weights it needs."""
+SET_METRICS: Final = ("fid", "kid")
+FLOOR: Final = "Floor: the truth itself"
 TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
     "nearest_fill": "Fused points, holes filled",
     **{name: method.title for name, method in METHODS.items()},
 }
 TERMINAL_METRICS: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "delta1", "miou")
-_DIGITS: Final = {"psnr": 2, "psnr_movers": 2, "flicker": 2, "rmse_m": 2, "fid": 1, "fvd": 1}
+_DIGITS: Final = {"psnr": 2, "psnr_movers": 2, "flicker": 2, "rmse_m": 2, "fid": 1, "kid": 4, "fvd": 1}
 
 
 def title_of(method: str) -> str:
@@ -25,15 +32,15 @@ def title_of(method: str) -> str:
 
 
 def number_text(metric: str, value: float | str | None) -> str:
-    """A metric's value with its usual digits; a reason why there is none is returned as it is."""
+    """A metric's value with its usual digits, or the reason why there is none; what needs weights names the flag that takes them."""
     if isinstance(value, str):
-        return value
+        return f"{value} ({WEIGHT_FLAGS[metric]})" if value == NOT_COMPUTED and metric in WEIGHT_FLAGS else value
     return "" if value is None else f"{value:.{_DIGITS.get(metric, 3)}f}"
 
 
 def document(
     scene: Scene, exact: bool, trajectories: Sequence[Mapping[str, Any]], methods: Sequence[str],
-    results: Sequence[Mapping[str, Any]], rows: Mapping[str, Mapping[str, Any]], depth_limit_m: float,
+    results: Sequence[Mapping[str, Any]], rows: Mapping[str, Mapping[str, Any]], made: Mapping[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
     """Everything ``metrics.json`` holds.
 
@@ -41,8 +48,10 @@ def document(
         scene: what was scored. exact: whether truth exists at any view.
         trajectories: as JSON values. methods: in the order of the tables.
         results: one entry per method and trajectory. rows: title, unit, better and needs of each metric.
-        depth_limit_m: depths beyond it do not count.
+        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count, and ``distributions``, what is known of FID
+            and KID or None where they are not computed.
     """
+    depth_limit_m, distributions = made["depth_limit_m"], made["distributions"]
     held_out = len(scene.frames_in("test"))
     rules = [
         "All methods are scored at one size, that of the scene's camera unless another was requested; "
@@ -56,6 +65,7 @@ def document(
         f"Depth counts where the truth is known and at most {depth_limit_m:g} m; "
         f"where a method gives none, it counts as {depth_limit_m:g} m.",
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
+        *([_rule_of_sets(distributions)] if distributions else []),
     ]
     return {
         "schema": 1,
@@ -71,7 +81,18 @@ def document(
         "trajectories": list(trajectories),
         "results": list(results),
         "by_distance": by_distance(trajectories, methods, results, list(rows)),
+        **({"distributions": distributions} if distributions else {}),
     }  # fmt: skip
+
+
+def _rule_of_sets(made: Mapping[str, Any]) -> str:
+    other = f"weights that are not the published file ({made['weights_sha256'][:12]})"
+    weights = "the published weights" if made["published_weights"] else other
+    return (
+        f"FID and KID compare the views of a trajectory with the {made['reference']}, with {weights} and the resize rule {made['resize']}. "
+        "They depend on the number of images: compare methods within a column only, and read them beside the floor, "
+        "which the truth itself scores."
+    )
 
 
 def by_distance(
@@ -87,11 +108,14 @@ def by_distance(
         here = [c["name"] for c in trajectories if c["shift_m"] is not None and abs(float(c["shift_m"])) == distance]
         signs = {float(c["shift_m"]) > 0 for c in trajectories if c["name"] in here}
         sides = "recorded" if distance == 0 else "both" if len(signs) == 2 else "left" if signs == {True} else "right"
+        sizes = {r["distribution"]["n"] for r in results if r["trajectory"] in here and "distribution" in r}
+        uneven = dict.fromkeys(SET_METRICS, UNEQUAL) if len(sizes) > 1 else {}
         for method in methods:
             rows = [r for r in results if r["method"] == method and r["trajectory"] in here]
+            values = {name: _mean([r["values"].get(name) for r in rows]) for name in names}
             table.append(
                 {"method": method, "distance_m": distance, "sides": sides, "trajectories": [r["trajectory"] for r in rows],
-                 "values": {name: _mean([r["values"].get(name) for r in rows]) for name in names}}
+                 "values": {**values, **uneven}}
             )  # fmt: skip
     return table
 
@@ -126,11 +150,27 @@ def values_by_distance(document: Mapping[str, Any]) -> dict[tuple[str, float], M
     return {(row["method"], float(row["distance_m"])): row["values"] for row in document["by_distance"]}
 
 
+def floors_by_distance(document: Mapping[str, Any]) -> dict[float, dict[str, float | str]]:
+    """Distance in metres -> what the truth itself scores in FID and KID, as the tables by distance average it."""
+    floors = document.get("distributions", {}).get("floors", [])
+    found: dict[float, dict[str, float | str]] = {}
+    for row in document["by_distance"]:
+        here = [floor for floor in floors if floor["trajectory"] in row["trajectories"]]
+        if here:
+            equal = len({floor["n"] for floor in here}) == 1
+            found[float(row["distance_m"])] = {
+                name: _mean([floor[name] for floor in here]) if equal else UNEQUAL for name in SET_METRICS
+            }
+    return found
+
+
 def plain(document: Mapping[str, Any]) -> str:
     """The main numbers for a terminal: one block per distance, best values marked with a star."""
     values_of = values_by_distance(document)
     distances = sorted({d for _, d in values_of})
-    columns = [m for m in document["metrics"] if m["name"] in TERMINAL_METRICS]
+    names = (*TERMINAL_METRICS, *(SET_METRICS if "distributions" in document else ()))
+    columns = [m for m in document["metrics"] if m["name"] in names]
+    floors = floors_by_distance(document)
     lines = []
     for distance in distances:
         if not any(
@@ -151,6 +191,9 @@ def plain(document: Mapping[str, Any]) -> str:
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
                 cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>14}")
             lines.append(f"  {method['title']:<28}" + "".join(cells))
+        if distance in floors:
+            cells = [f"{number_text(c['name'], floors[distance].get(c['name'])) + ' ':>14}" for c in columns]
+            lines.append(f"  {FLOOR:<28}" + "".join(cells))
         lines.append("")
     return "\n".join(lines).rstrip()
 
@@ -165,7 +208,25 @@ def markdown(document: Mapping[str, Any]) -> str:
             for r in document["results"] if r["trajectory"] == trajectory["name"]
         ]  # fmt: skip
         lines += ["", f"## {trajectory['name']}", "", *markdown_table(["method", "views", *names], rows)]
+        lines += _lines_of_sets(document, trajectory["name"])
     return "\n".join(lines) + "\n"
+
+
+def _lines_of_sets(document: Mapping[str, Any], trajectory: str) -> list[str]:
+    """Sizes of the sets behind FID and KID of a trajectory, errors of KID, and the floor."""
+    rows = [r for r in document["results"] if r["trajectory"] == trajectory and "distribution" in r]
+    lines = []
+    for row in rows[:1]:
+        of = row["distribution"]
+        lines += ["", f"* FID and KID: {of['n']} views of every method against {of['n_reference']} recorded frames."]
+    errors = [f"{title_of(r['method'])} {r['distribution']['kid_standard_error']:.4f}" for r in rows
+              if r["distribution"]["kid_standard_error"] is not None]  # fmt: skip
+    lines += [f"* Standard error of KID: {', '.join(errors)}."] if errors else []
+    for floor in document.get("distributions", {}).get("floors", []):
+        if floor["trajectory"] == trajectory:
+            values = ", ".join(f"{name.upper()} {number_text(name, floor[name])}" for name in SET_METRICS)
+            lines.append(f"* {FLOOR}: {values} ({floor['how']}, {floor['n']} against {floor['n_reference']}).")
+    return lines
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

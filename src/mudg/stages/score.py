@@ -1,8 +1,8 @@
 """``mudg score``: what the methods rendered, against the truth.
 
 For a generated city the truth is exact at any view. For a recorded log it is the held-out recorded frames, and nothing
-at shifted views. OUT holds metrics.json, metrics.md, truth/<trajectory>/ and nearest_fill/<trajectory>/ (observations)
-and errors/*.png.
+at shifted views. OUT holds metrics.json, metrics.md, truth/<trajectory>/ and nearest_fill/<trajectory>/ (observations),
+errors/*.png and, where FID is computed, features/.
 """
 
 from __future__ import annotations
@@ -45,13 +45,15 @@ from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.fitting.perception import lpips_network
 from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, Truth, ViewTruth, apart_m, stored_truth, truth_of
+from mudg.stages.scoring.distributions import FEATURES_FOLDER, Distributions, ImageSet, TrajectorySets, distributions_of
 
 BASELINE: Final = "nearest_fill"
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
 DEPTH_LIMIT_M: Final = 80.0
 _OUTPUT: Final = VerbOutput(
-    "score", 3,
-    ("metrics.json", "metrics.md", "errors/*.png", *below("truth/*", OBSERVATION_FILES), *below(f"{BASELINE}/*", OBSERVATION_FILES)),
+    "score", 4,
+    ("metrics.json", "metrics.md", "errors/*.png", f"{FEATURES_FOLDER}/*.safetensors",
+     *below("truth/*", OBSERVATION_FILES), *below(f"{BASELINE}/*", OBSERVATION_FILES)),
 )  # fmt: skip
 _NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
 
@@ -76,6 +78,10 @@ class ScoredTrajectory:
     frames: tuple[Frame | None, ...]
     sets: Mapping[str, ObservationSet]
     indices: Mapping[str, tuple[int, ...]]
+
+    def counted(self, held_out: frozenset[str]) -> list[int]:
+        """The views that count. Recorded training frames were seen by the fit and do not; views off the path never were."""
+        return [n for n, frame in enumerate(self.frames) if frame is None or frame.id in held_out]
 
     def record(self) -> dict[str, Any]:
         """The trajectory as JSON values."""
@@ -123,10 +129,12 @@ def run(
     """
     if not methods:
         raise UsageError("nothing to score", expected="at least one method with its folder of rendered views")
-    refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, "lpips-weights": config.lpips_weights})
+    weights = {"lpips_weights": config.lpips_weights, "fid_weights": config.fid_weights}
+    named = {name.replace("_", "-"): path for name, path in weights.items()}
+    refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, **named})
     others = {
         "fused": fused if config.baseline else None,
-        "lpips_weights": Path(config.lpips_weights) if config.lpips_weights else None,
+        **{name: Path(path) if path else None for name, path in weights.items()},
         "truth": truth,
     }
     given = {"scene": scene, **methods, **{name: path for name, path in others.items() if path is not None}}
@@ -142,18 +150,26 @@ def run(
         held_out=frozenset(f.id for f in recorded.frames_in("test") or recorded.frames),
         error_pictures=config.error_pictures, distances=_distances(config), distance_views=config.perceptual_views,
     )  # fmt: skip
+    sets = distributions_of(config, recorded, work.path)  # before the work: the weights may be unusable
     results: list[dict[str, Any]] = []
     with log.task("score", sum(len(trajectory.views) for trajectory in trajectories)) as bar:
         for trajectory in trajectories:
             bar.update(trajectory.name)
             results += _score(trajectory, reference, work.path, bar.advance)
+    if sets is not None:
+        with log.task("features", len(results)) as bar:
+            for trajectory in trajectories:
+                bar.update(trajectory.name)
+                rows_here = [row for row in results if row["trajectory"] == trajectory.name]
+                _add_distributions(rows_here, sets, _sets_of(trajectory, reference, work.path), bar.advance)
     names = [*([BASELINE] if reference.baseline is not None else []), *methods]
     rows = {
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
         for name, row in metrics.METRICS.items()
     }
     records = [trajectory.record() for trajectory in trajectories]
-    document = score_tables.document(recorded, reference.truth.exact, records, names, results, rows, DEPTH_LIMIT_M)
+    document = score_tables.document(recorded, reference.truth.exact, records, names, results, rows,
+        {"depth_limit_m": DEPTH_LIMIT_M, "distributions": None if sets is None else sets.record()})  # fmt: skip
     store.write_json(work.path / "metrics.json", document)
     store.write_text(work.path / "metrics.md", score_tables.markdown(document))
     work.finish({"trajectories": len(trajectories), "methods": names})
@@ -289,8 +305,7 @@ def _score(
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
     motion = metrics.StaticMotion()
     sums = {name: metrics.build_all(reference.distances, motion) for name in names}
-    # Recorded training frames were seen by the fit and do not count; views off the path never were.
-    counted = [n for n, frame in enumerate(trajectory.frames) if frame is None or frame.id in reference.held_out]
+    counted = trajectory.counted(reference.held_out)
     wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
     scored = 0
@@ -327,6 +342,46 @@ def _score(
         {"method": name, "trajectory": trajectory.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
         for name, of in sums.items()
     ]
+
+
+def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path) -> TrajectorySets:
+    """The counted images of a trajectory whose views have been scored and written."""
+    counted = trajectory.counted(reference.held_out)
+
+    def chosen(found: ObservationSet, indices: Sequence[int]) -> ImageSet:
+        return ImageSet(len(counted), lambda number: found.rgb_u8(indices[counted[number]]))
+
+    def true_image(number: int) -> NDArray[np.uint8]:
+        place = counted[number]
+        true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
+        if true is None:
+            raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
+        return to_bytes(true.seen.rgb)
+
+    methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
+    every = range(len(trajectory.views))
+    if reference.baseline is not None:
+        methods = {BASELINE: chosen(read_observations(out / BASELINE / trajectory.name), every), **methods}
+    truth = None
+    if reference.truth.exact and trajectory.shift_m != 0.0:
+        drawn = out / "truth" / trajectory.name
+        truth = ImageSet(len(counted), true_image) if reference.truth.stored else chosen(read_observations(drawn), every)
+    camera = trajectory.views[0].camera
+    return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
+
+
+def _add_distributions(
+    rows: Sequence[dict[str, Any]], sets: Distributions, here: TrajectorySets, advance: Callable[[], None]
+) -> None:
+    """FID and KID into the results of one trajectory."""
+    found = sets.of(here, advance)
+    for row in rows:
+        value = found[row["method"]]
+        if isinstance(value, str):
+            row["values"] |= {"fid": value, "kid": value}
+        else:
+            row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
+            row["distribution"] = value.record()
 
 
 def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequence[int]) -> list[set[str]]:

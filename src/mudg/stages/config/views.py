@@ -53,8 +53,14 @@ class ScoreConfig:
     lpips_weights: str = ""
     """Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package). LPIPS is computed at the
     same views as the perceptual distance (empty = not computed)."""
+    fid_weights: str = ""
+    """File with the weights of FID's Inception-v3 network (`pt_inception-2015-12-05-6726825d.pth`, or its tensors as safetensors). FID
+    and KID then compare all views with the recorded frames of the same camera (empty = not computed)."""
+    fid_resize: Literal["pytorch-fid", "tf1", "clean", "tm", "neurad"] = "pytorch-fid"
+    """How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or
+    neurad-studio (neurad) do it. Numbers of different rules cannot be compared."""
     error_pictures: bool = True
     """Write an image of the colour error at the middle view of every trajectory."""
     device: DeviceName = "auto"
-    """Device of the networks behind perceptual distance and LPIPS: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics
-    run on the CPU."""
+    """Device of the networks behind perceptual distance, LPIPS and FID: auto (CUDA if there is one), cpu, cuda, cuda:N. All other
+    metrics run on the CPU."""

@@ -1,0 +1,236 @@
+"""FID and KID of a method on a trajectory: its images as a set, against the recorded frames of the same camera.
+
+The reference is the recorded video, as in published tables, so there is a number off the recorded path of a driving log, too, where no
+other metric has a truth. Sets are small, and FID of small sets is mostly bias: every trajectory also gets a floor, what the truth itself
+would score.
+
+Features are kept in the folder of the scores, in a file whose name is the hash of weights, rule and pixels: an interrupted run does not
+compute a set again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mudg.base import seeds, store
+from mudg.base.devices import choose_device
+from mudg.base.errors import InputError
+from mudg.base.types import Scene
+from mudg.core import feature_distances
+from mudg.core.pictures import resize_rgb, to_bytes
+from mudg.data.scene import read_image
+from mudg.data.weights import read_checkpoint
+from mudg.models import inception
+from mudg.report import score_tables
+from mudg.stages.config import ScoreConfig
+
+FEATURES_FOLDER: Final = "features"
+FEWEST: Final = 2
+BLOCK_FRAMES: Final = 8
+"""Neighbouring frames that the error of KID takes as one draw."""
+FEWEST_BLOCKS: Final = 4
+FEWEST_TO_EXTRAPOLATE: Final = 1000
+_BATCH: Final = 8
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """Images u8[H, W, 3] that are read one at a time: ``image(number)`` for 0 to ``count`` - 1."""
+
+    count: int
+    image: Callable[[int], NDArray[np.uint8]]
+
+    def resized(self, width: int, height: int) -> ImageSet:
+        """The same images at one size, bilinear with antialiasing."""
+
+        def image(number: int) -> NDArray[np.uint8]:
+            found = self.image(number)
+            if found.shape[:2] == (height, width):
+                return found
+            planes = torch.from_numpy(np.array(found)).permute(2, 0, 1).float() / 255
+            return to_bytes(resize_rgb(planes, height, width))
+
+        return ImageSet(self.count, image)
+
+
+@dataclass(frozen=True)
+class TrajectorySets:
+    """What is compared on one trajectory.
+
+    Args:
+        name, camera: of the trajectory. width, height: common size, pixels.
+        methods: the counted images of every method.
+        truth: the true images of the same views where they are known and are not the recorded ones, else None.
+    """
+
+    name: str
+    camera: str
+    width: int
+    height: int
+    methods: Mapping[str, ImageSet]
+    truth: ImageSet | None
+
+
+@dataclass(frozen=True)
+class SetDistances:
+    """FID and KID of ``n`` images against ``n_reference``, and what stands beside them in metrics.json."""
+
+    n: int
+    n_reference: int
+    fid: float
+    kid: float
+    kid_standard_error: float | None
+    mind: float
+    fid_at_infinity: float | None
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values, rounded to 6 digits after the point."""
+        values = {
+            "kid_standard_error": self.kid_standard_error,
+            "mind": self.mind,
+            "fid_at_infinity": self.fid_at_infinity,
+        }
+        return {
+            "n": self.n,
+            "n_reference": self.n_reference,
+            **{k: None if v is None else round(v, 6) for k, v in values.items()},
+        }
+
+
+class FeatureFiles:
+    """Features of sets of images by FID's network, kept in a folder.
+
+    Args:
+        weights: file with the network's weights. rule: how images get its size. folder: where features are kept. device: of the network.
+
+    Raises:
+        InputError: the file is missing, damaged, or holds another network.
+    """
+
+    def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
+        self.rule: inception.ResizeRule = rule
+        self.sha256 = store.sha256_file(weights) if weights.is_file() else ""
+        self._folder, self._device = folder, device
+        self._network = inception.InceptionFeatures(read_checkpoint(weights), str(weights)).to(device)
+
+    def of(self, images: ImageSet) -> NDArray[np.float32]:
+        """Features f32[n, 2048] of a set, read from the folder if these very pixels were seen before."""
+        content = hashlib.sha256(f"{self.sha256} {self.rule} {images.count}".encode())
+        for number in range(images.count):
+            picture = images.image(number)
+            content.update(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes())
+        path = self._folder / f"{content.hexdigest()}.safetensors"
+        if path.is_file():
+            found = store.read_safetensors(path).get("features")
+            if found is not None and found.shape == (images.count, inception.WIDTH):
+                return found
+        batches = []
+        for start in range(0, images.count, _BATCH):
+            numbers = range(start, min(start + _BATCH, images.count))
+            batch = torch.stack([inception.prepared(images.image(number), self.rule) for number in numbers])
+            with torch.no_grad():
+                batches.append(self._network(batch.to(self._device))["2048"].cpu().numpy())
+        features = np.concatenate(batches)
+        store.write_safetensors(path, {"features": features})
+        return features
+
+
+class Distributions:
+    """FID and KID of every trajectory of a scene.
+
+    Args:
+        scene: whose recorded frames are the reference. features: how images become features.
+    """
+
+    def __init__(self, scene: Scene, features: FeatureFiles) -> None:
+        self._scene, self._features = scene, features
+        self._recorded: dict[tuple[str, int, int], NDArray[np.float32]] = {}
+        self._floors: list[dict[str, Any]] = []
+
+    def of(self, sets: TrajectorySets, advance: Callable[[], None] = lambda: None) -> dict[str, SetDistances | str]:
+        """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``.
+
+        Raises:
+            InputError: methods have different numbers of images.
+        """
+        counts = {method: images.count for method, images in sets.methods.items()}
+        if len(set(counts.values())) > 1:
+            raise InputError("FID of sets of different size cannot be compared", where=sets.name, expected="the same views for all methods",
+                got=", ".join(f"{method}: {count}" for method, count in counts.items()))  # fmt: skip
+        reference = self._reference(sets)
+        if not len(reference):
+            return dict.fromkeys(counts, score_tables.NO_TRUTH)
+        if min(*counts.values(), len(reference)) < FEWEST:
+            return dict.fromkeys(counts, score_tables.TOO_FEW)
+        found: dict[str, SetDistances | str] = {}
+        for method, images in sets.methods.items():
+            found[method] = distances(self._features.of(images.resized(sets.width, sets.height)), reference)
+            advance()
+        self._note_floor(sets, reference)
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, and the floors, for metrics.json."""
+        return {
+            "network": "Inception-v3 of 2015, global average, 2048 values", "weights_sha256": self._features.sha256,
+            "published_weights": self._features.sha256 == inception.KNOWN_SHA256, "resize": self._features.rule,
+            "reference": "recorded frames of the same camera", "covariance": "n - 1", "floors": self._floors,
+        }  # fmt: skip
+
+    def _reference(self, sets: TrajectorySets) -> NDArray[np.float32]:
+        key = (sets.camera, sets.width, sets.height)
+        if key not in self._recorded:
+            frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
+            images = ImageSet(len(frames), lambda number: read_image(self._scene, frames[number])).resized(
+                sets.width, sets.height
+            )
+            self._recorded[key] = self._features.of(images) if frames else np.zeros((0, inception.WIDTH), np.float32)
+        return self._recorded[key]
+
+    def _note_floor(self, sets: TrajectorySets, reference: NDArray[np.float32]) -> None:
+        if sets.truth is not None:
+            how = "true images of the same views"
+            found = distances(self._features.of(sets.truth.resized(sets.width, sets.height)), reference)
+        elif len(reference) >= 2 * FEWEST:
+            how, found = "every second recorded frame against the others", distances(reference[::2], reference[1::2])
+        else:
+            return
+        values = {"fid": round(found.fid, 6), "kid": round(found.kid, 6), **found.record()}
+        self._floors.append({"trajectory": sets.name, "how": how, **values})
+
+
+def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions | None:
+    """What computes FID and KID, or None where no weights are given.
+
+    Raises:
+        InputError: the file of weights is missing, damaged, or holds another network.
+    """
+    if not config.fid_weights:
+        return None
+    device = choose_device(config.device, "networks of the scores")
+    return Distributions(
+        scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, out / FEATURES_FOLDER, device)
+    )
+
+
+def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
+    """All distances of two sets of features ``[n, d]``, at least two rows each; rows in order of time."""
+    blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (made, reference))
+    error = None
+    if all(len(set(numbers.tolist())) >= FEWEST_BLOCKS for numbers in blocks):
+        error = feature_distances.kernel_distance_error(made, reference, blocks, seeds.numpy_rng(0, 0, "blocks of KID"))
+    many = min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE
+    return SetDistances(
+        n=len(made), n_reference=len(reference), fid=feature_distances.frechet_distance(made, reference),
+        kid=feature_distances.kernel_distance(made, reference), kid_standard_error=error,
+        mind=feature_distances.mind_distance(made, reference, seeds.numpy_rng(0, 0, "directions of MIND")),
+        fid_at_infinity=feature_distances.frechet_at_infinity(made, reference, seeds.numpy_rng(0, 0, "sizes of FID")) if many else None,
+    )  # fmt: skip

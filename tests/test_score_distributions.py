@@ -1,0 +1,225 @@
+"""FID and KID in the scorer: what is compared with what, floors, refusals, kept features, and what is said where there is no number."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import toy_inception
+import toy_views
+
+from mudg.base import store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Observation
+from mudg.core import feature_distances
+from mudg.data.scene import read_scene
+from mudg.models import inception
+from mudg.report import page, score_tables
+from mudg.stages import score
+from mudg.stages.config import ScoreConfig
+from mudg.stages.scoring import distributions
+from mudg.stages.scoring.distributions import Distributions, FeatureFiles, ImageSet, TrajectorySets
+
+CPU = torch.device("cpu")
+
+
+class Squares(torch.nn.Module):
+    """Stands for the network: 48 means of squares, and how many images it saw."""
+
+    seen = 0
+
+    def __init__(self, _state: object, _where: str = "") -> None:
+        super().__init__()
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        Squares.seen += len(images)
+        means = torch.nn.functional.adaptive_avg_pool2d(images, 4).flatten(1)
+        return {"2048": torch.nn.functional.pad(means, (0, inception.WIDTH - 48))}
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A weight file, and a network that takes no time."""
+    monkeypatch.setattr(inception, "InceptionFeatures", Squares)
+    Squares.seen = 0
+    path = tmp_path / "weights.safetensors"
+    store.write_safetensors(path, {"any": np.zeros(1, np.float32)})
+    return path
+
+
+def darker(_index: int, seen: Observation) -> Observation:
+    return dataclasses.replace(seen, rgb=seen.rgb * 0.5)
+
+
+def values(document: dict, trajectory: str, name: str) -> dict[str, object]:
+    return {r["method"]: r["values"][name] for r in document["results"] if r["trajectory"] == trajectory}
+
+
+def scored(tmp_path: Path, weights: Path, shifts: tuple[float, ...] = (0.0, 2.0), **more: object) -> tuple[Path, dict]:
+    scene = toy_views.write_scene(tmp_path / "scene")
+    methods = {
+        "a": toy_views.write_views(scene, tmp_path / "a", "a", shifts),
+        "b": toy_views.write_views(scene, tmp_path / "b", "b", shifts, darker),
+    }
+    config = ScoreConfig(fid_weights=str(weights), perceptual_views=0, error_pictures=False, **more)
+    out = score.run(config, scene, methods, tmp_path / "score")
+    return out, store.read_json(out / "metrics.json")
+
+
+def test_a_log_is_compared_with_its_recorded_frames_off_its_path_too(tmp_path: Path, quick: Path) -> None:
+    out, document = scored(tmp_path, quick)
+    shifted = values(document, "front_shift+2.0", "fid")
+    assert values(document, "front_shift+2.0", "psnr")["a"] == score_tables.NO_TRUTH
+    assert shifted["a"] == pytest.approx(0.0, abs=1e-5)  # the toy's views are its recorded images
+    assert shifted["b"] > 1.0
+    assert values(document, "front_shift+2.0", "kid")["a"] < values(document, "front_shift+2.0", "kid")["b"]
+    sizes = {r["trajectory"]: (r["distribution"]["n"], r["distribution"]["n_reference"]) for r in document["results"]}
+    assert sizes == {
+        "front_recorded": (2, 4),
+        "front_shift+2.0": (4, 4),
+    }  # held-out frames against the whole recorded video
+    made = document["distributions"]
+    assert made["weights_sha256"] == store.sha256_file(quick)
+    assert not made["published_weights"]
+    assert made["resize"] == "pytorch-fid"
+    assert any(
+        "weights that are not the published file" in rule and "pytorch-fid" in rule for rule in document["rules"]
+    )
+    text = (out / "metrics.md").read_text()
+    assert "FID and KID: 4 views of every method against 4 recorded frames." in text
+    assert score_tables.FLOOR in text
+
+
+def test_the_numbers_are_those_of_the_pure_functions(tmp_path: Path, quick: Path) -> None:
+    _, document = scored(tmp_path, quick, (2.0,))
+
+    def features(scale: float) -> np.ndarray:
+        # What a view folder holds: 8 bits.
+        scaled = [toy_views.colors(i) / np.float32(255) * np.float32(scale) for i in range(4)]
+        pictures = [np.round(rgb * 255).astype(np.uint8) for rgb in scaled]
+        return Squares(None)(torch.stack([inception.prepared(p, "pytorch-fid") for p in pictures]))["2048"].numpy()
+
+    expected = feature_distances.frechet_distance(features(0.5), features(1.0))
+    assert values(document, "front_shift+2.0", "fid")["b"] == pytest.approx(expected, rel=2e-2)
+    floor = document["distributions"]["floors"][0]
+    assert floor["how"] == "every second recorded frame against the others"
+    assert floor["fid"] == pytest.approx(
+        feature_distances.frechet_distance(features(1.0)[::2], features(1.0)[1::2]), abs=1e-5
+    )
+
+
+def test_features_are_kept_by_content_and_not_computed_twice(tmp_path: Path, quick: Path) -> None:
+    folder = tmp_path / "features"
+    pictures = [toy_views.colors(i) for i in range(3)]
+    files = FeatureFiles(quick, "tf1", folder, CPU)
+    first = files.of(ImageSet(3, lambda n: pictures[n]))
+    assert Squares.seen == 3
+    again = FeatureFiles(quick, "tf1", folder, CPU).of(ImageSet(3, lambda n: pictures[n].copy()))
+    assert Squares.seen == 3
+    assert np.array_equal(first, again)
+    files.of(ImageSet(3, lambda n: pictures[2 - n]))  # another order is another set
+    FeatureFiles(quick, "clean", folder, CPU).of(ImageSet(3, lambda n: pictures[n]))
+    assert Squares.seen == 9
+    assert len(list(folder.glob("*.safetensors"))) == 3
+
+
+def test_sets_of_different_size_are_refused_and_small_ones_have_no_number(tmp_path: Path, quick: Path) -> None:
+    scene = read_scene(toy_views.write_scene(tmp_path / "scene"))
+    found = Distributions(scene, FeatureFiles(quick, "tf1", tmp_path / "features", CPU))
+    some = {n: ImageSet(n, toy_views.colors) for n in (1, 3, 4)}
+    sets = TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": some[4], "b": some[3]}, None)
+    with pytest.raises(InputError, match="a: 4, b: 3"):
+        found.of(sets)
+    assert found.of(dataclasses.replace(sets, methods={"a": some[1]})) == {"a": score_tables.TOO_FEW}
+    assert found.of(dataclasses.replace(sets, camera="rear", methods={"a": some[4]})) == {"a": score_tables.NO_TRUTH}
+    assert found.record()["floors"] == []
+    truth = ImageSet(4, lambda n: toy_views.colors(n + 1))
+    found.of(dataclasses.replace(sets, methods={"a": some[4]}, truth=truth))
+    (floor,) = found.record()["floors"]
+    assert floor["how"] == "true images of the same views"
+    assert (floor["n"], floor["n_reference"]) == (4, 4)
+    assert floor["fid"] > 0
+
+
+def test_distances_with_different_n_are_not_averaged() -> None:
+    courses = [{"name": name, "shift_m": shift} for name, shift in (("left", 2.0), ("right", -2.0))]
+    rows = [
+        {"trajectory": name, "method": "a", "values": {"fid": 5.0, "psnr": 20.0}, "distribution": {"n": n}}
+        for name, n in (("left", 8), ("right", 7))
+    ]
+    (both,) = score_tables.by_distance(courses, ["a"], rows, ["psnr", "fid"])
+    assert both["values"]["fid"] == score_tables.UNEQUAL
+    assert both["values"]["psnr"] == 20.0
+    rows[1]["distribution"]["n"] = 8
+    assert score_tables.by_distance(courses, ["a"], rows, ["fid"])[0]["values"]["fid"] == 5.0
+
+
+def test_large_sets_have_an_error_and_an_extrapolation(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((40, 3)), rng.standard_normal((64, 3))
+    few = distributions.distances(a[:31], b)
+    assert few.kid_standard_error is not None
+    assert few.fid_at_infinity is None
+    assert distributions.distances(a[:24], b).kid_standard_error is None  # three blocks
+    monkeypatch.setattr(distributions, "FEWEST_TO_EXTRAPOLATE", 40)
+    assert distributions.distances(a, b).fid_at_infinity is not None
+    assert distributions.distances(a[:39], b).fid_at_infinity is None
+
+
+def test_without_weights_the_tables_name_the_flag(tmp_path: Path) -> None:
+    scene = toy_views.write_scene(tmp_path / "scene")
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
+    out = score.run(ScoreConfig(perceptual_views=0), scene, {"a": views}, tmp_path / "score")
+    document = store.read_json(out / "metrics.json")
+    assert {values(document, "front_recorded", name)["a"] for name in ("fid", "kid", "fvd", "lpips")} == {
+        "not computed"
+    }
+    assert "distributions" not in document
+    assert not (out / "features").exists()
+    assert "not computed (--fid-weights)" in (out / "metrics.md").read_text()
+    shown = page._score_values(document)
+    assert "FID (Inception weights: mudg score --fid-weights FILE)" in shown["not_computed"]
+    assert "not computed (--fid-weights)" in {
+        cell["text"] for row in shown["score_groups"][-1]["rows"] for cell in row["cells"]
+    }
+
+
+def test_the_page_and_the_terminal_show_the_floor_below_the_methods(tmp_path: Path, quick: Path) -> None:
+    out, document = scored(tmp_path, quick)
+    group = next(g for g in page._score_values(document)["score_groups"] if g["title"] == "Distribution")
+    assert [row["title"] for row in group["rows"]] == ["a", "b", score_tables.FLOOR]
+    assert all(len(row["cells"]) == 4 for row in group["rows"])  # two distances, FID and KID
+    text = score.summary_table(out)
+    assert "FID" in text
+    assert score_tables.FLOOR in text
+
+
+def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:
+    scene = toy_views.write_scene(tmp_path / "scene")
+    views = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))}
+    with pytest.raises(InputError, match="nothing.pth"):
+        score.run(ScoreConfig(fid_weights=str(tmp_path / "nothing.pth")), scene, views, tmp_path / "score")
+    other = tmp_path / "other.safetensors"
+    store.write_safetensors(other, {"conv1.weight": np.zeros(3, np.float32)})
+    with pytest.raises(InputError, match="Conv2d_1a_3x3.conv.weight"):
+        score.run(ScoreConfig(fid_weights=str(other)), scene, views, tmp_path / "score")
+    assert not (tmp_path / "score" / "truth").exists()
+    inside = tmp_path / "score" / "weights.safetensors"
+    with pytest.raises(UsageError, match="fid-weights"):
+        score.run(ScoreConfig(fid_weights=str(inside)), scene, views, tmp_path / "score")
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+def test_the_network_itself_from_a_file(tmp_path: Path, suffix: str) -> None:
+    state = toy_inception.state()
+    path = tmp_path / f"weights{suffix}"
+    if suffix == ".pth":
+        torch.save(state, path, _use_new_zipfile_serialization=False)
+    else:
+        store.write_safetensors(path, state)
+    found = FeatureFiles(path, "pytorch-fid", tmp_path / "features", CPU).of(ImageSet(2, toy_views.colors))
+    images = torch.stack([inception.prepared(toy_views.colors(n), "pytorch-fid") for n in range(2)])
+    assert np.allclose(found, inception.InceptionFeatures(state)(images)["2048"].numpy(), atol=1e-5)
