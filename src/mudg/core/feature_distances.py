@@ -108,7 +108,7 @@ def kernel_distance(made: ArrayLike, real: ArrayLike) -> float:
 def kernel_distance_error(
     made: ArrayLike,
     real: ArrayLike,
-    blocks: tuple[Sequence[int], Sequence[int]],
+    blocks: Sequence[ArrayLike],
     rng: np.random.Generator,
     draws: int = 200,
 ) -> float:
@@ -131,10 +131,11 @@ def kernel_distance_error(
     a, b = _pair(made, real, 2)
     groups = []
     for rows, numbers in zip((a, b), blocks, strict=True):
-        names, where = np.unique(np.asarray(numbers, np.int64), return_inverse=True)
-        if len(numbers) != len(rows) or len(names) < 2:
+        given = np.asarray(numbers, np.int64)
+        names, where = np.unique(given, return_inverse=True)
+        if given.shape != (len(rows),) or len(names) < 2:
             raise InputError("blocks do not fit the features", expected=f"a number for each of {len(rows)} rows, two blocks or more",
-                got=f"{len(numbers)} numbers, {len(names)} blocks")  # fmt: skip
+                got=f"{given.size} numbers, {len(names)} blocks")  # fmt: skip
         groups.append((where, len(names)))
     own_a, own_b, across = _cubic(a, a), _cubic(b, b), _cubic(a, b)
     found = []

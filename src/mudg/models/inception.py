@@ -8,7 +8,7 @@ not FID. How an image is brought to 299x299 is part of the definition, too; five
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final, Literal, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -41,15 +41,25 @@ Tap = Literal["64", "192", "768", "2048", "logits_unbiased"]
 """Where features are read, by their width: after the first and the second maximum pool and after Mixed_6e, averaged over places; the
 global average that FID uses; its classes without bias."""
 
-_Unit = tuple[str, int, tuple[int, int], int, bool]
+
+class _Unit(NamedTuple):
+    """A convolution with its norm: name, channels out, kernel, stride, and whether padding keeps the size."""
+
+    name: str
+    out: int
+    size: tuple[int, int]
+    stride: int
+    same: bool
+
+
 _AVERAGE, _MAXIMUM, _MAXIMUM_HALF = "average", "maximum", "maximum, every second place"
-_Branch = tuple["_Unit | str | tuple[_Unit, ...]", ...]
+_Branch = tuple[_Unit | str | tuple[_Unit, ...], ...]
 """Units and pools in order; a tuple of units at the end reads the same input and is concatenated."""
 
 
 def _unit(name: str, out: int, size: int | tuple[int, int] = 1, stride: int = 1) -> _Unit:
     """A convolution with its norm; padded to keep the size unless it takes every second place."""
-    return (name, out, (size, size) if isinstance(size, int) else size, stride, stride == 1)
+    return _Unit(name, out, (size, size) if isinstance(size, int) else size, stride, stride == 1)
 
 
 def _block_a(pool: int) -> tuple[_Branch, ...]:
@@ -101,8 +111,9 @@ def _block_e(pool: str) -> tuple[_Branch, ...]:
 
 
 _STEM: Final[tuple[_Unit | str, ...]] = (
-    ("Conv2d_1a_3x3", 32, (3, 3), 2, False), ("Conv2d_2a_3x3", 32, (3, 3), 1, False), ("Conv2d_2b_3x3", 64, (3, 3), 1, True), "64",
-    ("Conv2d_3b_1x1", 80, (1, 1), 1, False), ("Conv2d_4a_3x3", 192, (3, 3), 1, False), "192",
+    _Unit("Conv2d_1a_3x3", 32, (3, 3), 2, False), _Unit("Conv2d_2a_3x3", 32, (3, 3), 1, False),
+    _Unit("Conv2d_2b_3x3", 64, (3, 3), 1, True), "64",
+    _Unit("Conv2d_3b_1x1", 80, (1, 1), 1, False), _Unit("Conv2d_4a_3x3", 192, (3, 3), 1, False), "192",
 )  # fmt: skip
 """Convolutions from the image on; a name of a tap stands for a maximum pool, 3x3 at every second place, and the tap after it."""
 
@@ -131,8 +142,8 @@ def _units() -> Iterator[tuple[str, int, _Unit]]:
     width = 3
     for step in _STEM:
         if not isinstance(step, str):
-            yield step[0], width, step
-            width = step[1]
+            yield step.name, width, step
+            width = step.out
     for block, branches in _BLOCKS.items():
         total = 0
         for branch in branches:
@@ -140,10 +151,10 @@ def _units() -> Iterator[tuple[str, int, _Unit]]:
             for step in branch:
                 if isinstance(step, str):
                     continue
-                group = step if isinstance(step[0], tuple) else (step,)
+                group = (step,) if isinstance(step, _Unit) else step
                 for unit in group:
-                    yield f"{block}.{unit[0]}", inner, unit
-                inner = sum(unit[1] for unit in group)
+                    yield f"{block}.{unit.name}", inner, unit
+                inner = sum(unit.out for unit in group)
             total += inner
         width = total
 
@@ -195,7 +206,7 @@ class InceptionFeatures(nn.Module):
                 x = F.max_pool2d(x, 3, 2)
                 yield step, x
             else:
-                x = self._convolved(step[0], x)
+                x = self._convolved(step.name, x)
         for block in _BLOCKS:
             x = self.block(block, x)
             if block == _MIDDLE_TAP:
@@ -212,10 +223,10 @@ class InceptionFeatures(nn.Module):
         for step in branch:
             if isinstance(step, str):
                 x = _pooled(step, x)
-            elif isinstance(step[0], tuple):
-                x = torch.cat([self._convolved(f"{block}.{unit[0]}", x) for unit in step], 1)  # type: ignore[index]
+            elif isinstance(step, _Unit):
+                x = self._convolved(f"{block}.{step.name}", x)
             else:
-                x = self._convolved(f"{block}.{step[0]}", x)
+                x = torch.cat([self._convolved(f"{block}.{unit.name}", x) for unit in step], 1)
         return x
 
     def _convolved(self, name: str, x: Tensor) -> Tensor:
