@@ -100,7 +100,7 @@ def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_
         run.run_chain(other, "city", out)
     with pytest.raises(InputError, match="no diffusion model here"):
         run.run_chain(
-            replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path))), "city", out
+            replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none"))), "city", out
         )
     with pytest.raises(UsageError, match="LPIPS needs a weight file"):
         verbs.run("city", out, preset="paper", synthesize={"model": "embedded"})

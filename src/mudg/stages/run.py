@@ -72,8 +72,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
         raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
-    _refuse_missing(config)
     _refuse_overlap(config, source, out)
+    _refuse_missing(config)
     torch.set_num_threads(native.default_threads())
     ledger = _Ledger.open(out, config, str(source), overwrite)
     config = with_device(config)
