@@ -56,7 +56,7 @@ def frechet_distance(made: ArrayLike, real: ArrayLike) -> float:
 def _covariance_root(features: Features) -> Features:
     """R ``[min(n, d), d]`` with R^T R = the covariance of rows."""
     centred = (features - features.mean(0)) / math.sqrt(len(features) - 1)
-    return np.linalg.qr(centred, mode="r") if len(features) > features.shape[1] else centred
+    return np.asarray(np.linalg.qr(centred, mode="r")) if len(features) > features.shape[1] else centred
 
 
 def frechet_at_infinity(
