@@ -56,6 +56,19 @@ def resize_rgb(rgb: Tensor, height: int, width: int) -> Tensor:
     return torch.nn.functional.interpolate(rgb[None], size=(height, width), mode="bilinear", antialias=True)[0]
 
 
+def bilinear_from_corner(images: Tensor, side: int) -> Tensor:
+    """Images f32[n, C, H, W] squashed to ``side`` x ``side``, bilinear as TensorFlow 1 did it: pixel k of the result lies at k * in /
+    out, with no half-pixel offset and no antialiasing."""
+    for axis in (-2, -1):
+        count = images.shape[axis]
+        place = torch.arange(side, dtype=torch.float32) * (count / side)
+        low = place.floor().long().clamp(max=count - 1)
+        high = (low + 1).clamp(max=count - 1)
+        share = (place - low).view([-1, 1] if axis == -2 else [-1])
+        images = images.index_select(axis, low) * (1 - share) + images.index_select(axis, high) * share
+    return images
+
+
 def resize_nearest(values: Map, height: int, width: int) -> Map:
     """Depth, labels or masks [..., H, W] to another size by the nearest pixel centre; nothing is mixed."""
     if tuple(values.shape[-2:]) == (height, width):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mudg.base.errors import InputError
-from mudg.core.pictures import resize_bicubic
+from mudg.core.pictures import bilinear_from_corner, resize_bicubic
 
 SIDE_PX: Final = 299
 NORM_EPSILON: Final = 1e-3
@@ -273,7 +273,7 @@ def prepared(rgb: NDArray[np.uint8], rule: ResizeRule) -> Tensor:
     if rule == "pytorch-fid":
         return F.interpolate(image / 255, size=size, mode="bilinear", align_corners=False)[0] * 2 - 1
     if rule == "tf1":
-        image = _bilinear_from_corner(image)
+        image = bilinear_from_corner(image, SIDE_PX)
     elif rule == "clean":
         image = F.interpolate(image, size=size, mode="bicubic", align_corners=False, antialias=True).clamp(0, 255)
     else:
@@ -283,15 +283,3 @@ def prepared(rgb: NDArray[np.uint8], rule: ResizeRule) -> Tensor:
 
 def _planes(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float()
-
-
-def _bilinear_from_corner(image: Tensor) -> Tensor:
-    """Bilinear as TensorFlow 1 did it: pixel k of the result lies at k * in / out, with no half-pixel offset."""
-    for axis in (-2, -1):
-        count = image.shape[axis]
-        place = torch.arange(SIDE_PX, dtype=torch.float32) * (count / SIDE_PX)
-        low = place.floor().long().clamp(max=count - 1)
-        high = (low + 1).clamp(max=count - 1)
-        share = (place - low).view([-1, 1] if axis == -2 else [-1])
-        image = image.index_select(axis, low) * (1 - share) + image.index_select(axis, high) * share
-    return image

@@ -203,8 +203,9 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
     groups = [
         _score_group(scores, title, [metrics[n] for n in names if n in metrics], distances) for title, names in GROUPS
     ]
-    if "distributions" in scores:
-        groups.append(_with_floor(scores, _score_group(scores, "Distribution", [metrics[n] for n in SET_METRICS], distances), distances))
+    made_of_sets = [metrics[name] for name, entry in SET_METRICS.items() if entry in scores]
+    if made_of_sets:
+        groups.append(_with_floor(scores, _score_group(scores, "Distribution", made_of_sets, distances), distances))
     if absent:
         cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in absent]
         rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]

@@ -13,9 +13,10 @@ NOT_REQUESTED: Final = "not requested"
 NOT_COMPUTED: Final = "not computed"
 TOO_FEW: Final = "too few views"
 UNEQUAL: Final = "unequal n"
-WEIGHT_FLAGS: Final = {"lpips": "--lpips-weights", "fid": "--fid-weights", "kid": "--fid-weights"}
+WEIGHT_FLAGS: Final = {"lpips": "--lpips-weights", "fid": "--fid-weights", "kid": "--fid-weights", "fvd": "--fvd-weights"}
 """Metric -> the flag of ``mudg score`` that names the weights it needs."""
-SET_METRICS: Final = ("fid", "kid")
+SET_METRICS: Final = {"fid": "distributions", "kid": "distributions", "fvd": "videos"}
+"""Metric of sets of images or clips -> the entry of metrics.json that says how it was made."""
 FLOOR: Final = "Floor: the truth itself"
 TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
@@ -48,10 +49,10 @@ def document(
         scene: what was scored. exact: whether truth exists at any view.
         trajectories: as JSON values. methods: in the order of the tables.
         results: one entry per method and trajectory. rows: title, unit, better and needs of each metric.
-        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count, and ``distributions``, what is known of FID
-            and KID or None where they are not computed.
+        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count, and ``distributions`` and ``videos``, what is
+            known of FID and KID and of FVD, or None where they are not computed.
     """
-    depth_limit_m, distributions = made["depth_limit_m"], made["distributions"]
+    depth_limit_m, distributions, videos = made["depth_limit_m"], made["distributions"], made["videos"]
     held_out = len(scene.frames_in("test"))
     rules = [
         "All methods are scored at one size, that of the scene's camera unless another was requested; "
@@ -66,6 +67,7 @@ def document(
         f"where a method gives none, it counts as {depth_limit_m:g} m.",
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
         *([_rule_of_sets(distributions)] if distributions else []),
+        *([_rule_of_videos(videos)] if videos else []),
     ]
     return {
         "schema": 1,
@@ -82,6 +84,7 @@ def document(
         "results": list(results),
         "by_distance": by_distance(trajectories, methods, results, list(rows)),
         **({"distributions": distributions} if distributions else {}),
+        **({"videos": videos} if videos else {}),
     }  # fmt: skip
 
 
@@ -92,6 +95,14 @@ def _rule_of_sets(made: Mapping[str, Any]) -> str:
         f"FID and KID compare the views of a trajectory with the {made['reference']}, with {weights} and the resize rule {made['resize']}. "
         "They depend on the number of images: compare methods within a column only, and read them beside the floor, "
         "which the truth itself scores."
+    )
+
+
+def _rule_of_videos(made: Mapping[str, Any]) -> str:
+    return (
+        f"FVD compares clips of {made['clip_frames']} views, one at every {made['hop_frames']}th, with those of the {made['reference']} "
+        f"(resize rule {made['resize']}, epsilon {made['norm_epsilon']:g}); all views count. With so few clips it is mostly bias: read "
+        "it beside the floor."
     )
 
 
@@ -108,8 +119,10 @@ def by_distance(
         here = [c["name"] for c in trajectories if c["shift_m"] is not None and abs(float(c["shift_m"])) == distance]
         signs = {float(c["shift_m"]) > 0 for c in trajectories if c["name"] in here}
         sides = "recorded" if distance == 0 else "both" if len(signs) == 2 else "left" if signs == {True} else "right"
-        sizes = {r["distribution"]["n"] for r in results if r["trajectory"] in here and "distribution" in r}
-        uneven = dict.fromkeys(SET_METRICS, UNEQUAL) if len(sizes) > 1 else {}
+        uneven = {}
+        for kind, own in (("distribution", ("fid", "kid")), ("video", ("fvd",))):
+            if len({r[kind]["n"] for r in results if r["trajectory"] in here and kind in r}) > 1:
+                uneven |= dict.fromkeys(own, UNEQUAL)
         for method in methods:
             rows = [r for r in results if r["method"] == method and r["trajectory"] in here]
             values = {name: _mean([r["values"].get(name) for r in rows]) for name in names}
@@ -151,16 +164,15 @@ def values_by_distance(document: Mapping[str, Any]) -> dict[tuple[str, float], M
 
 
 def floors_by_distance(document: Mapping[str, Any]) -> dict[float, dict[str, float | str]]:
-    """Distance in metres -> what the truth itself scores in FID and KID, as the tables by distance average it."""
-    floors = document.get("distributions", {}).get("floors", [])
+    """Distance in metres -> what the truth itself scores in FID, KID and FVD, as the tables by distance average it."""
     found: dict[float, dict[str, float | str]] = {}
     for row in document["by_distance"]:
-        here = [floor for floor in floors if floor["trajectory"] in row["trajectories"]]
-        if here:
-            equal = len({floor["n"] for floor in here}) == 1
-            found[float(row["distance_m"])] = {
-                name: _mean([floor[name] for floor in here]) if equal else UNEQUAL for name in SET_METRICS
-            }
+        for name, entry in SET_METRICS.items():
+            floors = document.get(entry, {}).get("floors", [])
+            here = [floor for floor in floors if floor["trajectory"] in row["trajectories"]]
+            if here:
+                equal = len({floor["n"] for floor in here}) == 1
+                found.setdefault(float(row["distance_m"]), {})[name] = _mean([f[name] for f in here]) if equal else UNEQUAL
     return found
 
 
@@ -168,7 +180,7 @@ def plain(document: Mapping[str, Any]) -> str:
     """The main numbers for a terminal: one block per distance, best values marked with a star."""
     values_of = values_by_distance(document)
     distances = sorted({d for _, d in values_of})
-    names = (*TERMINAL_METRICS, *(SET_METRICS if "distributions" in document else ()))
+    names = (*TERMINAL_METRICS, *(name for name, entry in SET_METRICS.items() if entry in document))
     columns = [m for m in document["metrics"] if m["name"] in names]
     floors = floors_by_distance(document)
     lines = []
@@ -222,9 +234,13 @@ def _lines_of_sets(document: Mapping[str, Any], trajectory: str) -> list[str]:
     errors = [f"{title_of(r['method'])} {r['distribution']['kid_standard_error']:.4f}" for r in rows
               if r["distribution"]["kid_standard_error"] is not None]  # fmt: skip
     lines += [f"* Standard error of KID: {', '.join(errors)}."] if errors else []
-    for floor in document.get("distributions", {}).get("floors", []):
+    for row in [r for r in document["results"] if r["trajectory"] == trajectory and "video" in r][:1]:
+        of = row["video"]
+        lines += [*([] if lines else [""]), f"* FVD: {of['n']} clips of every method against {of['n_reference']} recorded clips."]
+    floors = [floor for entry in ("distributions", "videos") for floor in document.get(entry, {}).get("floors", [])]
+    for floor in floors:
         if floor["trajectory"] == trajectory:
-            values = ", ".join(f"{name.upper()} {number_text(name, floor[name])}" for name in SET_METRICS)
+            values = ", ".join(f"{name.upper()} {number_text(name, floor[name])}" for name in SET_METRICS if name in floor)
             lines.append(f"* {FLOOR}: {values} ({floor['how']}, {floor['n']} against {floor['n_reference']}).")
     return lines
 

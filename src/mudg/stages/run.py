@@ -133,7 +133,7 @@ def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
         "ingest.poses": config.ingest.poses, "ingest.boxes": config.ingest.boxes, "annotate.weights": config.annotate.weights,
         "annotate.depth-network": config.annotate.depth_network, "synthesize.model": folder_of(config.synthesize.model),
         "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights, "score.lpips-weights": config.score.lpips_weights,
-        "score.fid-weights": config.score.fid_weights,
+        "score.fid-weights": config.score.fid_weights, "score.fvd-weights": config.score.fvd_weights,
     })  # fmt: skip
 
 

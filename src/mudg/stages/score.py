@@ -46,6 +46,7 @@ from mudg.stages.config import ScoreConfig
 from mudg.stages.fitting.perception import lpips_network
 from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, Truth, ViewTruth, apart_m, stored_truth, truth_of
 from mudg.stages.scoring.distributions import FEATURES_FOLDER, Distributions, ImageSet, TrajectorySets, distributions_of
+from mudg.stages.scoring.videos import VideoDistances, videos_of
 
 BASELINE: Final = "nearest_fill"
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
@@ -129,7 +130,7 @@ def run(
     """
     if not methods:
         raise UsageError("nothing to score", expected="at least one method with its folder of rendered views")
-    weights = {"lpips_weights": config.lpips_weights, "fid_weights": config.fid_weights}
+    weights = {"lpips_weights": config.lpips_weights, "fid_weights": config.fid_weights, "fvd_weights": config.fvd_weights}
     named = {name.replace("_", "-"): path for name, path in weights.items()}
     refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, **named})
     others = {
@@ -150,18 +151,26 @@ def run(
         held_out=frozenset(f.id for f in recorded.frames_in("test") or recorded.frames),
         error_pictures=config.error_pictures, distances=_distances(config), distance_views=config.perceptual_views,
     )  # fmt: skip
-    sets = distributions_of(config, recorded, work.path)  # before the work: the weights may be unusable
+    # Before the work: the weights may be unusable.
+    sets, videos = distributions_of(config, recorded, work.path), videos_of(config, recorded, work.path)
     results: list[dict[str, Any]] = []
     with log.task("score", sum(len(trajectory.views) for trajectory in trajectories)) as bar:
         for trajectory in trajectories:
             bar.update(trajectory.name)
             results += _score(trajectory, reference, work.path, bar.advance)
-    if sets is not None:
+    if sets is not None or videos is not None:
         with log.task("features", len(results)) as bar:
             for trajectory in trajectories:
                 bar.update(trajectory.name)
                 rows_here = [row for row in results if row["trajectory"] == trajectory.name]
-                _add_distributions(rows_here, sets, _sets_of(trajectory, reference, work.path), bar.advance)
+                if sets is not None:
+                    counted = trajectory.counted(reference.held_out)
+                    _add_distributions(rows_here, sets, _sets_of(trajectory, reference, work.path, counted))
+                if videos is not None:
+                    every = range(len(trajectory.views))
+                    _add_videos(rows_here, videos, _sets_of(trajectory, reference, work.path, every))
+                for _ in rows_here:
+                    bar.advance()
     names = [*([BASELINE] if reference.baseline is not None else []), *methods]
     rows = {
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
@@ -169,7 +178,8 @@ def run(
     }
     records = [trajectory.record() for trajectory in trajectories]
     document = score_tables.document(recorded, reference.truth.exact, records, names, results, rows,
-        {"depth_limit_m": DEPTH_LIMIT_M, "distributions": None if sets is None else sets.record()})  # fmt: skip
+        {"depth_limit_m": DEPTH_LIMIT_M, "distributions": None if sets is None else sets.record(),
+         "videos": None if videos is None else videos.record()})  # fmt: skip
     store.write_json(work.path / "metrics.json", document)
     store.write_text(work.path / "metrics.md", score_tables.markdown(document))
     work.finish({"trajectories": len(trajectories), "methods": names})
@@ -344,9 +354,8 @@ def _score(
     ]
 
 
-def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path) -> TrajectorySets:
-    """The counted images of a trajectory whose views have been scored and written."""
-    counted = trajectory.counted(reference.held_out)
+def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, counted: Sequence[int]) -> TrajectorySets:
+    """The images at the counted views of a trajectory whose views have been scored and written."""
 
     def chosen(found: ObservationSet, indices: Sequence[int]) -> ImageSet:
         return ImageSet(len(counted), lambda number: found.rgb_u8(indices[counted[number]]))
@@ -370,11 +379,19 @@ def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path) -> T
     return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
 
 
-def _add_distributions(
-    rows: Sequence[dict[str, Any]], sets: Distributions, here: TrajectorySets, advance: Callable[[], None]
-) -> None:
+def _add_videos(rows: Sequence[dict[str, Any]], videos: VideoDistances, here: TrajectorySets) -> None:
+    """FVD into the results of one trajectory."""
+    found = videos.of(here)
+    for row in rows:
+        value = found[row["method"]]
+        row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
+        if not isinstance(value, str):
+            row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
+
+
+def _add_distributions(rows: Sequence[dict[str, Any]], sets: Distributions, here: TrajectorySets) -> None:
     """FID and KID into the results of one trajectory."""
-    found = sets.of(here, advance)
+    found = sets.of(here)
     for row in rows:
         value = found[row["method"]]
         if isinstance(value, str):

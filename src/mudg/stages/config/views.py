@@ -59,8 +59,13 @@ class ScoreConfig:
     fid_resize: Literal["pytorch-fid", "tf1", "clean", "tm", "neurad"] = "pytorch-fid"
     """How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or
     neurad-studio (neurad) do it. Numbers of different rules cannot be compared."""
+    fvd_weights: str = ""
+    """File with the weights of FVD's I3D network (Kinetics-400), as safetensors or a state dict. FVD then compares clips of 16 views with
+    those of the recorded video of the same camera (empty = not computed)."""
+    fvd_resize: Literal["videogpt", "google", "stylegan-v"] = "videogpt"
+    """How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v)."""
     error_pictures: bool = True
     """Write an image of the colour error at the middle view of every trajectory."""
     device: DeviceName = "auto"
-    """Device of the networks behind perceptual distance, LPIPS and FID: auto (CUDA if there is one), cpu, cuda, cuda:N. All other
+    """Device of the networks behind perceptual distance, LPIPS, FID and FVD: auto (CUDA if there is one), cpu, cuda, cuda:N. All other
     metrics run on the CPU."""

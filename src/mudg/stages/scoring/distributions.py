@@ -123,24 +123,45 @@ class FeatureFiles:
 
     def of(self, images: ImageSet) -> NDArray[np.float32]:
         """Features f32[n, 2048] of a set, read from the folder if these very pixels were seen before."""
-        content = hashlib.sha256(f"{self.sha256} {self.rule} {images.count}".encode())
-        for number in range(images.count):
-            picture = images.image(number)
-            content.update(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes())
-        path = self._folder / f"{content.hexdigest()}.safetensors"
-        if path.is_file():
-            found = store.read_safetensors(path).get("features")
-            if found is not None and found.shape == (images.count, inception.WIDTH):
-                return found
+        key = f"Inception {self.sha256} {self.rule}"
+        return kept_features(self._folder, key, images, (images.count, inception.WIDTH), lambda: self._computed(images))
+
+    def _computed(self, images: ImageSet) -> NDArray[np.float32]:
         batches = []
         for start in range(0, images.count, _BATCH):
             numbers = range(start, min(start + _BATCH, images.count))
             batch = torch.stack([inception.prepared(images.image(number), self.rule) for number in numbers])
             with torch.no_grad():
                 batches.append(self._network(batch.to(self._device))["2048"].cpu().numpy())
-        features = np.concatenate(batches)
-        store.write_safetensors(path, {"features": features})
-        return features
+        return np.concatenate(batches)
+
+
+def kept_features(
+    folder: Path, key: str, images: ImageSet, shape: tuple[int, int], compute: Callable[[], NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Features of a set, from a folder if these very pixels went through the same network before, else computed and kept there.
+
+    Args:
+        folder: where files lie. key: weights and rules. images: what is described. shape: of the features. compute: makes them.
+    """
+    content = hashlib.sha256(f"{key} {images.count}".encode())
+    for number in range(images.count):
+        picture = images.image(number)
+        content.update(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes())
+    path = folder / f"{content.hexdigest()}.safetensors"
+    if path.is_file():
+        found = store.read_safetensors(path).get("features")
+        if found is not None and found.shape == shape:
+            return found
+    features = compute()
+    store.write_safetensors(path, {"features": features})
+    return features
+
+
+def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
+    """The recorded frames of a trajectory's camera at the common size, in order of time; none if the scene lacks the camera."""
+    frames = scene.frames_of(sets.camera) if sets.camera in scene.cameras else ()
+    return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
 
 
 class Distributions:
@@ -155,7 +176,7 @@ class Distributions:
         self._recorded: dict[tuple[str, int, int], NDArray[np.float32]] = {}
         self._floors: list[dict[str, Any]] = []
 
-    def of(self, sets: TrajectorySets, advance: Callable[[], None] = lambda: None) -> dict[str, SetDistances | str]:
+    def of(self, sets: TrajectorySets) -> dict[str, SetDistances | str]:
         """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``.
 
         Raises:
@@ -173,7 +194,6 @@ class Distributions:
         found: dict[str, SetDistances | str] = {}
         for method, images in sets.methods.items():
             found[method] = distances(self._features.of(images.resized(sets.width, sets.height)), reference)
-            advance()
         self._note_floor(sets, reference)
         return found
 
@@ -188,11 +208,10 @@ class Distributions:
     def _reference(self, sets: TrajectorySets) -> NDArray[np.float32]:
         key = (sets.camera, sets.width, sets.height)
         if key not in self._recorded:
-            frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
-            images = ImageSet(len(frames), lambda number: read_image(self._scene, frames[number])).resized(
-                sets.width, sets.height
+            images = recorded_images(self._scene, sets)
+            self._recorded[key] = (
+                self._features.of(images) if images.count else np.zeros((0, inception.WIDTH), np.float32)
             )
-            self._recorded[key] = self._features.of(images) if frames else np.zeros((0, inception.WIDTH), np.float32)
         return self._recorded[key]
 
     def _note_floor(self, sets: TrajectorySets, reference: NDArray[np.float32]) -> None:
