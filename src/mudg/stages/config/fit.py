@@ -105,7 +105,7 @@ class VirtualConfig:
 
     probability: float = Field(default=0.4, ge=0, le=1)
     """Probability that a step uses a virtual view, 0 to 1 (published: 0.2)."""
-    continued_probability: float = Field(default=0.7, ge=0, le=1)
+    continued_probability: float = Field(default=1.0, ge=0, le=1)
     """The same for a fit that continues a finished one (`--start-from`), which has few steps to learn from them."""
     beside: bool = True
     """A step with a virtual view also learns from its recorded view. Off: from the virtual view alone, as published."""
@@ -118,7 +118,7 @@ class VirtualConfig:
     """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
     densify: bool = False
     """Let virtual views also decide where Gaussians are added."""
-    confidence_power: float = Field(default=1.0, ge=0)
+    confidence_power: float = Field(default=0.5, ge=0)
     """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all pixels count
     the same)."""
     color_weight: float = Field(default=1.0, ge=0)
