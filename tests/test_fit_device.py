@@ -419,6 +419,7 @@ def test_a_backend_that_does_not_draw_on_the_device_is_refused(world, tmp_path):
         fitted(world, tmp_path / "fit", settings("street_gaussians", "cuda"))
     with pytest.raises(UsageError, match="--raster"):
         fitted(world, tmp_path / "fit", replace(settings("street_gaussians", "cpu"), raster="gsplat"))
+    assert not (tmp_path / "fit").exists()  # refused before anything is written
 
 
 def test_every_step_of_a_run_follows_its_device_unless_it_has_its_own():

@@ -65,6 +65,7 @@ def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = 
         raise UsageError("no such benchmark", expected=", ".join((*BENCHES, SHIFT, REAL)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
+    choose_device(config.device, "benchmark", NETWORK_KINDS)  # refused before anything is written
     directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), result_settings(config), inputs, overwrite)
     if directory.complete:
         return directory.reused()

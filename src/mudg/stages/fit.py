@@ -135,12 +135,12 @@ def run(
         inputs |= {name: store.digest(folder) for name, folder in named.items()}
     if config.virtual.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
+    device = drawing_device(config.device, "fit", config.raster)
     folder = RunDir.open(out, OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     if begun is not None:
         config = whole_run(config)
-    device = drawing_device(config.device, "fit", config.raster)
     with one_torch_thread(), memory_of(device, "fit"):
         state = _prepare(config, FitInputs(Path(scene), Path(fused), virtual, begun), folder.path).to(device)
         with contextlib.closing(state.views):

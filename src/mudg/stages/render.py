@@ -43,10 +43,10 @@ def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite:
     """
     refuse_overlap(out, {"scene": scene, "model": model})
     inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
+    device = drawing_device(config.device, "render", config.raster)
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    device = drawing_device(config.device, "render", config.raster)
     fitted = load_model(Path(model)).to(device)
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)

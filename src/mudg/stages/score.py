@@ -140,6 +140,7 @@ def run(
     }
     given = {"scene": scene, **methods, **{name: path for name, path in others.items() if path is not None}}
     inputs = {name: store.digest(path) for name, path in given.items()}
+    choose_device(config.device, "networks of the scores")  # refused before anything is written
     work = RunDir.open(out, _OUTPUT, configuration.result_settings(config), inputs, overwrite)
     if work.complete:
         return work.reused()
