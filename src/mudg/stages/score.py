@@ -160,18 +160,7 @@ def run(
             bar.update(trajectory.name)
             results += _score(trajectory, reference, work.path, bar.advance)
     if sets is not None or videos is not None:
-        with log.task("features", len(results)) as bar:
-            for trajectory in trajectories:
-                bar.update(trajectory.name)
-                rows_here = [row for row in results if row["trajectory"] == trajectory.name]
-                if sets is not None:
-                    counted = trajectory.counted(reference.held_out)
-                    _add_distributions(rows_here, sets, _sets_of(trajectory, reference, work.path, counted))
-                if videos is not None:
-                    every = range(len(trajectory.views))
-                    _add_videos(rows_here, videos, _sets_of(trajectory, reference, work.path, every))
-                for _ in rows_here:
-                    bar.advance()
+        _compare_sets(results, trajectories, reference, work.path, sets, videos)
     names = [*([BASELINE] if reference.baseline is not None else []), *methods]
     rows = {
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
@@ -185,6 +174,25 @@ def run(
     store.write_text(work.path / "metrics.md", score_tables.markdown(document))
     work.finish({"trajectories": len(trajectories), "methods": names})
     return work.path
+
+
+def _compare_sets(
+    results: Sequence[dict[str, Any]], trajectories: Sequence[ScoredTrajectory], reference: Reference, out: Path,
+    sets: Distributions | None, videos: VideoDistances | None,
+) -> None:  # fmt: skip
+    """Add to the results what compares whole sets of views: distances of images, and of clips, where their weights are given."""
+    with log.task("features", len(results)) as bar:
+        for trajectory in trajectories:
+            bar.update(trajectory.name)
+            rows_here = [row for row in results if row["trajectory"] == trajectory.name]
+            if sets is not None:
+                counted = trajectory.counted(reference.held_out)
+                _add_distributions(rows_here, sets, _sets_of(trajectory, reference, out, counted))
+            if videos is not None:
+                every = range(len(trajectory.views))
+                _add_videos(rows_here, videos, _sets_of(trajectory, reference, out, every))
+            for _ in rows_here:
+                bar.advance()
 
 
 def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
