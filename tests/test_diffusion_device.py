@@ -170,6 +170,7 @@ def losses_in(out):
     return [row["total"] for row in rows if "total" in row]
 
 
+@pytest.mark.slow
 def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path, monkeypatch):
     """Codec, network, refiner, finisher and scores; stopped after two steps and continued."""
     config = tiny(clips, device="cpu", log_every=1)
@@ -196,6 +197,7 @@ def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path, monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_a_published_type_model_learns_on_a_device(tmp_path):
     points = write_clips(tmp_path / "clips", 32, 32, points=True)
     torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512.ckpt")
