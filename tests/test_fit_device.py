@@ -16,25 +16,23 @@ import pytest
 import torch
 from fit_settings import fit_config
 from pretend_device import Transfer, pretend_device, transfers
-from test_scene_options import EVERYTHING, walker_cloud, walker_track, with_tracks
+from test_scene_options import EVERYTHING, written_world
 from test_score_metrics import lpips_state
-from toy_world import camera, fused_cloud, truth, view_at, write_scene
+from toy_world import camera, view_at
 
 from mudg.base import store
 from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.base.types import FusedCloud
 from mudg.bench import chain
 from mudg.bench import poses as bench_poses
 from mudg.bench import real as bench_real
 from mudg.bench import shift as bench_shift
-from mudg.core import native_ops, trajectory
+from mudg.core import native_ops
 from mudg.core.raster import place
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.cloudfile import write_fused
-from mudg.data.observations import ObservationWriter, read_observations
+from mudg.data.observations import read_observations
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
 from mudg.models.scene.mcmc import McmcSettings, drift, order_of_place, relocate_and_grow
@@ -58,17 +56,7 @@ NUMBERS = 64
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> dict[str, Path]:
-    """A scene with a car and a walker, its fused cloud, and perfect virtual views 2 m to the left."""
-    root = tmp_path_factory.mktemp("world")
-    plain = write_scene(root / "plain", frames=FRAMES, width=SIZE[0], height=SIZE[1])
-    scene = with_tracks(plain, (*plain.tracks, walker_track(plain.tracks[0].times_s)), root / "scene")
-    cloud = fused_cloud(FRAMES)
-    write_fused(root / "fuse", FusedCloud(cloud.static, {**cloud.objects, "walker": walker_cloud()}), {})
-    path = trajectory.shifted(scene, "front", 2.0)
-    with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
-        for view in path.views:
-            writer.add(truth(view.resized(30, 20)))
-    return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+    return written_world(tmp_path_factory.mktemp("world"), SIZE, FRAMES)
 
 
 @pytest.fixture(autouse=True)

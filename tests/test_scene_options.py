@@ -54,19 +54,22 @@ def with_tracks(scene: Scene, tracks: tuple[Track, ...], out: Path) -> Scene:
         return writer.finish()
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory) -> dict[str, Path]:
+def written_world(root: Path, size: tuple[int, int], frames: int) -> dict[str, Path]:
     """A scene with a car and a walker, its fused cloud, perfect virtual views 2 m to the left."""
-    root = tmp_path_factory.mktemp("world")
-    plain = write_scene(root / "plain", frames=FRAMES, width=SIZE[0], height=SIZE[1])
+    plain = write_scene(root / "plain", frames=frames, width=size[0], height=size[1])
     scene = with_tracks(plain, (*plain.tracks, walker_track(plain.tracks[0].times_s)), root / "scene")
-    cloud = fused_cloud(FRAMES)
+    cloud = fused_cloud(frames)
     write_fused(root / "fuse", FusedCloud(cloud.static, {**cloud.objects, "walker": walker_cloud()}), {})
     path = trajectory.shifted(scene, "front", 2.0)
     with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
         for view in path.views:
             writer.add(truth(view.resized(30, 20)))
     return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> dict[str, Path]:
+    return written_world(tmp_path_factory.mktemp("world"), SIZE, FRAMES)
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:

@@ -117,9 +117,10 @@ class FeatureFiles:
 
     def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
         self.rule: inception.ResizeRule = rule
-        self.sha256 = store.sha256_file(weights) if weights.is_file() else ""
+        state = read_checkpoint(weights)
+        self.sha256 = store.sha256_file(weights)
         self._folder, self._device = folder, device
-        self._network = inception.InceptionFeatures(read_checkpoint(weights), str(weights)).to(device)
+        self._network = inception.InceptionFeatures(state, str(weights)).to(device)
 
     def of(self, images: ImageSet) -> NDArray[np.float32]:
         """Features f32[n, 2048] of a set, read from the folder if these very pixels were seen before."""
