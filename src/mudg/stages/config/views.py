@@ -67,8 +67,8 @@ class ScoreConfig:
     """How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or
     neurad-studio (neurad) do it. Numbers of different rules cannot be compared."""
     fvd_weights: str = ""
-    """File with the weights of FVD's I3D network (Kinetics-400), as safetensors, a state dict or TorchScript. FVD then compares clips of 16 views
-    those of the recorded video of the same camera (empty = not computed)."""
+    """File with the weights of FVD's I3D network (Kinetics-400), as safetensors, a state dict or the TorchScript archive. FVD then compares
+    clips of 16 views with those of the recorded video of the same camera (empty = not computed)."""
     fvd_resize: Literal["videogpt", "google", "stylegan-v"] = "videogpt"
     """How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v)."""
     dino_weights: str = ""
