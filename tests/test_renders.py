@@ -114,6 +114,26 @@ def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
         assert bool((depth[top] < 12.01).all()) and bool((ids[top] == 2).all())
 
 
+def test_ground_that_no_image_shows_is_level():
+    """Road points from 8 m on, 1.6 m below the camera, rows as dense as pixels; nearer road is neither measured nor rendered: it goes
+    on at the same height, its truth. Of another class it keeps the depth of the nearest pixel."""
+    x, y = np.meshgrid(np.arange(8, 14, 0.04), np.arange(-10, 10, 0.04))
+    xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.6)], 1).astype(np.float32)
+    view = view_at()
+    falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
+    empty = lambda view: flat_render(view, 1000.0, 0.0, label=palette.ID["sky"])  # noqa: E731
+    for name in ("road", "building"):
+        cloud = PointCloud(xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID[name], np.uint8))
+        made = build_conditions(FusedCloud(cloud, {}), [], [view], [], RULES, render_at=empty)[0]
+        hole = ~made.valid[0, 0] & (falls > 0.25)
+        assert int(hole.sum()) > 100
+        depth = made.depth[0, 0][hole]
+        if name == "road":
+            assert float((depth * falls[hole] / 1.6 - 1).abs().max()) < 0.07  # half a row
+        else:
+            assert float(depth.min()) > 7.5
+
+
 def test_below_the_horizon_follows_the_camera():
     level = clips.below_horizon(view_at(), 0.1)
     rows = (torch.arange(32) + 0.5 - 16) / 40

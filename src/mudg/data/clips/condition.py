@@ -97,6 +97,9 @@ class ProjectedPoints:
 
 OVERLAP_GRID = 24, 16
 """Columns and rows of the places of a view by which it is told how much of it another image shows."""
+GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
+LEAST_FALL = 0.02
+"""Metres per metre of depth by which a ray must fall to be followed to the ground."""
 RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
 
@@ -118,7 +121,8 @@ class DrawnCloud:
         shows, and the nearest measured pixel stands for it, in the render too.
         """
         sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
-        color, depth, moving, ids = _filled(sparse, self.rules)
+        nearest = _nearest_measured(sparse)
+        color, depth, moving, ids = _filled(sparse, nearest, self.rules)
         if self.render_at is None:
             return Surfaces(sparse.valid, color, depth, moving, ids, None)
         render = self.render_at(view)
@@ -126,6 +130,7 @@ class DrawnCloud:
         solid = render.alpha[0] >= self.rules.solid_alpha
         surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
         hidden = ~solid & (below_horizon(view, self.rules.ground_slope) | surface_seen) & bool(sparse.valid.any())
+        depth = torch.where(hidden, _levelled(view, depth, ids, nearest).clamp(max=self.rules.far_m), depth)
         render = replace(render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics))
         shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(max=self.rules.far_m)
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
@@ -171,13 +176,19 @@ def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tenso
     return *geometry.pinhole(target.intrinsics, px, py, safe), pz
 
 
-def below_horizon(view: View, slope: float) -> Tensor:
-    """Which pixels' rays fall by more than `slope` metres per horizontal metre, bool[H,W]."""
+def ray_directions(view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """World x, y and z, f32[H,W] each, of the pixels' rays, of length 1 along the camera's z."""
     camera = view.camera
     columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
     u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
     turn = torch.from_numpy(view.world_from_cam[:3, :3].astype(np.float32))
     x, y, z = (turn[i, 0] * u[None, :] + turn[i, 1] * v[:, None] + turn[i, 2] for i in range(3))
+    return x, y, z
+
+
+def below_horizon(view: View, slope: float) -> Tensor:
+    """Which pixels' rays fall by more than `slope` metres per horizontal metre, bool[H,W]."""
+    x, y, z = ray_directions(view)
     return z < -slope * torch.hypot(x, y)
 
 
@@ -344,13 +355,29 @@ def _condition_of_view(
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
 
 
-def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest valid pixel, for every pixel."""
+def _nearest_measured(sparse: ProjectedPoints) -> tuple[Tensor, Tensor]:
+    """Row and column of the nearest measured pixel, i64[H,W] each, for every pixel."""
+    rows, columns = nearest_valid(sparse.valid.numpy())
+    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))
+
+
+def _filled(
+    sparse: ProjectedPoints, nearest: tuple[Tensor, Tensor], rules: ConditionRules
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest measured pixel, for every pixel."""
     if not bool(sparse.valid.any()):
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
-    rows, columns = (torch.from_numpy(i.astype(np.int64)) for i in nearest_valid(sparse.valid.numpy()))
-    here = (..., rows, columns)
+    here = (..., *nearest)
     return sparse.rgb[here], sparse.depth[here], sparse.moving[here], sparse.semantics[here]
+
+
+def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Tensor]) -> Tensor:
+    """Filled depth f32[H,W] in which ground goes on at the height, not at the depth, of the nearest measured pixel; `ids` u8[H,W] are
+    that pixel's classes."""
+    falls = -ray_directions(view)[2]
+    there = falls[nearest]
+    level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (there > LEAST_FALL)
+    return torch.where(level, depth * there / falls.clamp(min=LEAST_FALL), depth)
 
 
 def _published_condition(
