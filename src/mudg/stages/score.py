@@ -283,7 +283,11 @@ def _measured(
     seen = {m: found[trajectory.indices[m][number]] for m, found in trajectory.sets.items()}
     if reference.baseline is not None:
         seen = {BASELINE: reference.baseline(view), **seen}
-    facts = reference.facts.of(view, truth)
+    asked = {name for of in wanted.values() for name in of}
+    if asked <= {"flicker", *view_metrics.EVERY_VIEW}:  # a view that does not count: only its neighbours need it
+        facts = ViewFacts(instance=None if truth is None else truth.instance)
+    else:
+        facts = reference.facts.of(view, truth)
     measured = {m: metrics.measure(pair_of(o, truth, view, facts), wanted[m]) for m, o in seen.items()}
     if truth is not None:
         measured[TRUTH] = metrics.measure(pair_of(truth.seen, truth, view, facts), wanted[TRUTH])

@@ -1,7 +1,8 @@
-"""The LiDAR points of a log, read once, for truth at views that no camera recorded."""
+"""The LiDAR points of a log, for truth at views that no camera recorded."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from typing import Final
 
@@ -20,10 +21,11 @@ from mudg.stages.score_truth import SAME_SWEEP_S
 
 MERGED_SWEEPS: Final = 6
 """Sweeps of each LiDAR whose points tell what the shown cameras saw."""
+KEPT_SWEEPS: Final = 96
 
 
 class LogPoints:
-    """The LiDAR points of a log; sweeps are read once."""
+    """The LiDAR points of a log; threads may ask. The sweeps asked for last are kept."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -33,6 +35,7 @@ class LogPoints:
         for sweep in scene.sweeps:
             self._sensors.setdefault(sweep.sensor, []).append(sweep)
         self._kept: dict[str, OwnedPoints] = {}
+        self._lock = threading.Lock()
 
     def of_moment(self, time_s: float) -> OwnedPoints | None:
         """Points of the sweep of each LiDAR that was taken with an image, or None without one."""
@@ -85,7 +88,8 @@ class LogPoints:
         return OwnedPoints(*joined, gap_deg=min(part.gap_deg for part in parts))
 
     def _read(self, sweep: Sweep) -> OwnedPoints:
-        if sweep.id not in self._kept:
+        kept = self._kept.get(sweep.id)
+        if kept is None:
             points = read_points(self.scene, sweep)
             owner, owned = separate(
                 SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), self.dynamic, self._rules
@@ -95,8 +99,12 @@ class LogPoints:
                 xyz[owner == number] = local
             ids = points.classes
             known = np.full(len(xyz), palette.UNLABELLED, np.uint8) if ids is None else ids
-            self._kept[sweep.id] = OwnedPoints(xyz, owner, known, largest_beam_gap(points.xyz))
-        return self._kept[sweep.id]
+            kept = OwnedPoints(xyz, owner, known, largest_beam_gap(points.xyz))
+            with self._lock:
+                while len(self._kept) >= KEPT_SWEEPS:
+                    del self._kept[next(iter(self._kept))]
+                self._kept[sweep.id] = kept
+        return kept
 
 
 def shown_frame(scene: Scene, frame: Frame, rgb: NDArray[np.uint8]) -> ShownFrame | None:
