@@ -90,6 +90,17 @@ def test_the_rule_finds_bright_stripes_on_the_road_only() -> None:
     assert not lane_scores.bright_stripes(rgb, everywhere)[:, 190:].any()
 
 
+def test_what_lies_beside_the_road_makes_no_markings() -> None:
+    rgb, mask = road_with_line()
+    road = np.zeros_like(mask)
+    road[:, 80:125] = True
+    rgb[:, ~road] = 0.0  # dark cars on both sides
+    found = lane_scores.bright_stripes(rgb, road)
+    assert np.array_equal(found, lane_scores.bright_stripes(np.where(road, rgb, 1.0), road))
+    hits, union = lane_scores.tolerant_iou(found, mask)
+    assert hits / union == 1.0
+
+
 def test_tolerant_iou_by_hand() -> None:
     true = np.zeros((20, 60), bool)
     true[:, 20:22] = True

@@ -143,14 +143,17 @@ def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
     """Road markings of an image by a fixed rule, bool[H, W].
 
     The image is blurred a little; a pixel of the road is a marking if it is brighter by ``CONTRAST`` than what an opening along its
-    row, an eighth of the image wide, leaves of it; specks are left out.
+    row, an eighth of the image wide, leaves of it; specks are left out. Only pixels of the road are looked at: beside a dark car it is no
+    marking.
 
     Args:
         rgb: colours ``[3, H, W]`` in [0, 1]. road: pixels where markings are looked for.
     """
-    gray = np.asarray(ndimage.gaussian_filter(gray_of(rgb), SMOOTH_PX, mode="nearest"))
-    size = max(5, round(gray.shape[1] * STRIPE_SHARE) | 1)
-    flat = gray - np.asarray(ndimage.grey_opening(gray, (1, size), mode="nearest"))
+    share = np.asarray(ndimage.gaussian_filter(road.astype(np.float64), SMOOTH_PX, mode="nearest"))
+    gray = np.asarray(ndimage.gaussian_filter(gray_of(rgb) * road, SMOOTH_PX, mode="nearest")) / np.maximum(share, 1e-6)
+    size = (1, max(5, round(gray.shape[1] * STRIPE_SHARE) | 1))
+    lowest = ndimage.grey_erosion(np.where(road, gray, np.inf), size, mode="constant", cval=np.inf)
+    flat = gray - ndimage.grey_dilation(np.where(road, lowest, -np.inf), size, mode="constant", cval=-np.inf)
     found = (flat > CONTRAST) & road
     regions, count = ndimage.label(found, np.ones((3, 3)))
     return found & (np.bincount(regions.ravel(), minlength=count + 1) >= FEWEST_PX)[regions]

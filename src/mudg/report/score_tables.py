@@ -236,19 +236,21 @@ def plain(document: Mapping[str, Any]) -> str:
             continue
         lines.append(distance_title(document, distance))
         heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
-        lines.append("  " + " " * 28 + "".join(f"{head:>14}" for head in heads))
+        widths = [max(14, len(head) + 2) for head in heads]
+        lines.append("  " + " " * 28 + "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True)))
         for method in document["methods"]:
             values = values_of.get((method["name"], distance), {})
             cells = []
-            for metric in columns:
+            for metric, width in zip(columns, widths, strict=True):
                 across = {
                     m["name"]: values_of.get((m["name"], distance), {}).get(metric["name"]) for m in document["methods"]
                 }
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
-                cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>14}")
+                cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>{width}}")
             lines.append(f"  {method['title']:<28}" + "".join(cells))
         if distance in floors:
-            cells = [f"{number_text(c['name'], floors[distance].get(c['name'])) + ' ':>14}" for c in columns]
+            found = [number_text(c["name"], floors[distance].get(c["name"])) + " " for c in columns]
+            cells = [f"{text:>{width}}" for text, width in zip(found, widths, strict=True)]
             lines.append(f"  {FLOOR:<28}" + "".join(cells))
         lines.append("")
     return "\n".join(lines).rstrip()
