@@ -33,7 +33,8 @@ from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
-from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
+from mudg.data.clips.ablated import ConditionSources, conditions_of
+from mudg.data.clips.condition import ConditionRules, WarpSource
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
@@ -81,9 +82,12 @@ def run(
     if directory.complete:
         return directory.reused()
     cameras = config.cameras or tuple(loaded.cameras)[:1]
-    if not cameras or not config.shifts_m:
+    if not cameras or not (config.shifts_m or config.paths):
         raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
-    paths = [trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m]
+    paths = [
+        *(trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m),
+        *(trajectory.named(loaded, camera, name) for camera in cameras for name in config.paths),
+    ]
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
@@ -164,7 +168,7 @@ def make_trajectory(
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     recorded = recorded_images(scene, config)
     render_at = None if fitted is None else functools.partial(render_planes, load_model(fitted))
-    maker = ViewMaker(model, scene, cloud, recorded, rules, config, render_at)
+    maker = ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at), config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -213,32 +217,26 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
 class ViewMaker:
     """Conditions, samples and observations of one scene at one size."""
 
-    def __init__(
-        self, model: loading.DiffusionModel, scene: Scene, cloud: FusedCloud, recorded: Sequence[Photo], rules: ConditionRules,
-        config: SynthesizeConfig, render_at: RenderAt | None,
-    ) -> None:  # fmt: skip
-        if not recorded:
+    def __init__(self, model: loading.DiffusionModel, given: ConditionSources, config: SynthesizeConfig) -> None:
+        if not given.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
-        self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
-        self._rules, self._full_size = rules, config.full_size
-        self._render_at = render_at
+        self._model, self._given, self._parts = model, given, config.condition
+        self._full_size = config.full_size
         self._sources: dict[int, WarpSource] = {}
         self._request = loading.request_of(config, loading.half_of(config) == torch.bfloat16)
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
-        return view if self._full_size else view.resized(self._rules.width, self._rules.height)
+        return view if self._full_size else view.resized(self._given.rules.width, self._given.rules.height)
 
     def make(
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
     ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
-        condition, fine = build_conditions(
-            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources, self._render_at
-        )
+        condition, fine = conditions_of(self._given, self._parts, views, self._sources)
         sample, made, made_views = self._generated(condition, fine, views, replace(self._request, index=number, known=known))
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
-        if self._model.points_alone and not recorded_at_pose(views[0], self._recorded):
+        if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
             usable[0] = False
         trust = made.confidence * usable
         observations = [
