@@ -6,6 +6,7 @@ OUT/fit/<method>   every fit      OUT/start/<method>   what a variant with other
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -81,6 +82,16 @@ def made(make: Callable[[bool], Path], overwrite: bool) -> Path:
         if not overwrite:
             raise
         return make(True)
+
+
+def seconds_of(out: Path) -> dict[str, float]:
+    """Seconds of each finished step, by folder."""
+    steps = sorted(path.relative_to(out) for path in out.glob("**/run.json"))
+    return {
+        path.parent.as_posix(): float(store.read_json(out / path).get("seconds", math.nan))
+        for path in steps
+        if len(path.parts) <= 3 and ".part" not in str(path)
+    }
 
 
 def at_once(config: BenchConfig) -> int:

@@ -127,7 +127,7 @@ class PaperTable:
 
     def rows_of(self, methods: tuple[str, ...]) -> tuple[PaperRow, ...]:
         """What is computed where these methods are asked for: its own rows, or one per method."""
-        return self.rows or tuple(PaperRow(name, METHODS[name].title, name) for name in methods)
+        return self.rows or tuple(PaperRow(name, f"{METHODS[name].title} ({name})", name) for name in methods)
 
 
 # ---- scenes ----
@@ -190,7 +190,7 @@ EXACT: Final = (
     Column("flicker", "flicker", "lower", 3),
     Column("psnr_movers", "PSNR of dynamic objects", "higher", 2),
 )
-"""Columns that no paper has off the recorded path, because only a generated city has the truth there. They stand in a table of their own."""
+"""Columns of generated cities, whose truth is known everywhere; most of them no paper can have off the recorded path."""
 
 
 # ---- places ----
@@ -246,187 +246,6 @@ _SCENES_OPEN: Final = "The paper's scenes are not known by name, so any log can 
 _SEEN_FRAMES: Final = (
     "No frame is held out, as published: the recorded path is scored on frames that were learned from."
 )
-
-
-def _tables() -> tuple[PaperTable, ...]:
-    return (
-        PaperTable(
-            "mudg1",
-            "MuDG, table 1: lateral shifts",
-            "Waymo Open, number of scenes not stated; front camera; diffusion at 576x1024",
-            "",
-            (both(2), both(3), both(4)),
-            (FID, FVD),
-            printed(
-                _SHIFT_CELLS,
-                """
-                S3Gaussian | 169.08 2031.97 191.38 2543.47 206.99 2663.56
-                3DGS, dynamic variant | 101.63 1062.57 117.36 1379.68 135.10 1675.16
-                EmerNeRF | 73.58 645.90 93.09 983.94 110.94 1250.56
-                Street Gaussians | 69.79 563.00 87.71 898.05 100.05 1269.99
-                FreeVS | 92.08 652.09 95.91 784.74 117.68 801.20
-                MuDG, diffusion output | 50.02 671.24 49.42 777.78 56.52 770.39
-                MuDG, Gaussians | 54.14 509.34 58.85 659.27 65.44 808.85""",
-                "MuDG, table 1",
-            ),
-            notes=(_SCENES_OPEN, _SIDES_OPEN, _SPLIT_OPEN, "Size and clip length behind FVD are not stated."),
-        ),
-        PaperTable(
-            "mudg2",
-            "MuDG, table 2: what the diffusion model's condition brings",
-            "Waymo Open, recorded views; number of scenes not stated",
-            "",
-            (PATH,),
-            (SSIM, PSNR, LPIPS, FID),
-            printed(
-                "0:ssim 0:psnr 0:lpips 0:fid",
-                """
-                reference | .539 19.09 .325 31.33
-                sparse colour | .631 22.01 .254 25.17
-                both, concatenated | .642 22.48 .238 23.66
-                full | .643 22.49 .237 23.29""",
-                "MuDG, table 2",
-            ),
-            rows=(
-                PaperRow("reference", "reference alone", "mudg_r", {"condition": "reference"}),
-                PaperRow("points", "sparse points alone", "mudg_r", {"condition": "points"}),
-                PaperRow("concat", "both", "mudg_r", {"condition": "concat"}),
-                PaperRow("mudg_r", "full condition", "mudg_r"),
-            ),
-            notes=(
-                "Ours: parts of the condition are switched off when sampling. The model was trained on whole conditions, so the rows say "
-                "what it makes of the rest; the paper trained a model per row.",
-                "Our reference is the nearest recorded image that is not held out, put up far away; full adds images warped by depth and, where "
-                "the model uses them, renders of the fit.",
-                _SPLIT_OPEN,
-            ),
-        ),
-        PaperTable(
-            "mudg3",
-            "MuDG, table 3: what virtual views bring to the Gaussians",
-            "Waymo Open, recorded views; number of scenes not stated",
-            "",
-            (PATH,),
-            (SSIM, PSNR, LPIPS, FID, FVD),
-            printed(
-                "0:ssim 0:psnr 0:lpips 0:fid 0:fvd",
-                """
-                none | .916 31.96 .085 39.62 283.05
-                + I | .910 31.46 .091 32.20 217.17
-                + I + D | .910 31.54 .090 32.00 216.14
-                + I + S | .910 31.51 .091 32.17 214.22
-                all | .910 31.60 .090 31.94 209.79""",
-                "MuDG, table 3",
-            ),
-            rows=(
-                PaperRow("street_gaussians", "none", "street_gaussians"),
-                *(
-                    PaperRow(name, title, "mudg_s", {"virtual": terms})
-                    for name, (title, _, terms) in VIRTUAL_TERMS.items()
-                ),
-                PaperRow("mudg_s", "all", "mudg_s"),
-            ),
-            virtual_shifts_m=(2.0, -2.0),
-            notes=("Virtual views are 2 m to both sides, as in the published code.", _SPLIT_OPEN),
-        ),
-        _recondreamer(),
-        _drivedreamer4d(),
-        PaperTable(
-            "streetcrafter",
-            "StreetCrafter: lateral shifts",
-            "Waymo Open, six segments, front camera 1066x1600",
-            "streetcrafter",
-            (PATH, left(2), left(3), up(1.5)),
-            (PSNR, SSIM, LPIPS, FID),
-            printed(
-                "2:fid 3:fid up1.5:fid",
-                """
-                StreetCrafter | 57.4 66.4 59.0
-                Difix3D+ | 60.2 71.6 60.3
-                S2D | 46.1 53.9 41.3""",
-                "second-hand, protocol of StreetCrafter",
-            ),
-            only={RECORDED: ("psnr", "ssim", "lpips"), "2": ("fid",), "3": ("fid",), "up1.5": ("fid",)},
-            held_out_every=2,
-            size="1600x1066",
-            notes=(
-                "Shifts go to the left, on the last two segments to the right. Ranges belong to the segments in the order of their names.",
-            ),
-        ),
-        PaperTable(
-            "freesim",
-            "FreeSim: lateral shifts",
-            "Waymo Open, 16 scenes, front camera",
-            "",
-            (PATH, both(1), both(2), both(3)),
-            (PSNR, SSIM, FID),
-            printed(
-                "1:fid 2:fid 3:fid 0:psnr",
-                """
-                PVG | 22.9 34.3 47.5 29.19
-                EmerNeRF | 32.3 40.2 49.8 29.18
-                Street Gaussians | 25.8 35.4 47.6 28.01
-                FreeSim, not progressive | 20.1 26.3 29.7 -
-                FreeSim, without LiDAR | 15.5 18.5 21.3 -
-                FreeSim | 14.6 17.0 18.6 28.32""",
-                "FreeSim",
-            ),
-            only={RECORDED: ("psnr", "ssim"), **dict.fromkeys("123", ("fid",))},
-            notes=(_SCENES_OPEN, _SIDES_OPEN, _SPLIT_OPEN),
-        ),
-        _recam(),
-        _spvc(),
-        PaperTable(
-            "panda",
-            "PandaSet: lateral shifts and height",
-            "PandaSet, ten scenes, front camera 1920x1080",
-            "",
-            (PATH, both(2), both(3), up(1)),
-            (PSNR, SSIM, LPIPS, FID),
-            printed(
-                "2:fid 3:fid up1:fid",
-                """
-                UniSim | 74.7 97.5 -
-                NeuRAD | 72.3 93.9 76.3
-                Street Gaussians | 66.3 80.7 78.4
-                ReconDreamer | 65.4 74.9 67.7
-                ReconDreamer++ | 61.9 71.7 62.4
-                SPVC | 35.1 45.0 42.1""",
-                "SPVC, PandaSet",
-            ),
-            only={RECORDED: ("psnr", "ssim", "lpips"), **dict.fromkeys(("2", "3", "up1"), ("fid",))},
-            held_out_every=2,
-            resize="neurad",
-            notes=(
-                "The names of the ten scenes are not listed here, so any log can enter.",
-                "Published shifts go left or right: both, and their mean.",
-            ),
-        ),
-        PaperTable(
-            "dist",
-            "DiST-4D: lateral shifts",
-            "nuScenes validation, six cameras, interpolated to 12 Hz",
-            "",
-            (both(1), both(2), both(4)),
-            (FID, FVD),
-            printed(
-                "1:fid 1:fvd 2:fid 2:fvd 4:fid 4:fvd",
-                """
-                PVG | 48.15 247 60.44 356 84.50 501
-                EmerNeRF | 37.57 - 52.03 - 76.11 -
-                Street Gaussians | 32.12 153 43.24 257 67.44 430
-                OmniRe | 31.48 - 43.31 - 67.36 -
-                FreeVS | 51.26 432 62.04 497 77.14 556
-                DiST-S | 10.12 45 12.97 69 17.57 105
-                PhiGensis | 9.80 44 11.71 68 15.51 103
-                GaussianDWM | 8.36 - 11.27 - 18.81 -
-                GaussianDWM++ | 8.19 43 11.05 64 15.02 101""",
-                "DiST-4D, PhiGensis, GaussianDWM++",
-            ),
-            all_cameras=True,
-            notes=(_SCENES_OPEN, _SPLIT_OPEN, "Ours: frames as recorded, not interpolated."),
-        ),
-    )
 
 
 def _recondreamer() -> PaperTable:
@@ -554,5 +373,180 @@ def _spvc() -> PaperTable:
     )
 
 
-TABLES: Final[dict[str, PaperTable]] = {table.name: table for table in _tables()}
+_ROWS: Final[tuple[PaperTable, ...]] = (
+    PaperTable(
+        "mudg1",
+        "MuDG, table 1: lateral shifts",
+        "Waymo Open, number of scenes not stated; front camera; diffusion at 576x1024",
+        "",
+        (both(2), both(3), both(4)),
+        (FID, FVD),
+        printed(
+            _SHIFT_CELLS,
+            """
+                S3Gaussian | 169.08 2031.97 191.38 2543.47 206.99 2663.56
+                3DGS, dynamic variant | 101.63 1062.57 117.36 1379.68 135.10 1675.16
+                EmerNeRF | 73.58 645.90 93.09 983.94 110.94 1250.56
+                Street Gaussians | 69.79 563.00 87.71 898.05 100.05 1269.99
+                FreeVS | 92.08 652.09 95.91 784.74 117.68 801.20
+                MuDG, diffusion output | 50.02 671.24 49.42 777.78 56.52 770.39
+                MuDG, Gaussians | 54.14 509.34 58.85 659.27 65.44 808.85""",
+            "MuDG, table 1",
+        ),
+        notes=(_SCENES_OPEN, _SIDES_OPEN, _SPLIT_OPEN, "Size and clip length behind FVD are not stated."),
+    ),
+    PaperTable(
+        "mudg2",
+        "MuDG, table 2: what the diffusion model's condition brings",
+        "Waymo Open, recorded views; number of scenes not stated",
+        "",
+        (PATH,),
+        (SSIM, PSNR, LPIPS, FID),
+        printed(
+            "0:ssim 0:psnr 0:lpips 0:fid",
+            """
+                reference | .539 19.09 .325 31.33
+                sparse colour | .631 22.01 .254 25.17
+                both, concatenated | .642 22.48 .238 23.66
+                full | .643 22.49 .237 23.29""",
+            "MuDG, table 2",
+        ),
+        rows=(
+            PaperRow("reference", "reference alone", "mudg_r", {"condition": "reference"}),
+            PaperRow("points", "sparse points alone", "mudg_r", {"condition": "points"}),
+            PaperRow("concat", "both", "mudg_r", {"condition": "concat"}),
+            PaperRow("mudg_r", "full condition", "mudg_r"),
+        ),
+        notes=(
+            "Ours: parts of the condition are switched off when sampling. The model was trained on whole conditions, so the rows say "
+            "what it makes of the rest; the paper trained a model per row.",
+            "Our reference is the nearest recorded image that is not held out, put up far away; full adds images warped by depth and, "
+            "where the model uses them, renders of the fit.",
+            _SPLIT_OPEN,
+        ),
+    ),
+    PaperTable(
+        "mudg3",
+        "MuDG, table 3: what virtual views bring to the Gaussians",
+        "Waymo Open, recorded views; number of scenes not stated",
+        "",
+        (PATH,),
+        (SSIM, PSNR, LPIPS, FID, FVD),
+        printed(
+            "0:ssim 0:psnr 0:lpips 0:fid 0:fvd",
+            """
+                none | .916 31.96 .085 39.62 283.05
+                + I | .910 31.46 .091 32.20 217.17
+                + I + D | .910 31.54 .090 32.00 216.14
+                + I + S | .910 31.51 .091 32.17 214.22
+                all | .910 31.60 .090 31.94 209.79""",
+            "MuDG, table 3",
+        ),
+        rows=(
+            PaperRow("street_gaussians", "none", "street_gaussians"),
+            *(PaperRow(name, title, "mudg_s", {"virtual": terms}) for name, (title, _, terms) in VIRTUAL_TERMS.items()),
+            PaperRow("mudg_s", "all", "mudg_s"),
+        ),
+        virtual_shifts_m=(2.0, -2.0),
+        notes=("Virtual views are 2 m to both sides, as in the published code.", _SPLIT_OPEN),
+    ),
+    _recondreamer(),
+    _drivedreamer4d(),
+    PaperTable(
+        "streetcrafter",
+        "StreetCrafter: lateral shifts",
+        "Waymo Open, six segments, front camera 1066x1600",
+        "streetcrafter",
+        (PATH, left(2), left(3), up(1.5)),
+        (PSNR, SSIM, LPIPS, FID),
+        printed(
+            "2:fid 3:fid up1.5:fid",
+            """
+                StreetCrafter | 57.4 66.4 59.0
+                Difix3D+ | 60.2 71.6 60.3
+                S2D | 46.1 53.9 41.3""",
+            "second-hand, protocol of StreetCrafter",
+        ),
+        only={RECORDED: ("psnr", "ssim", "lpips"), "2": ("fid",), "3": ("fid",), "up1.5": ("fid",)},
+        held_out_every=2,
+        size="1600x1066",
+        notes=(
+            "Shifts go to the left, on the last two segments to the right. Ranges belong to the segments in the order of their names.",
+        ),
+    ),
+    PaperTable(
+        "freesim",
+        "FreeSim: lateral shifts",
+        "Waymo Open, 16 scenes, front camera",
+        "",
+        (PATH, both(1), both(2), both(3)),
+        (PSNR, SSIM, FID),
+        printed(
+            "1:fid 2:fid 3:fid 0:psnr",
+            """
+                PVG | 22.9 34.3 47.5 29.19
+                EmerNeRF | 32.3 40.2 49.8 29.18
+                Street Gaussians | 25.8 35.4 47.6 28.01
+                FreeSim, not progressive | 20.1 26.3 29.7 -
+                FreeSim, without LiDAR | 15.5 18.5 21.3 -
+                FreeSim | 14.6 17.0 18.6 28.32""",
+            "FreeSim",
+        ),
+        only={RECORDED: ("psnr", "ssim"), **dict.fromkeys("123", ("fid",))},
+        notes=(_SCENES_OPEN, _SIDES_OPEN, _SPLIT_OPEN),
+    ),
+    _recam(),
+    _spvc(),
+    PaperTable(
+        "panda",
+        "PandaSet: lateral shifts and height",
+        "PandaSet, ten scenes, front camera 1920x1080",
+        "",
+        (PATH, both(2), both(3), up(1)),
+        (PSNR, SSIM, LPIPS, FID),
+        printed(
+            "2:fid 3:fid up1:fid",
+            """
+                UniSim | 74.7 97.5 -
+                NeuRAD | 72.3 93.9 76.3
+                Street Gaussians | 66.3 80.7 78.4
+                ReconDreamer | 65.4 74.9 67.7
+                ReconDreamer++ | 61.9 71.7 62.4
+                SPVC | 35.1 45.0 42.1""",
+            "SPVC, PandaSet",
+        ),
+        only={RECORDED: ("psnr", "ssim", "lpips"), **dict.fromkeys(("2", "3", "up1"), ("fid",))},
+        held_out_every=2,
+        resize="neurad",
+        notes=(
+            "The names of the ten scenes are not listed here, so any log can enter.",
+            "Published shifts go left or right: both, and their mean.",
+        ),
+    ),
+    PaperTable(
+        "dist",
+        "DiST-4D: lateral shifts",
+        "nuScenes validation, six cameras, interpolated to 12 Hz",
+        "",
+        (both(1), both(2), both(4)),
+        (FID, FVD),
+        printed(
+            "1:fid 1:fvd 2:fid 2:fvd 4:fid 4:fvd",
+            """
+                PVG | 48.15 247 60.44 356 84.50 501
+                EmerNeRF | 37.57 - 52.03 - 76.11 -
+                Street Gaussians | 32.12 153 43.24 257 67.44 430
+                OmniRe | 31.48 - 43.31 - 67.36 -
+                FreeVS | 51.26 432 62.04 497 77.14 556
+                DiST-S | 10.12 45 12.97 69 17.57 105
+                PhiGensis | 9.80 44 11.71 68 15.51 103
+                GaussianDWM | 8.36 - 11.27 - 18.81 -
+                GaussianDWM++ | 8.19 43 11.05 64 15.02 101""",
+            "DiST-4D, PhiGensis, GaussianDWM++",
+        ),
+        all_cameras=True,
+        notes=(_SCENES_OPEN, _SPLIT_OPEN, "Ours: frames as recorded, not interpolated."),
+    ),
+)
+TABLES: Final[dict[str, PaperTable]] = {table.name: table for table in _ROWS}
 """All tables, by name."""

@@ -11,7 +11,6 @@ one thread.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +25,16 @@ from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
-from mudg.bench.chain import VIRTUAL_TERMS, FitChain, at_once, each_log, learns_virtual, made, refuse_foreign
+from mudg.bench.chain import (
+    VIRTUAL_TERMS,
+    FitChain,
+    at_once,
+    each_log,
+    learns_virtual,
+    made,
+    refuse_foreign,
+    seconds_of,
+)
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
@@ -244,7 +252,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
     return {
         "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
         "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": found,
-        "seconds": _seconds(out),
+        "seconds": seconds_of(out),
     }  # fmt: skip
 
 
@@ -307,13 +315,3 @@ def write_exact(truth: Path, paths: Sequence[Trajectory], out: Path, *, overwrit
                 writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
     folder.finish({"trajectories": shifted})
     return folder.path
-
-
-def _seconds(out: Path) -> dict[str, float]:
-    """Seconds of each finished step, by folder."""
-    steps = sorted(path.relative_to(out) for path in out.glob("**/run.json"))
-    return {
-        path.parent.as_posix(): float(store.read_json(out / path).get("seconds", math.nan))
-        for path in steps
-        if len(path.parts) <= 3 and ".part" not in str(path)
-    }
