@@ -15,7 +15,20 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.bench import paper, paper_logs, paper_numbers, paper_text
 from mudg.bench import run as bench
-from mudg.bench.paper_tables import FID, FVD, PATH, PSNR, RECORDED, SCENE_LISTS, TABLES, PaperRow, PaperTable, both, left, printed
+from mudg.bench.paper_tables import (
+    FID,
+    FVD,
+    PATH,
+    PSNR,
+    RECORDED,
+    SCENE_LISTS,
+    TABLES,
+    PaperRow,
+    PaperTable,
+    both,
+    left,
+    printed,
+)
 from mudg.data.city import logs as city_logs
 from mudg.data.city.config import CityConfig
 from mudg.data.scene import read_scene
@@ -83,7 +96,8 @@ def test_methods_are_all_of_this_version_unless_some_are_named():
     rows = paper.rows_of(BenchConfig(), TABLES["mudg1"])
     assert [row.method for row in rows] == list(METHODS)
     assert [row.name for row in paper.rows_of(BenchConfig(methods=("nearest_fill", "gs3d")), TABLES["mudg1"])] == ["gs3d"]
-    assert [row.name for row in paper.rows_of(BenchConfig(), TABLES["mudg3"])] == ["street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"]
+    ablation = [row.name for row in paper.rows_of(BenchConfig(), TABLES["mudg3"])]
+    assert ablation == ["street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"]
     with pytest.raises(UsageError, match="unknown method"):
         paper.rows_of(BenchConfig(methods=("nerf",)), TABLES["mudg1"])
     with pytest.raises(UsageError, match="rows of its own"):

@@ -22,7 +22,7 @@ from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import paper_numbers, paper_page, paper_text, shift_page
 from mudg.bench.chain import FitChain, at_once, each_log, learns_virtual, made, refuse_foreign, seconds_of
-from mudg.bench.paper_logs import CityLog, PaperLog, facts_of, logs_of, make_scene, missing_scenes, scored_cameras
+from mudg.bench.paper_logs import ListedCity, PaperLog, facts_of, logs_of, make_scene, missing_scenes, scored_cameras
 from mudg.bench.paper_tables import EXACT, RECORDED, TABLES, PaperRow, PaperTable
 from mudg.bench.shift import PERCEPTUAL_VIEWS, write_fill
 from mudg.data.scene import read_scene
@@ -96,7 +96,7 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
     table, out = TABLES[config.table], Path(out)
     rows = rows_of(config, table)
     logs = logs_of(config, sources, table)
-    read = {f"log {log.name}": log.source for log in logs if not isinstance(log, CityLog)}
+    read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read, **weights_of(config.score)})
     refuse_foreign(
         out, PAGES, lambda document: document["bench"] == "paper" and document["table"]["name"] == table.name
@@ -111,7 +111,7 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
     ]  # fmt: skip
     found = each_log(make_log, jobs, [log.name for log in logs], at_once(config))
     settings = {
-        "list": str(sources[0]) if isinstance(logs[0], CityLog) else "", "missing_scenes": list(missing_scenes(table, logs)),
+        "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "", "missing_scenes": list(missing_scenes(table, logs)),
         "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model), "renders": renders,
         "continued_share": CONTINUED_SHARE, "videos": config.videos, "score": configuration.result_settings(measured),
     }  # fmt: skip
@@ -171,7 +171,7 @@ def make_log(job: PaperJob) -> dict[str, Any]:
     made(lambda o: fuse.run(FuseConfig(), scene, job.fused, overwrite=o), job.overwrite)
     asked = asked_of(job, scene)
     truth: Path | None = None
-    if isinstance(job.log, CityLog):
+    if isinstance(job.log, ListedCity):
         truth = made(lambda o: score_truth.write_truth(scene, asked.paths, job.out / TRUTH, overwrite=o), job.overwrite)
     fill = made(lambda o: write_fill(scene, job.fused, asked.paths, job.out / FILL, overwrite=o), job.overwrite)
     views = {FILL: (fill,), **{row.name: views_of(job, row, scene, asked) for row in job.rows}}

@@ -36,7 +36,7 @@ _SHOWN: Final = VerbOutput("frames of a table", 1, SCENE_FILES)
 
 
 @dataclass(frozen=True)
-class CityLog:
+class ListedCity:
     """A generated log: its seed and what it is recorded with."""
 
     name: str
@@ -62,7 +62,7 @@ class RecordedLog:
     note: str
 
 
-PaperLog = CityLog | RecordedLog
+PaperLog = ListedCity | RecordedLog
 
 
 def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> tuple[PaperLog, ...]:
@@ -99,7 +99,7 @@ def _cities(config: BenchConfig, name: str, table: PaperTable) -> tuple[PaperLog
     width, height = size or (STANDARD.width, STANDARD.height)
     cameras = ("front",) if table.front_only else STANDARD.cameras
     rules = LogRules(frames[1] if frames else STANDARD.frames, width, height, cameras)
-    return tuple(CityLog(str(seed), seed, rules) for seed in city_logs.LISTS[name][: config.logs])
+    return tuple(ListedCity(str(seed), seed, rules) for seed in city_logs.LISTS[name][: config.logs])
 
 
 def _recorded(config: BenchConfig, name: str, source: Path, table: PaperTable) -> RecordedLog:
@@ -164,7 +164,7 @@ def make_scene(log: PaperLog, table: PaperTable, out: Path, device: DeviceName, 
     Raises:
         InputError: the log has fewer frames than the table asks for. Whatever a verb raises.
     """
-    if isinstance(log, CityLog):
+    if isinstance(log, ListedCity):
         settings = IngestConfig(test_every=table.held_out_every, city=city_logs.log_config(log.seed, log.rules))
         return made(lambda o: ingest.run(settings, ingest.CITY, out / "scene", overwrite=o), overwrite)
     refuse_overlap(out, {"log": log.source})

@@ -11,7 +11,7 @@ from statistics import fmean
 from typing import Any, Final
 
 from mudg.base.errors import InputError
-from mudg.bench.paper_tables import EXACT, Better, Column, PaperTable
+from mudg.bench.paper_tables import EXACT, Better, PaperColumn, PaperTable
 from mudg.bench.shift_tables import standard_error
 from mudg.report.score_tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 
@@ -29,7 +29,7 @@ OTHER_N: Final = "other n"
 
 
 def at_place(
-    documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[Column]
+    documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]
 ) -> dict[str, dict[str, Any]]:
     """Values of one method on one log at a place: key -> ``{"value": number or reason, "n", "n_reference"}``.
 
@@ -43,7 +43,7 @@ def at_place(
     return {column.key: _value(column, here, column.key in known) for column in columns}
 
 
-def _value(column: Column, rows: Sequence[Mapping[str, Any] | None], known: bool) -> dict[str, Any]:
+def _value(column: PaperColumn, rows: Sequence[Mapping[str, Any] | None], known: bool) -> dict[str, Any]:
     if not known:
         return {"value": NOT_SCORED}
     given = [None if row is None else row["values"].get(column.key, NOT_COMPUTED) for row in rows]
@@ -58,14 +58,14 @@ def _value(column: Column, rows: Sequence[Mapping[str, Any] | None], known: bool
     return found
 
 
-def _reason(column: Column, reason: str) -> str:
+def _reason(column: PaperColumn, reason: str) -> str:
     if reason == NOT_COMPUTED and column.needs:
         return f"no weights: --score.{column.needs.replace('_', '-')}"
     return "no truth off the path on a recorded log" if reason == NO_TRUTH else reason
 
 
 def floors_at(
-    documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[Column]
+    documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]
 ) -> dict[str, dict[str, Any]]:
     """What the truth itself scores on a recorded log at a place: the scorer's floors, for measures of sets of views alone."""
     found: dict[str, dict[str, Any]] = {}
@@ -133,7 +133,7 @@ def document(
     }  # fmt: skip
 
 
-def _cell(logs: Sequence[Mapping[str, Any]], row: str, place: str, column: Column) -> dict[str, Any]:
+def _cell(logs: Sequence[Mapping[str, Any]], row: str, place: str, column: PaperColumn) -> dict[str, Any]:
     """Mean over all logs, or the reason why there is none."""
     found = [entry["values"][row][place][column.key] for entry in logs]
     if row == TRUTH and column.key in BY_DEFINITION:
@@ -150,7 +150,7 @@ def _cell(logs: Sequence[Mapping[str, Any]], row: str, place: str, column: Colum
     }  # fmt: skip
 
 
-def _equalise(cells: dict[str, dict[str, dict[str, Any]]], columns: Sequence[tuple[str, Column]]) -> None:
+def _equalise(cells: dict[str, dict[str, dict[str, Any]]], columns: Sequence[tuple[str, PaperColumn]]) -> None:
     """Refuse methods with different numbers of views in a column; a floor with another number is left out of the table, with the reason.
 
     Raises:
@@ -189,7 +189,7 @@ def values_of(table: PaperTable) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _column_values(column: Column) -> dict[str, Any]:
+def _column_values(column: PaperColumn) -> dict[str, Any]:
     return {
         "key": column.key,
         "title": column.title,

@@ -30,7 +30,7 @@ class SceneRange:
 
 
 @dataclass(frozen=True)
-class Place:
+class PaperPlace:
     """Where views are scored.
 
     Args:
@@ -51,7 +51,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Column:
+class PaperColumn:
     """A number of ``metrics.json``.
 
     Args:
@@ -108,8 +108,8 @@ class PaperTable:
     title: str
     data: str
     scenes: str
-    places: tuple[Place, ...]
-    columns: tuple[Column, ...]
+    places: tuple[PaperPlace, ...]
+    columns: tuple[PaperColumn, ...]
     published: tuple[PublishedRow, ...]
     only: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     rows: tuple[PaperRow, ...] = ()
@@ -121,7 +121,7 @@ class PaperTable:
     virtual_shifts_m: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
 
-    def cells(self) -> tuple[tuple[Place, Column], ...]:
+    def cells(self) -> tuple[tuple[PaperPlace, PaperColumn], ...]:
         """All places and columns, in the order of the table."""
         return tuple((p, c) for p in self.places for c in self.columns if c.key in self.only.get(p.name, (c.key,)))
 
@@ -168,27 +168,27 @@ although papers print both in one table), and of StreetCrafter."""
 
 # ---- columns ----
 
-PSNR: Final = Column("psnr", "PSNR", "higher", 2)
-SSIM: Final = Column("ssim", "SSIM", "higher", 3)
-LPIPS: Final = Column("lpips", "LPIPS", "lower", 3, needs="lpips_weights")
-FID: Final = Column("fid", "FID", "lower", 2, needs="fid_weights", counts="distribution")
-FVD: Final = Column("fvd", "FVD", "lower", 1, needs="fvd_weights", counts="video")
-NTA: Final = Column("nta_iou", "NTA-IoU", "higher", 3, needs="detections")
-NTL: Final = Column("ntl_iou", "NTL-IoU", "higher", 2, needs="lanes")
-IQ: Final = Column("imaging_quality", "IQ", "higher", 2)
-CLIP_F: Final = Column("clip_f", "CLIP-F", "higher", 3)
-CLIP_V: Final = Column("clip_v", "CLIP-V", "higher", 3)
-ROTATION: Final = Column("rotation_error", "RErr", "lower", 3)
-TRANSLATION: Final = Column("translation_error", "TErr", "lower", 3)
+PSNR: Final = PaperColumn("psnr", "PSNR", "higher", 2)
+SSIM: Final = PaperColumn("ssim", "SSIM", "higher", 3)
+LPIPS: Final = PaperColumn("lpips", "LPIPS", "lower", 3, needs="lpips_weights")
+FID: Final = PaperColumn("fid", "FID", "lower", 2, needs="fid_weights", counts="distribution")
+FVD: Final = PaperColumn("fvd", "FVD", "lower", 1, needs="fvd_weights", counts="video")
+NTA: Final = PaperColumn("nta_iou", "NTA-IoU", "higher", 3, needs="detections")
+NTL: Final = PaperColumn("ntl_iou", "NTL-IoU", "higher", 2, needs="lanes")
+IQ: Final = PaperColumn("imaging_quality", "IQ", "higher", 2)
+CLIP_F: Final = PaperColumn("clip_f", "CLIP-F", "higher", 3)
+CLIP_V: Final = PaperColumn("clip_v", "CLIP-V", "higher", 3)
+ROTATION: Final = PaperColumn("rotation_error", "RErr", "lower", 3)
+TRANSLATION: Final = PaperColumn("translation_error", "TErr", "lower", 3)
 EXACT: Final = (
     PSNR,
     SSIM,
-    Column("perceptual", "perceptual", "lower", 4),
-    Column("kid", "KID", "lower", 4, needs="fid_weights", counts="distribution"),
-    Column("abs_rel", "AbsRel", "lower", 4),
-    Column("miou", "mIoU", "higher", 3),
-    Column("flicker", "flicker", "lower", 3),
-    Column("psnr_movers", "PSNR of dynamic objects", "higher", 2),
+    PaperColumn("perceptual", "perceptual", "lower", 4),
+    PaperColumn("kid", "KID", "lower", 4, needs="fid_weights", counts="distribution"),
+    PaperColumn("abs_rel", "AbsRel", "lower", 4),
+    PaperColumn("miou", "mIoU", "higher", 3),
+    PaperColumn("flicker", "flicker", "lower", 3),
+    PaperColumn("psnr_movers", "PSNR of dynamic objects", "higher", 2),
 )
 """Columns of generated cities, whose truth is known everywhere; most of them no paper can have off the recorded path."""
 
@@ -196,25 +196,25 @@ EXACT: Final = (
 # ---- places ----
 
 
-def both(metres: float) -> Place:
+def both(metres: float) -> PaperPlace:
     """A lateral distance, the mean over both sides."""
-    return Place(f"{metres:g}", f"{metres:g} m", (metres, -metres))
+    return PaperPlace(f"{metres:g}", f"{metres:g} m", (metres, -metres))
 
 
-def left(metres: float) -> Place:
+def left(metres: float) -> PaperPlace:
     """A lateral distance, to the left alone (or to the right where a scene list says so)."""
-    return Place(f"{metres:g}", f"{metres:g} m, one side", (metres,))
+    return PaperPlace(f"{metres:g}", f"{metres:g} m, one side", (metres,))
 
 
-PATH: Final = Place(RECORDED, "recorded path", (0.0,))
-LANE: Final = Place("lane", "lane change", paths=("lane+0.1", "lane-0.1"))
-FASTER: Final = Place("faster", "speed up", paths=("speed+0.1",))
-SLOWER: Final = Place("slower", "slow down", paths=("speed-0.1",))
+PATH: Final = PaperPlace(RECORDED, "recorded path", (0.0,))
+LANE: Final = PaperPlace("lane", "lane change", paths=("lane+0.1", "lane-0.1"))
+FASTER: Final = PaperPlace("faster", "speed up", paths=("speed+0.1",))
+SLOWER: Final = PaperPlace("slower", "slow down", paths=("speed-0.1",))
 
 
-def up(metres: float) -> Place:
+def up(metres: float) -> PaperPlace:
     """Raised by a height."""
-    return Place(f"up{metres:g}", f"{metres:g} m up", paths=(f"up{metres:+g}",))
+    return PaperPlace(f"up{metres:g}", f"{metres:g} m up", paths=(f"up{metres:+g}",))
 
 
 # ---- published numbers ----

@@ -19,7 +19,7 @@ _LATEX: Final = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class PrintedCell:
     """A printed cell; ``best``: the best number of its column among ours."""
 
     text: str
@@ -27,12 +27,12 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Line:
+class PrintedRow:
     """A printed row. ``kind``: ours, anchor (truth, filled points), published, or n (numbers of views)."""
 
     title: str
     kind: str
-    cells: tuple[Cell, ...]
+    cells: tuple[PrintedCell, ...]
 
 
 def heading(doc: Mapping[str, Any]) -> str:
@@ -56,7 +56,7 @@ def notes_of(doc: Mapping[str, Any]) -> list[str]:
         f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by number.",
         f"Every fit has {settings['iterations']} iterations, under virtual views {settings['continued_share']:g} times as many more; seed "
         f"{settings['seed']}.",
-        "Means over logs; in brackets the standard error over logs. Bold: best of ours; the truth itself and published rows are not ranked.",
+        "Means over logs; in brackets the standard error over logs. Bold: best of ours; truth and published rows are not ranked.",
         *table["notes"],
         *_notes_of_sets(doc["made"]),
         *(f"{entry['log']}: {entry['note']}." for entry in doc["logs"] if entry["note"]),
@@ -102,39 +102,41 @@ def _columns(doc: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return {column["key"]: column for column in (*doc["further"], *doc["table"]["columns"])}
 
 
-def lines_of(doc: Mapping[str, Any]) -> list[Line]:
+def lines_of(doc: Mapping[str, Any]) -> list[PrintedRow]:
     """The table: published rows, ours, and the numbers of views."""
     wanted = [tuple(cell) for cell in doc["table"]["cells"]]
     lines = []
     for row in doc["published"]:
         values = {(place, key): value for place, key, value in row["values"]}
         if values.keys() & set(wanted):
-            texts = (Cell(_digits(values[cell], _columns(doc)[cell[1]]) if cell in values else "") for cell in wanted)
-            lines.append(Line(f"{row['title']} ({PUBLISHED}: {row['source']})", PUBLISHED, tuple(texts)))
+            texts = (
+                PrintedCell(_digits(values[cell], _columns(doc)[cell[1]]) if cell in values else "") for cell in wanted
+            )
+            lines.append(PrintedRow(f"{row['title']} ({PUBLISHED}: {row['source']})", PUBLISHED, tuple(texts)))
     return [*lines, *_ours(doc, wanted)]
 
 
-def exact_lines(doc: Mapping[str, Any], place: str) -> list[Line]:
+def exact_lines(doc: Mapping[str, Any], place: str) -> list[PrintedRow]:
     """The columns that the exact truth of a city allows, at a place."""
     return _ours(doc, [(place, column["key"]) for column in doc["further"]])
 
 
-def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> list[Line]:
+def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> list[PrintedRow]:
     lines = []
     for row in doc["rows"]:
         cells = [_cell(doc, row["name"], place, key) for place, key in wanted]
-        lines.append(Line(row["title"], "ours" if row["method"] else "anchor", tuple(cells)))
+        lines.append(PrintedRow(row["title"], "ours" if row["method"] else "anchor", tuple(cells)))
     counts = [_count(doc, place, key) for place, key in wanted]
-    return [*lines, Line("n", "n", tuple(map(Cell, counts)))]
+    return [*lines, PrintedRow("n", "n", tuple(map(PrintedCell, counts)))]
 
 
-def _cell(doc: Mapping[str, Any], row: str, place: str, key: str) -> Cell:
+def _cell(doc: Mapping[str, Any], row: str, place: str, key: str) -> PrintedCell:
     found, column = doc["cells"][row][place][key], _columns(doc)[key]
     if "mean" not in found:
-        return Cell(found["reason"])
+        return PrintedCell(found["reason"])
     error = found["standard_error"]
     behind = "" if error is None else f" ({_digits(error, column)})"
-    return Cell(_digits(found["mean"], column) + behind, row in doc["best"][place][key])
+    return PrintedCell(_digits(found["mean"], column) + behind, row in doc["best"][place][key])
 
 
 def _digits(value: float, column: Mapping[str, Any]) -> str:

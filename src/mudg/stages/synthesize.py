@@ -33,7 +33,7 @@ from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
-from mudg.data.clips.ablated import ConditionSources, conditions_of
+from mudg.data.clips.ablated import ConditionParts, ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules, WarpSource
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
@@ -220,8 +220,8 @@ class ViewMaker:
     def __init__(self, model: loading.DiffusionModel, given: ConditionSources, config: SynthesizeConfig) -> None:
         if not given.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
-        self._model, self._given, self._parts = model, given, config.condition
-        self._full_size = config.full_size
+        self._model, self._given, self._full_size = model, given, config.full_size
+        self._parts: ConditionParts = config.condition
         self._sources: dict[int, WarpSource] = {}
         self._request = loading.request_of(config, loading.half_of(config) == torch.bfloat16)
 
