@@ -8,6 +8,7 @@ import typing
 
 import numpy as np
 import pytest
+from PIL import Image
 from test_bench import SMALL
 
 from mudg.base import config as configuration
@@ -193,6 +194,13 @@ def test_means_and_standard_errors_by_hand():
     assert alone["best"]["2"]["fid"] == ["gs3d", "mudg_s"]
 
 
+def test_the_best_of_a_column():
+    cells = {"a": {"mean": 0.4}, "b": {"mean": 1.3}, "c": {"mean": 0.9}, "d": {"reason": "none"}}
+    best = {better: paper_numbers.best_of(better, cells, 2, 1.0) for better in ("higher", "lower", "one")}
+    assert best == {"higher": ["b"], "lower": ["a"], "one": ["c"]}
+    assert paper_numbers.best_of("lower", {"a": {"mean": 1.0}, "d": {"reason": "none"}}, 2, 1.0) == []
+
+
 def test_different_numbers_of_views_are_refused():
     logs = toy_logs(FIDS)
     logs[1]["values"]["mudg_s"]["3"]["fid"]["n"] = 11
@@ -259,8 +267,8 @@ def test_the_table_as_csv(toy):
 
 def test_the_table_as_latex(toy):
     lines = paper_text.latex(toy).splitlines()
-    assert r"With diffusion (mudg\_s) & \textbf{45.00 (5.00)} & no weights: --score.fvd-weights & \textbf{46.00 (5.00)} & " \
-        r"no weights: --score.fvd-weights \\" in lines  # fmt: skip
+    assert r"With diffusion (mudg\_s) & \textbf{45.00 (5.00)} & -- & \textbf{46.00 (5.00)} & -- \\" in lines
+    assert "% -- FVD ↓, 2 m: no weights: --score.fvd-weights" in lines
     assert r"\begin{tabular}{lrrrr}" in lines and lines[-1] == r"\end{tabular}"
     assert lines[0].startswith("% Toy & table")
     assert lines.count(r"\hline") == 4  # above and below the heads, after the published rows, at the end
@@ -314,6 +322,25 @@ def test_a_recorded_log_is_cut_to_the_table(recorded, tmp_path):
     assert len(scene.sweeps) == 5 and scene.source.recipe is None
     with pytest.raises(InputError, match="fewer frames"):
         paper_logs.make_scene(dataclasses.replace(log, frames=(0, 39)), table, tmp_path / "more", "cpu", False)
+
+
+def test_pictures_without_truth(recorded, tmp_path):
+    """Rows of colour and depth alone, all columns, in full size; nothing for a column without the trajectory."""
+    from mudg.bench import shift_page
+    from mudg.bench.shift import write_fill
+    from mudg.core import trajectory
+    from mudg.stages import fuse
+    from mudg.stages.config import FuseConfig
+
+    scene = read_scene(recorded)
+    paths = [trajectory.shifted(scene, "front", 2.0), trajectory.named(scene, "front", "lane+0.1")]
+    fused = fuse.run(FuseConfig(), recorded, tmp_path / "fused")
+    one, both = (write_fill(recorded, fused, paths[:n], tmp_path / f"fill{n}") for n in (1, 2))
+    out = shift_page.film({"one": one, "both": (both,)}, paths, tmp_path / "film", videos=False)
+    assert sorted(path.name for path in out.glob("*.jpg")) == ["front_lane+0.1.jpg", "front_shift+2.0.jpg"]
+    with Image.open(out / "front_lane+0.1.jpg") as picture:
+        seen = np.asarray(picture.convert("L"))
+    assert seen.shape == (2 * 48, 2 * 64) and seen[:, :60].max() < 40 < seen[:, 70:].max()
 
 
 # ---- the command -------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointClo
 from mudg.core import visible
 from mudg.data.clips import condition as clips
 from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.ablated import ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
@@ -110,6 +111,25 @@ def test_backdrop_of_the_recorded_view_is_the_image():
     recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
     condition = build_conditions(cloud, [], [view_at()], recorded, RULES)[0]
     assert torch.allclose(condition.backdrop[0], clips.image_tensor(recorded[0].rgb), atol=1e-5)
+
+
+@pytest.mark.parametrize("fine", [0, 2])
+def test_parts_of_a_condition_are_switched_off(fine):
+    cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
+    recorded = [Photo(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
+    rules = replace(RULES, fine_width=48 * fine, fine_height=32 * fine)
+    views = [view_at(y=2.0, time_s=0.1)]
+    given = ConditionSources(cloud, (), recorded, rules)
+    full, points, reference, concat = (conditions_of(given, parts, views, {}) for parts in ("full", "points", "reference", "concat"))
+    for grid in (0, 1):
+        whole, bare, image, both = full[grid], points[grid], reference[grid], concat[grid]
+        assert bool(whole.warped.any()) and not any(bool(c.warped.any()) for c in (bare, image, both))
+        assert torch.equal(bare.valid, whole.valid) and torch.equal(bare.depth, whole.depth)
+        assert torch.equal(bare.backdrop, bare.color)
+        assert torch.equal(both.color, bare.color) and torch.equal(both.depth, bare.depth)
+        assert torch.equal(both.backdrop, whole.backdrop) and torch.equal(image.color, whole.backdrop)
+        assert not bool(image.valid.any()) and bool((image.depth == rules.far_m).all())
+    assert torch.equal(full[0].color, build_conditions(cloud, [], views, recorded, rules)[0].color)
 
 
 def test_moving_things_take_no_colour_from_another_time():

@@ -175,8 +175,8 @@ def best_of(better: Better, cells: Mapping[str, Mapping[str, Any]], digits: int,
     numbers = {name: round(cell["mean"] * factor, digits) for name, cell in cells.items() if "mean" in cell}
     if len(numbers) < 2:
         return []
-    best = (max if better == "higher" else min)(numbers.values())
-    return [name for name, number in numbers.items() if number == best]
+    apart = {name: {"higher": -number, "lower": number, "one": abs(number - 1)}[better] for name, number in numbers.items()}
+    return [name for name, number in apart.items() if number == min(apart.values())]
 
 
 def values_of(table: PaperTable) -> dict[str, Any]:

@@ -23,8 +23,8 @@ def page(doc: Mapping[str, Any]) -> str:
     ] if columns else []  # fmt: skip
     return html.render(
         "paper.html.j2", title=paper_text.heading(doc), kicker=f"mudg bench paper --table {doc['table']['name']}",
-        lead=paper_text.data_of(doc),
-        notes=paper_text.notes_of(doc), heads=["", *paper_text.heads_of(doc)], lines=paper_text.lines_of(doc), exact=exact,
+        lead=paper_text.notes_of(doc)[0],
+        notes=paper_text.notes_of(doc)[1:], heads=["", *paper_text.heads_of(doc)], lines=paper_text.lines_of(doc), exact=exact,
         log_heads=paper_text.LOG_HEADS, logs=[paper_text.log_cells(entry) for entry in doc["logs"]],
         films=[{"log": entry["log"], "name": name} for entry in doc["logs"] for name in entry["films"]],
         columns=doc["logs"][0]["columns"], videos=doc["settings"]["videos"],

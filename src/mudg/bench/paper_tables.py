@@ -14,7 +14,8 @@ from mudg.bench.chain import VIRTUAL_TERMS
 from mudg.methods import METHODS
 from mudg.models.inception import ResizeRule
 
-Better = Literal["higher", "lower"]
+Better = Literal["higher", "lower", "one"]
+"""Which numbers are better; one: those near 1."""
 RECORDED: Final = "0"
 
 
@@ -187,7 +188,7 @@ EXACT: Final = (
     PaperColumn("kid", "KID", "lower", 4, needs="fid_weights", counts="distribution"),
     PaperColumn("abs_rel", "AbsRel", "lower", 4),
     PaperColumn("miou", "mIoU", "higher", 3),
-    PaperColumn("flicker", "flicker", "lower", 3),
+    PaperColumn("flicker", "flicker", "one", 3),
     PaperColumn("psnr_movers", "PSNR of dynamic objects", "higher", 2),
 )
 """Columns of generated cities, whose truth is known everywhere; most of them no paper can have off the recorded path."""

@@ -10,20 +10,21 @@ from typing import Any, Final
 
 from mudg.report.score_tables import markdown_table
 
-ARROWS: Final = {"higher": "↑", "lower": "↓"}
+ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
 PUBLISHED: Final = "published"
 _LATEX: Final = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$",
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class PrintedCell:
-    """A printed cell; ``best``: the best number of its column among ours."""
+    """A printed cell: ``best``, the best number of its column among ours; ``reason``, no number but why there is none."""
 
     text: str
     best: bool = False
+    reason: bool = False
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> list[Pri
 def _cell(doc: Mapping[str, Any], row: str, place: str, key: str) -> PrintedCell:
     found, column = doc["cells"][row][place][key], _columns(doc)[key]
     if "mean" not in found:
-        return PrintedCell(found["reason"])
+        return PrintedCell(found["reason"], reason=True)
     error = found["standard_error"]
     behind = "" if error is None else f" ({_digits(error, column)})"
     return PrintedCell(_digits(found["mean"], column) + behind, row in doc["best"][place][key])
@@ -235,22 +236,29 @@ def _number(value: float | None) -> str:
 
 
 def latex(doc: Mapping[str, Any]) -> str:
-    """The table as a LaTeX ``tabular``; notes as comments above it."""
-    heads = heads_of(doc)
-    lines = [
-        *(f"% {note}" for note in (heading(doc), *notes_of(doc))),
-        r"\begin{tabular}{l" + "r" * len(heads) + "}",
-        r"\hline",
-    ]
+    """The tables as LaTeX ``tabular``; notes, and the reasons behind cells without a number (--), as comments above them."""
+    parts = [("", heads_of(doc), lines_of(doc))]
+    for place in doc["table"]["places"] if doc["further"] else ():
+        heads = [f"{column['title']} {ARROWS[column['better']]}" for column in doc["further"]]
+        parts.append((f"Exact truth: {place['title']}", heads, exact_lines(doc, place["name"])))
+    lines = [f"% {note}" for note in (heading(doc), *notes_of(doc))]
+    for title, heads, rows in parts:
+        lines += [*([f"% {title}"] if title else []), *_tabular(heads, rows), ""]
+    return "\n".join(lines)
+
+
+def _tabular(heads: Sequence[str], rows: Sequence[PrintedRow]) -> list[str]:
+    reasons = dict.fromkeys(f"{head}: {cell.text}" for row in rows for head, cell in zip(heads, row.cells, strict=True) if cell.reason)
+    lines = [*(f"% -- {reason}" for reason in reasons), r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline"]
     lines += [" & ".join(["", *map(escaped, heads)]) + r" \\", r"\hline"]
     kind = ""
-    for line in lines_of(doc):
-        if kind and PUBLISHED in (kind, line.kind) and kind != line.kind:
+    for row in rows:
+        if kind and PUBLISHED in (kind, row.kind) and kind != row.kind:
             lines.append(r"\hline")
-        kind = line.kind
-        texts = (rf"\textbf{{{escaped(cell.text)}}}" if cell.best else escaped(cell.text) for cell in line.cells)
-        lines.append(" & ".join([escaped(line.title), *texts]) + r" \\")
-    return "\n".join([*lines, r"\hline", r"\end{tabular}", ""])
+        kind = row.kind
+        texts = ("--" if c.reason else rf"\textbf{{{escaped(c.text)}}}" if c.best else escaped(c.text) for c in row.cells)
+        lines.append(" & ".join([escaped(row.title), *texts]) + r" \\")
+    return [*lines, r"\hline", r"\end{tabular}"]
 
 
 def escaped(text: str) -> str:
