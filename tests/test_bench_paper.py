@@ -365,7 +365,8 @@ def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
 
 
 TINY = BenchConfig(
-    logs=2, iterations=20, processes=1, videos=False, resolution="96x64", frames="0:5", methods=("street_gaussians", "mudg_r", "mudg_s")
+    logs=2, iterations=20, processes=1, videos=False, resolution="96x64", frames="0:5",
+    methods=("street_gaussians", "mudg_r", "freevs", "mudg_s"),
 )  # fmt: skip
 
 
@@ -392,6 +393,7 @@ def test_a_table_on_cities_end_to_end(filled):
         assert cell["n"] == [10, 10] and cell["standard_error"] > 0
         assert document["cells"][row]["3"]["fid"] == {"reason": "no weights: --score.fid-weights"}
     assert document["cells"]["truth"]["3"]["flicker"]["mean"] == pytest.approx(1.0)
+    assert document["cells"]["freevs"]["3"]["psnr"] == {"reason": "no model: --freevs-model"}
     seed = document["logs"][0]["log"]
     assert (out / seed / "film" / "front_shift+3.0.jpg").is_file()
     before = {name: (out / seed / name / "run.json").stat().st_mtime_ns for name in ("fit/mudg_s", "virtual", "score/mudg_s")}
@@ -407,7 +409,8 @@ def test_a_table_on_cities_end_to_end(filled):
 def test_settings_and_further_paths_end_to_end(filled, table, tmp_path):
     _, config = filled
     usual = BenchConfig().methods if TABLES[table].rows else ("mudg_r",)
-    config = dataclasses.replace(config, table=table, logs=1, methods=usual)
+    usual = usual if TABLES[table].rows else (*usual, "freevs")
+    config = dataclasses.replace(config, table=table, logs=1, methods=usual, freevs_model=config.model)
     document = store.read_json(bench.run("paper", config, tmp_path / "out", sources=("city:development",)) / "bench.json")
     for row in TABLES[table].rows or (PaperRow("mudg_r", "", "mudg_r"),):
         for place in TABLES[table].places:
@@ -415,6 +418,9 @@ def test_settings_and_further_paths_end_to_end(filled, table, tmp_path):
     if table == "mudg2":
         psnr = {name: of[RECORDED]["psnr"]["mean"] for name, of in document["cells"].items() if name != "truth"}
         assert len({round(value, 6) for value in psnr.values()}) == len(psnr)  # every condition gives other views
+    if not TABLES[table].rows:
+        assert "mean" in document["cells"]["freevs"]["lane"]["psnr"]
+        assert document["cells"]["freevs"]["lane"]["abs_rel"] == {"reason": "not produced"}
 
 
 @pytest.mark.slow

@@ -140,7 +140,8 @@ def rows_of(config: BenchConfig, table: PaperTable) -> tuple[PaperRow, ...]:
     unknown = sorted(set(asked) - set(METHODS))
     if unknown:
         raise UsageError("unknown method", where="--methods", expected=", ".join(METHODS), got=", ".join(unknown))
-    return table.rows_of(asked)
+    as_freevs = {"condition": "freevs", "model": config.freevs_model}
+    return tuple(replace(row, changes=as_freevs) if row.method == "freevs" else row for row in table.rows_of(asked))
 
 
 def score_settings(config: ScoreConfig, table: PaperTable) -> ScoreConfig:
@@ -174,7 +175,8 @@ def make_log(job: PaperJob) -> dict[str, Any]:
     if isinstance(job.log, ListedCity):
         truth = made(lambda o: score_truth.write_truth(scene, asked.paths, job.out / TRUTH, overwrite=o), job.overwrite)
     fill = made(lambda o: write_fill(scene, job.fused, asked.paths, job.out / FILL, overwrite=o), job.overwrite)
-    views = {FILL: (fill,), **{row.name: views_of(job, row, scene, asked) for row in job.rows}}
+    left_out = [row.name for row in job.rows if row.changes.get("model") == ""]
+    views = {FILL: (fill,), **{row.name: views_of(job, row, scene, asked) for row in job.rows if row.name not in left_out}}
     scored = {name: scores_of(job, name, folders, scene, truth) for name, folders in views.items()}
     if truth is not None:
         scored[TRUTH] = scores_of(job, TRUTH, (truth,), scene, truth)
@@ -183,6 +185,8 @@ def make_log(job: PaperJob) -> dict[str, Any]:
     values = {
         name: {place: paper_numbers.at_place(documents, at, columns) for place, at in names.items()} for name, documents in scored.items()
     }  # fmt: skip
+    none = {column.key: {"value": "no model: --freevs-model"} for column in columns}
+    values |= {name: dict.fromkeys(names, none) for name in left_out}
     if truth is None:
         values[TRUTH] = {place: paper_numbers.floors_at(scored[FILL], at, columns) for place, at in names.items()}
     shown = {**({} if truth is None else {TRUTH: truth}), **views}

@@ -32,9 +32,11 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
+from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.data.clips.ablated import ConditionParts, ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules, WarpSource
+from mudg.data.clips.near_points import NearSweeps
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
@@ -42,12 +44,13 @@ from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, gener
 from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of
 from mudg.models.mdm.model import MDM
-from mudg.stages.config import SynthesizeConfig
+from mudg.stages import fuse
+from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.learning import loading
 
-SOURCE = "mudg_r"
+SOURCE, FREEVS = "mudg_r", "freevs"
 SKY = palette.ID["sky"]
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
@@ -143,6 +146,17 @@ def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     return [Photo(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
 
 
+def near_sweeps(scene: Scene, cloud: FusedCloud, path: Trajectory) -> NearSweeps:
+    """The sweeps of a scene for FreeVS' condition, each coloured by the images of its time that are not held out."""
+    times = [view.time_s for view in path.views]
+    period_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.1
+
+    def read(number: int) -> SweepShots:
+        return next(iter(fuse.scene_sweeps(replace(scene, sweeps=(scene.sweeps[number],)), FuseConfig())))
+
+    return NearSweeps(tuple(sweep.time_s for sweep in scene.sweeps), read, scene.tracks, period_s, cloud.colors)
+
+
 def without_classes(cloud: FusedCloud) -> FusedCloud:
     """The cloud without its points' classes."""
     bare = lambda points: replace(points, semantics=None)  # noqa: E731
@@ -168,14 +182,15 @@ def make_trajectory(
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     recorded = recorded_images(scene, config)
     render_at = None if fitted is None else functools.partial(render_planes, load_model(fitted))
-    maker = ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at), config)
+    near = near_sweeps(scene, cloud, path) if config.condition == FREEVS else None
+    maker = ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at, near), config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
     fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     sheet: list[np.ndarray] = []
     every = max(1, len(path) // 5)
-    with ObservationWriter(folder, path.name, SOURCE) as writer:
+    with ObservationWriter(folder, path.name, FREEVS if config.condition == FREEVS else SOURCE) as writer:
         done = spans[first - 1].stop if first else 0
         for view in path.views[:done]:
             writer.skip(maker.sized(view))
@@ -239,10 +254,14 @@ class ViewMaker:
         if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
             usable[0] = False
         trust = made.confidence * usable
+        source, color_alone = (FREEVS, True) if self._parts == FREEVS else (SOURCE, False)
         observations = [
-            Observation(view, made.rgb[i], made.depth[i], made.semantics[i], trust[i], usable[i], "virtual", SOURCE)
+            Observation(
+                view, made.rgb[i], None if color_alone else made.depth[i], None if color_alone else made.semantics[i], trust[i],
+                usable[i], "virtual", source,
+            )
             for i, view in enumerate(made_views)
-        ]
+        ]  # fmt: skip
         return sample, condition, observations
 
     def _generated(
@@ -250,7 +269,7 @@ class ViewMaker:
     ) -> tuple[GeneratedClip, GeneratedClip, tuple[View, ...]]:
         """The clip at the size the model works at; it and its views at the size that is written, without depth in the sky."""
         model = self._model
-        if self._full_size and isinstance(model, MDM) and model.finisher is not None:
+        if self._full_size and isinstance(model, MDM) and model.finisher is not None and self._parts != FREEVS:
             sample, finished = generated_and_finished(model, condition, fine, request)
             return sample, without_sky_depth(finished, fine), tuple(views)
         sample = generated(model, condition, request)
@@ -258,7 +277,7 @@ class ViewMaker:
         if not self._full_size:
             return sample, made, condition.views
         size = views[0].camera.height, views[0].camera.width
-        conditions = None if model.points_alone else (condition, fine)
+        conditions = None if model.points_alone or self._parts == FREEVS else (condition, fine)
         return sample, enlarge(made, size, conditions), tuple(views)
 
 

@@ -13,23 +13,27 @@ from typing import Literal
 
 import torch
 
+from mudg.base.errors import UsageError
 from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
+from mudg.data.clips.near_points import NearSweeps, near_condition
 
-ConditionParts = Literal["full", "reference", "points", "concat"]
+ConditionParts = Literal["full", "reference", "points", "concat", "freevs"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
 without recorded images and renders. concat: points and that image, without anything warped by depth, and without renders."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConditionSources:
-    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, and renders of a fit, if there is one."""
+    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the log's
+    sweeps, where they are needed."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
     recorded: Sequence[Photo]
     rules: ConditionRules
     render_at: RenderAt | None = None
+    near: NearSweeps | None = None
 
 
 def conditions_of(
@@ -42,6 +46,11 @@ def conditions_of(
     """
     rules = sources.rules
     cloud, tracks, recorded = sources.cloud, sources.tracks, sources.recorded
+    if parts == "freevs":
+        if sources.near is None:
+            raise UsageError("this condition needs the sweeps of the log", got=parts)
+        condition = near_condition(sources.near, views, rules)
+        return condition, condition
     if parts == "full":
         return build_conditions(cloud, tracks, views, recorded, rules, kept, sources.render_at)
     points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)

@@ -66,6 +66,8 @@ class BenchConfig:
         "mudg1", "mudg2", "mudg3", "recondreamer", "drivedreamer4d", "streetcrafter", "freesim", "recam", "spvc", "panda", "dist"
     ] = "mudg1"
     """paper: the table to fill (docs/paper_tables.md)."""
+    freevs_model: str = ""
+    """paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no numbers)."""
     score: ScoreConfig = Field(default_factory=ScoreConfig)
     """paper: how every row is scored; files of weights are given here."""
     protocols: tuple[str, ...] = ("gap", "camera", "lidar", "classes")
