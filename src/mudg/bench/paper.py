@@ -23,7 +23,7 @@ from mudg.base.types import Trajectory
 from mudg.bench import paper_numbers, paper_page, paper_text, shift_page
 from mudg.bench.chain import FitChain, at_once, each_log, learns_virtual, made, refuse_foreign, seconds_of
 from mudg.bench.paper_logs import ListedCity, PaperLog, facts_of, logs_of, make_scene, missing_scenes, scored_cameras
-from mudg.bench.paper_tables import EXACT, RECORDED, TABLES, PaperRow, PaperTable
+from mudg.bench.paper_tables import RECORDED, TABLES, PaperRow, PaperTable, further_columns
 from mudg.bench.shift import PERCEPTUAL_VIEWS, write_fill
 from mudg.data.scene import read_scene
 from mudg.methods import METHODS
@@ -176,12 +176,15 @@ def make_log(job: PaperJob) -> dict[str, Any]:
         truth = made(lambda o: score_truth.write_truth(scene, asked.paths, job.out / TRUTH, overwrite=o), job.overwrite)
     fill = made(lambda o: write_fill(scene, job.fused, asked.paths, job.out / FILL, overwrite=o), job.overwrite)
     left_out = [row.name for row in job.rows if row.changes.get("model") == ""]
-    views = {FILL: (fill,), **{row.name: views_of(job, row, scene, asked) for row in job.rows if row.name not in left_out}}
+    views = {
+        FILL: (fill,),
+        **{row.name: views_of(job, row, scene, asked) for row in job.rows if row.name not in left_out},
+    }
     scored = {name: scores_of(job, name, folders, scene, truth) for name, folders in views.items()}
     if truth is not None:
         scored[TRUTH] = scores_of(job, TRUTH, (truth,), scene, truth)
     names = {place.name: names_at(place.endings(job.log.side), asked.cameras) for place in job.table.places}
-    columns = tuple(dict.fromkeys((*job.table.columns, *(EXACT if truth is not None else ()))))
+    columns = tuple(dict.fromkeys((*job.table.columns, *further_columns(truth is not None))))
     values = {
         name: {place: paper_numbers.at_place(documents, at, columns) for place, at in names.items()} for name, documents in scored.items()
     }  # fmt: skip

@@ -11,7 +11,7 @@ from statistics import fmean
 from typing import Any, Final
 
 from mudg.base.errors import InputError
-from mudg.bench.paper_tables import EXACT, Better, PaperColumn, PaperTable
+from mudg.bench.paper_tables import Better, PaperColumn, PaperTable, further_columns
 from mudg.bench.shift_tables import standard_error
 from mudg.report.score_tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 
@@ -23,6 +23,8 @@ BY_DEFINITION: Final = frozenset({"psnr", "ssim", "psnr_movers", "lpips", "perce
 SELF: Final = "perfect by definition"
 NOT_SCORED: Final = "no score of this version"
 OTHER_N: Final = "other n"
+EXACT_TITLE, MEASURED_TITLE = "Exact truth", "Measured at LiDAR points and in recorded frames"
+"""Titles of the further columns."""
 
 
 # ---- one log ----
@@ -60,7 +62,8 @@ def _value(column: PaperColumn, rows: Sequence[Mapping[str, Any] | None], known:
 
 def _reason(column: PaperColumn, reason: str) -> str:
     if reason == NOT_COMPUTED and column.needs:
-        return f"no weights: --score.{column.needs.replace('_', '-')}"
+        what = "no weights" if column.needs.endswith("_weights") else "not given"
+        return f"{what}: --score.{column.needs.replace('_', '-')}"
     return "no truth off the path on a recorded log" if reason == NO_TRUTH else reason
 
 
@@ -77,7 +80,7 @@ def floors_at(
             n, reference = sum(f["n"] for f in here), sum(f["n_reference"] for f in here)
             found[column.key] = {"value": fmean(f[column.key] for f in here), "n": n, "n_reference": reference}
         else:
-            missing = SELF if column.key in BY_DEFINITION else NOT_COMPUTED
+            missing = SELF if column.key in BY_DEFINITION else NOT_COMPUTED if entry else NO_TRUTH
             found[column.key] = {"value": _reason(column, missing)}
     return found
 
@@ -110,7 +113,8 @@ def document(
     exact = all(entry["exact"] for entry in logs)
     every = [*({"name": name, "title": title, "method": "", "changes": {}} for name, title in ANCHORS.items()), *rows]
     main = [(place.name, column) for place, column in table.cells()]
-    further = [(place.name, column) for place in table.places for column in EXACT] if exact else []
+    columns = further_columns(exact)
+    further = [(place.name, column) for place in table.places for column in columns]
     cells = {
         row["name"]: {place: {c.key: _cell(logs, row["name"], place, c) for p, c in (*main, *further) if p == place}
                       for place in dict.fromkeys(p for p, _ in main)}
@@ -124,7 +128,8 @@ def document(
         best.setdefault(place, {})[column.key] = best_of(column.better, here, column.digits, column.factor)
     return {
         "schema": 1, "bench": "paper", "table": values_of(table), "exact": exact, "settings": dict(settings), "rows": every,
-        "cells": cells, "best": best, "further": [_column_values(c) for c in EXACT] if exact else [],
+        "cells": cells, "best": best, "further": [_column_values(c) for c in columns],
+        "further_title": EXACT_TITLE if exact else MEASURED_TITLE,
         "published": [
             {"title": row.title, "source": row.source, "values": [[*key, value] for key, value in row.values.items()]}
             for row in table.published
@@ -135,7 +140,7 @@ def document(
 
 def _cell(logs: Sequence[Mapping[str, Any]], row: str, place: str, column: PaperColumn) -> dict[str, Any]:
     """Mean over all logs, or the reason why there is none."""
-    found = [entry["values"][row][place][column.key] for entry in logs]
+    found = [entry["values"][row][place].get(column.key, {"value": NOT_SCORED}) for entry in logs]
     if row == TRUTH and column.key in BY_DEFINITION:
         return {"reason": SELF}
     reasons = [one["value"] for one in found if isinstance(one["value"], str)]
@@ -175,7 +180,9 @@ def best_of(better: Better, cells: Mapping[str, Mapping[str, Any]], digits: int,
     numbers = {name: round(cell["mean"] * factor, digits) for name, cell in cells.items() if "mean" in cell}
     if len(numbers) < 2:
         return []
-    apart = {name: {"higher": -number, "lower": number, "one": abs(number - 1)}[better] for name, number in numbers.items()}
+    apart = {
+        name: {"higher": -number, "lower": number, "one": abs(number - 1)}[better] for name, number in numbers.items()
+    }
     return [name for name, number in apart.items() if number == min(apart.values())]
 
 

@@ -16,15 +16,16 @@ from mudg.report import html
 def page(doc: Mapping[str, Any]) -> str:
     """The whole page from what ``bench.json`` holds."""
     columns = {column["key"]: column for column in doc["further"]}
-    exact = [
+    further = [
         {"title": place["title"], "heads": ["", *(f"{c['title']} {paper_text.ARROWS[c['better']]}" for c in columns.values())],
-         "lines": paper_text.exact_lines(doc, place["name"])}
+         "lines": paper_text.further_lines(doc, place["name"])}
         for place in doc["table"]["places"]
     ] if columns else []  # fmt: skip
     return html.render(
         "paper.html.j2", title=paper_text.heading(doc), kicker=f"mudg bench paper --table {doc['table']['name']}",
         lead=paper_text.notes_of(doc)[0],
-        notes=paper_text.notes_of(doc)[1:], heads=["", *paper_text.heads_of(doc)], lines=paper_text.lines_of(doc), exact=exact,
+        notes=paper_text.notes_of(doc)[1:], heads=["", *paper_text.heads_of(doc)], lines=paper_text.lines_of(doc),
+        further=further, further_title=doc["further_title"],
         log_heads=paper_text.LOG_HEADS, logs=[paper_text.log_cells(entry) for entry in doc["logs"]],
         films=[{"log": entry["log"], "name": name} for entry in doc["logs"] for name in entry["films"]],
         columns=doc["logs"][0]["columns"], videos=doc["settings"]["videos"],

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 from mudg.bench.chain import VIRTUAL_TERMS
+from mudg.core.metrics import METRICS
 from mudg.methods import METHODS
 from mudg.models.inception import ResizeRule
 
@@ -177,21 +178,38 @@ FVD: Final = PaperColumn("fvd", "FVD", "lower", 1, needs="fvd_weights", counts="
 NTA: Final = PaperColumn("nta_iou", "NTA-IoU", "higher", 3, needs="detections")
 NTL: Final = PaperColumn("ntl_iou", "NTL-IoU", "higher", 2, needs="lanes")
 IQ: Final = PaperColumn("imaging_quality", "IQ", "higher", 2)
-CLIP_F: Final = PaperColumn("clip_f", "CLIP-F", "higher", 3)
-CLIP_V: Final = PaperColumn("clip_v", "CLIP-V", "higher", 3)
+CLIP_F: Final = PaperColumn("clip_f", "CLIP-F", "higher", 4, needs="clip_weights")
+CLIP_V: Final = PaperColumn("clip_v", "CLIP-V", "higher", 4, needs="clip_weights")
 ROTATION: Final = PaperColumn("rotation_error", "RErr", "lower", 3)
 TRANSLATION: Final = PaperColumn("translation_error", "TErr", "lower", 3)
+_KID: Final = PaperColumn("kid", "KID", "lower", 4, needs="fid_weights", counts="distribution")
 EXACT: Final = (
     PSNR,
     SSIM,
     PaperColumn("perceptual", "perceptual", "lower", 4),
-    PaperColumn("kid", "KID", "lower", 4, needs="fid_weights", counts="distribution"),
+    _KID,
     PaperColumn("abs_rel", "AbsRel", "lower", 4),
     PaperColumn("miou", "mIoU", "higher", 3),
     PaperColumn("flicker", "flicker", "one", 3),
     PaperColumn("psnr_movers", "PSNR of dynamic objects", "higher", 2),
+    PaperColumn("agent_iou", "agent IoU", "higher", 3),
+    PaperColumn("lane_iou", "lane IoU", "higher", 3),
 )
-"""Columns of generated cities, whose truth is known everywhere; most of them no paper can have off the recorded path."""
+"""Further columns of generated cities, whose truth is known everywhere; most of them no paper can have off the recorded path."""
+MEASURED: Final = (
+    _KID,
+    PaperColumn("lidar_abs_rel", "AbsRel at points", "lower", 4),
+    PaperColumn("lidar_delta1", "delta < 1.25 at points", "higher", 3),
+    PaperColumn("lidar_psnr", "PSNR at points", "higher", 2),
+    PaperColumn("agreement", "agreement of classes", "higher", 3),
+    PaperColumn("lane_correlation", "lane gradients", "higher", 3),
+)
+"""Further columns of recorded logs: what LiDAR points and recorded frames tell about views off the path."""
+
+
+def further_columns(exact: bool) -> tuple[PaperColumn, ...]:
+    """The further columns of logs with or without exact truth, as far as `mudg score` has them."""
+    return tuple(column for column in (EXACT if exact else MEASURED) if column.key in METRICS)
 
 
 # ---- places ----

@@ -117,8 +117,8 @@ def lines_of(doc: Mapping[str, Any]) -> list[PrintedRow]:
     return [*lines, *_ours(doc, wanted)]
 
 
-def exact_lines(doc: Mapping[str, Any], place: str) -> list[PrintedRow]:
-    """The columns that the exact truth of a city allows, at a place."""
+def further_lines(doc: Mapping[str, Any], place: str) -> list[PrintedRow]:
+    """The further columns at a place."""
     return _ours(doc, [(place, column["key"]) for column in doc["further"]])
 
 
@@ -171,9 +171,9 @@ def markdown(doc: Mapping[str, Any]) -> str:
     for place in doc["table"]["places"] if doc["further"] else ():
         heads = [f"{column['title']} {ARROWS[column['better']]}" for column in doc["further"]]
         lines += [
-            f"## Exact truth: {place['title']}",
+            f"## {doc['further_title']}: {place['title']}",
             "",
-            *markdown_table(["", *heads], rows(exact_lines(doc, place["name"]))),
+            *markdown_table(["", *heads], rows(further_lines(doc, place["name"]))),
             "",
         ]
     return "\n".join(
@@ -240,7 +240,7 @@ def latex(doc: Mapping[str, Any]) -> str:
     parts = [("", heads_of(doc), lines_of(doc))]
     for place in doc["table"]["places"] if doc["further"] else ():
         heads = [f"{column['title']} {ARROWS[column['better']]}" for column in doc["further"]]
-        parts.append((f"Exact truth: {place['title']}", heads, exact_lines(doc, place["name"])))
+        parts.append((f"{doc['further_title']}: {place['title']}", heads, further_lines(doc, place["name"])))
     lines = [f"% {note}" for note in (heading(doc), *notes_of(doc))]
     for title, heads, rows in parts:
         lines += [*([f"% {title}"] if title else []), *_tabular(heads, rows), ""]
@@ -248,7 +248,9 @@ def latex(doc: Mapping[str, Any]) -> str:
 
 
 def _tabular(heads: Sequence[str], rows: Sequence[PrintedRow]) -> list[str]:
-    reasons = dict.fromkeys(f"{head}: {cell.text}" for row in rows for head, cell in zip(heads, row.cells, strict=True) if cell.reason)
+    reasons = dict.fromkeys(
+        f"{head}: {cell.text}" for row in rows for head, cell in zip(heads, row.cells, strict=True) if cell.reason
+    )
     lines = [*(f"% -- {reason}" for reason in reasons), r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline"]
     lines += [" & ".join(["", *map(escaped, heads)]) + r" \\", r"\hline"]
     kind = ""
@@ -256,7 +258,9 @@ def _tabular(heads: Sequence[str], rows: Sequence[PrintedRow]) -> list[str]:
         if kind and PUBLISHED in (kind, row.kind) and kind != row.kind:
             lines.append(r"\hline")
         kind = row.kind
-        texts = ("--" if c.reason else rf"\textbf{{{escaped(c.text)}}}" if c.best else escaped(c.text) for c in row.cells)
+        texts = (
+            "--" if c.reason else rf"\textbf{{{escaped(c.text)}}}" if c.best else escaped(c.text) for c in row.cells
+        )
         lines.append(" & ".join([escaped(row.title), *texts]) + r" \\")
     return [*lines, r"\hline", r"\end{tabular}"]
 
