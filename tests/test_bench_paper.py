@@ -375,6 +375,10 @@ def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
     document = store.read_json(out / "bench.json")
     assert [row["name"] for row in document["rows"]] == ["truth", "nearest_fill", "gs3d"]
     assert document["settings"]["score"]["fid_resize"] == "pytorch-fid"
+    absent = dataclasses.replace(config, score=ScoreConfig(fid_weights=str(tmp_path / "absent.pth")))
+    with pytest.raises(InputError, match="no such file"):
+        bench.run("paper", absent, tmp_path / "other", sources=("city:development",))
+    assert not (tmp_path / "other").exists()
     with pytest.raises(UsageError, match="do not belong"):
         bench.run("paper", dataclasses.replace(config, table="spvc"), out, sources=("city:development",))
 

@@ -97,7 +97,10 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
     rows = rows_of(config, table)
     logs = logs_of(config, sources, table)
     read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read, **weights_of(config.score)})
+    models = {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model}
+    refuse_overlap(out, {**models, **read, **weights_of(config.score)})
+    digests = {name: store.digest(Path(path)) for name, path in weights_of(config.score).items()}  # told before any work: it may be missing
+    digests |= {"freevs_model": mdm_files.digest(config.freevs_model)} if config.freevs_model else {}
     refuse_foreign(
         out, PAGES, lambda document: document["bench"] == "paper" and document["table"]["name"] == table.name
     )
@@ -114,6 +117,7 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
         "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "", "missing_scenes": list(missing_scenes(table, logs)),
         "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model), "renders": renders,
         "continued_share": CONTINUED_SHARE, "videos": config.videos, "score": configuration.result_settings(measured),
+        "digests": digests,
     }  # fmt: skip
     document = paper_numbers.document(table, found, [_values_of(row) for row in rows], settings)
     store.write_json(out / "bench.json", document)
@@ -154,9 +158,8 @@ def score_settings(config: ScoreConfig, table: PaperTable) -> ScoreConfig:
 
 def weights_of(config: ScoreConfig) -> dict[str, str]:
     """Files and folders that a score reads: setting -> path."""
-    return {
-        name: value for name, value in configuration.to_dict(config).items() if isinstance(value, str) and "/" in value
-    }
+    found = {name: value for name, value in configuration.to_dict(config).items() if isinstance(value, str) and value}
+    return {name: value for name, value in found.items() if name.endswith("weights") or Path(value).exists()}
 
 
 def _values_of(row: PaperRow) -> dict[str, Any]:
