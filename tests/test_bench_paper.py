@@ -383,6 +383,33 @@ def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
         bench.run("paper", dataclasses.replace(config, table="spvc"), out, sources=("city:development",))
 
 
+@pytest.mark.slow
+def test_an_interrupted_table_goes_on(tmp_path, monkeypatch):
+    config = BenchConfig(
+        logs=2, processes=1, videos=False, resolution="64x48", frames="0:4", methods=("nearest_fill",), table="drivedreamer4d"
+    )
+    make_scene, seen = paper.make_scene, []
+
+    def interrupted(log, *rest):
+        seen.append(log.name)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return make_scene(log, *rest)
+
+    monkeypatch.setattr(paper, "make_scene", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        bench.run("paper", config, tmp_path / "out", sources=("city:development",))
+    first = tmp_path / "out" / seen[0]
+    made = {path: path.stat().st_mtime_ns for path in first.rglob("manifest.json")}
+    assert len(made) >= 5 and not (tmp_path / "out" / "bench.json").exists()
+    out = bench.run("paper", config, tmp_path / "out", sources=("city:development",))
+    assert {path: path.stat().st_mtime_ns for path in first.rglob("manifest.json")} == made
+    document = store.read_json(out / "bench.json")
+    assert [entry["log"] for entry in document["logs"]] == seen[:2]
+    assert [row["name"] for row in document["rows"]] == ["truth", "nearest_fill"]
+    assert document["cells"]["nearest_fill"]["faster"]["psnr"]["n"] == [4, 4]
+
+
 TINY = BenchConfig(
     logs=2, iterations=20, processes=1, videos=False, resolution="96x64", frames="0:5",
     methods=("street_gaussians", "mudg_r", "freevs", "mudg_s"),
