@@ -112,6 +112,20 @@ def test_how_rows_are_scored():
     assert asked.fid_resize == "clean" and asked.perceptual_views > 1000
 
 
+def test_every_log_has_its_own_detections(tmp_path):
+    @dataclasses.dataclass(frozen=True)
+    class Settings:
+        detections: str = ""
+        lanes: str = ""
+
+    (tmp_path / "7.json").write_text("[]")
+    (tmp_path / "lanes" / "7").mkdir(parents=True)
+    given = Settings(str(tmp_path), str(tmp_path / "lanes"))
+    assert paper.of_log(given, "7") == Settings(str(tmp_path / "7.json"), str(tmp_path / "lanes" / "7"))
+    assert paper.of_log(given, "8") == given
+    assert paper.of_log(Settings(), "7") == Settings()
+
+
 # ---- numbers -----------------------------------------------------------------------------------------------------------
 
 

@@ -43,6 +43,8 @@ from mudg.stages.run import CONTINUED_SHARE
 FILL, TRUTH = score.BASELINE, "truth"
 PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
 ALL_VIEWS: Final = 1_000_000
+PER_LOG: Final = ("detections", "lanes", "video_features")
+"""Settings of a score that name what was made of the views of one log."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,10 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
     measured = on_device(score_settings(config.score, table), config.device)
     renders = mdm_files.uses_renders(config.model)
     jobs = [
-        PaperJob(log, out / log.name, table, rows, usual, on_device(generator, config.device), measured, renders, config.videos, overwrite)
+        PaperJob(
+            log, out / log.name, table, rows, usual, on_device(generator, config.device), of_log(measured, log.name), renders,
+            config.videos, overwrite,
+        )
         for log in logs
     ]  # fmt: skip
     found = each_log(make_log, jobs, [log.name for log in logs], at_once(config))
@@ -154,6 +159,17 @@ def score_settings(config: ScoreConfig, table: PaperTable) -> ScoreConfig:
     resize = table.resize if config.fid_resize == ScoreConfig().fid_resize else config.fid_resize
     views = ALL_VIEWS if config.lpips_weights else PERCEPTUAL_VIEWS
     return replace(config, baseline=False, error_pictures=False, fid_resize=resize, perceptual_views=views)
+
+
+def of_log(config: ScoreConfig, log: str) -> ScoreConfig:
+    """How the rows of one log are scored: where a folder of detections, lanes or features has an entry of the log's name (or such a
+    ``.json``), that one is taken."""
+    own: dict[str, Any] = {}
+    for name in PER_LOG:
+        given = getattr(config, name, "")
+        found = [path for ending in ("", ".json") if given and (path := Path(given) / f"{log}{ending}").exists()]
+        own |= {name: str(found[0])} if found else {}
+    return replace(config, **own)
 
 
 def weights_of(config: ScoreConfig) -> dict[str, str]:
