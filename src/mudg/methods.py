@@ -33,5 +33,6 @@ METHODS: Final[dict[str, Method]] = {
     "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics")),
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
     "mudg_r": Method("Diffusion output", "synthesize"),
+    "freevs": Method("FreeVS condition, our network", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }
