@@ -208,10 +208,11 @@ VERBS: dict[str, Verb] = {
         _learn,
     ),
     "convert": Verb(
-        "Convert a published checkpoint to a model folder for synthesize or annotate.",
+        "Convert a published checkpoint to a folder for synthesize, annotate or score.",
         ("mudg convert 1024-mdm-checkpoint.ckpt --to models/mudg_1024",
          "mudg convert model.ckpt --to models/dc_512 --resolution 320x512 --dtype bfloat16",
-         "mudg convert checkpoints --to weights/depthlab"),
+         "mudg convert checkpoints --to weights/depthlab",
+         "mudg convert i3d_torchscript.pt --to weights/i3d --network i3d"),
         _convert,
     ),
     "adapt": Verb(

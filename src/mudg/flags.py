@@ -112,7 +112,8 @@ class Convert(Common):
 
     checkpoint: Annotated[Path, tyro.conf.Positional, arg(metavar="CKPT")]
     """Checkpoint file of MuDG, DynamiCrafter-512 or DynamiCrafter-1024 (.ckpt, .pt or .safetensors); or, for DepthLab, the folder
-    that contains DepthLab's files, Marigold's folder and the image encoder's folder."""
+    that contains DepthLab's files, Marigold's folder and the image encoder's folder; or, with --network, weights of a
+    network of the scores."""
     to: Annotated[Path, arg(metavar="FOLDER")]
     """Model folder to write."""
     overwrite: FlagCreatePairsOff[bool] = False
