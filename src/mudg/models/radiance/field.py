@@ -96,8 +96,8 @@ class RadianceField(nn.Module):
         self.shadow = _Mlp((width, width, 1), draw)
         self.sky = _Mlp((context, width, width, 3), draw)
         self.appearance = nn.Parameter(0.01 * torch.randn(len(self.cameras), sizes.appearance, generator=draw))
-        self.register_buffer("center", torch.tensor(extent.center), persistent=False)
-        self.register_buffer("half", torch.tensor(extent.half), persistent=False)
+        self.register_buffer("box_center", torch.tensor(extent.center), persistent=False)
+        self.register_buffer("box_half", torch.tensor(extent.half), persistent=False)
 
     @property
     def device(self) -> torch.device:
@@ -106,7 +106,7 @@ class RadianceField(nn.Module):
 
     def unit(self, xyz: Tensor) -> Tensor:
         """World places ``[N, 3]`` in the unit cube."""
-        return contract(xyz, self.center, self.half)  # type: ignore[arg-type]
+        return contract(xyz, self.box_center, self.box_half)  # type: ignore[arg-type]
 
     def proposed_density(self, level: int, xyz: Tensor) -> Tensor:
         """Density ``[N]`` that a proposal network states. Each level asks its own network."""

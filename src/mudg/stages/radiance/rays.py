@@ -90,7 +90,7 @@ def view_rays(view: View, extent: Extent, camera: int, stride: int = 1) -> tuple
     """A ray for every (``stride``-th) pixel, row by row, and the camera depth of each ray's unit length ``[R]``."""
     x, y = (torch.from_numpy(values[::stride].astype(np.float32)) for values in geometry.pixel_rays(view.camera))
     plane = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x)), torch.ones(len(y), len(x))], -1).reshape(-1, 3)
-    return _rays(plane, torch.from_numpy(view.world_from_cam).float().expand(len(plane), 4, 4),
+    return _rays(plane, torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4),
                  torch.full((len(plane), 1), extent.normalised(view.time_s)),
                  torch.full((len(plane),), camera, dtype=torch.int64)), 1 / plane.norm(dim=1)  # fmt: skip
 
