@@ -12,10 +12,17 @@ from mudg.base import seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.core.hash_grid import HashGrid, encode, torch_encode
 
-GRIDS = [HashGrid(3, 3, 2, 2, 20, 8), HashGrid(4, 3, 4, 2, 9, 9), HashGrid(3, 2, 1, 3, 5, 12), HashGrid(4, 2, 8, 1, 6, 8)]
+GRIDS = [
+    HashGrid(3, 3, 2, 2, 20, 8),
+    HashGrid(4, 3, 4, 2, 9, 9),
+    HashGrid(3, 2, 1, 3, 5, 12),
+    HashGrid(4, 2, 8, 1, 6, 8),
+]
 
 
-def drawn(grid: HashGrid, count: int, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def drawn(
+    grid: HashGrid, count: int, dtype: torch.dtype = torch.float32
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     generator = seeds.torch_generator(3, count, "hash grid")
     points = torch.rand(count, grid.dimensions, generator=generator, dtype=torch.float64)
     table = torch.randn(grid.table_shape, generator=generator, dtype=torch.float64)
@@ -35,7 +42,9 @@ def test_levels_hold_all_corners_until_they_are_too_many():
 
 def test_a_linear_function_on_the_corners_is_met_exactly_between_them():
     grid = HashGrid(3, 1, 1, 4, 4, 10)
-    corners = torch.tensor(list(itertools.product(range(5), repeat=3)), dtype=torch.float32).flip(1)  # the first axis fastest
+    corners = torch.tensor(list(itertools.product(range(5), repeat=3)), dtype=torch.float32).flip(
+        1
+    )  # the first axis fastest
     table = (corners @ torch.tensor([1.0, -2.0, 0.5]))[:, None]
     points, _, _ = drawn(grid, 50)
     wanted = 4 * points @ torch.tensor([1.0, -2.0, 0.5])
@@ -46,7 +55,9 @@ def test_a_linear_function_on_the_corners_is_met_exactly_between_them():
 def test_finite_differences_of_the_twin():
     for grid in (HashGrid(3, 2, 2, 1, 3, 4), HashGrid(4, 1, 1, 2, 2, 5)):
         points, table, _ = drawn(grid, 3, torch.float64)
-        assert torch.autograd.gradcheck(lambda p, t, g=grid: torch_encode(p, t, g), (points, table), eps=1e-7, atol=1e-5)
+        assert torch.autograd.gradcheck(
+            lambda p, t, g=grid: torch_encode(p, t, g), (points, table), eps=1e-7, atol=1e-5
+        )
 
 
 @pytest.mark.skipif(native.library() is None, reason="no native library")

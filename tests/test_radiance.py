@@ -22,7 +22,7 @@ from mudg.models.radiance import field as fields
 from mudg.models.radiance import march as marching
 from mudg.models.radiance import sampling
 from mudg.models.radiance.field import Extent, FieldSizes, RadianceField, aggregated
-from mudg.models.radiance.march import Budget, Draws, Rays
+from mudg.models.radiance.march import Budget, RayDraws, Rays
 from mudg.stages import fit, render, synthesize
 from mudg.stages.config import FitConfig, RenderConfig, SynthesizeConfig
 from mudg.stages.config.radiance import PUBLISHED_EMERNERF
@@ -156,7 +156,7 @@ def test_color_loss_reaches_every_field_and_proposals_learn_only_when_asked():
     field = tiny_field()
     rays, _ = view_rays(view_at(0.3, _camera(6, 4)), field.extent, 0)
     budget = Budget((16, 12), 8, 0.1, 1000.0)
-    draws = Draws.of(len(rays), budget, seeds.torch_generator(0, 1, "draws"), torch.device("cpu"))
+    draws = RayDraws.of(len(rays), budget, seeds.torch_generator(0, 1, "draws"), torch.device("cpu"))
     marched = marching.march(field, rays, budget, draws)
     marching.colors(field, rays, marched)[0].square().mean().backward()
     reached = {name for name, value in field.named_parameters() if value.grad is not None and value.grad.abs().sum() > 0}

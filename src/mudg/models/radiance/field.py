@@ -83,7 +83,9 @@ class RadianceField(nn.Module):
         facts: method, scene and so on, kept on disk.
     """
 
-    def __init__(self, sizes: FieldSizes, extent: Extent, cameras: Sequence[str], facts: Mapping[str, Any], seed: int = 0) -> None:
+    def __init__(
+        self, sizes: FieldSizes, extent: Extent, cameras: Sequence[str], facts: Mapping[str, Any], seed: int = 0
+    ) -> None:
         super().__init__()
         self.sizes, self.extent, self.cameras, self.facts = sizes, extent, tuple(cameras), dict(facts)
         draw, width = seeds.torch_generator(seed, 0, "radiance field"), sizes.width
@@ -146,7 +148,12 @@ class RadianceField(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """Everything but the parameters, as JSON values."""
-        return {"sizes": asdict(self.sizes), "extent": asdict(self.extent), "cameras": list(self.cameras), "facts": self.facts}
+        return {
+            "sizes": asdict(self.sizes),
+            "extent": asdict(self.extent),
+            "cameras": list(self.cameras),
+            "facts": self.facts,
+        }
 
     @classmethod
     def from_state(cls, values: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> RadianceField:
@@ -155,14 +162,21 @@ class RadianceField(nn.Module):
         Raises:
             InputError: tensors are missing, left over or of another shape.
         """
-        sizes = {k: v if isinstance(v, int) else tuple(tuple(r) if isinstance(r, list) else r for r in v) for k, v in values["sizes"].items()}
+        sizes = {
+            k: v if isinstance(v, int) else tuple(tuple(r) if isinstance(r, list) else r for r in v)
+            for k, v in values["sizes"].items()
+        }
         extent = {k: tuple(v) if isinstance(v, list) else v for k, v in values["extent"].items()}
         field = cls(FieldSizes(**sizes), Extent(**extent), values["cameras"], values["facts"])
         wanted = {name: tuple(tensor.shape) for name, tensor in field.state_dict().items()}
         given = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
         if wanted != given:
             odd = sorted(name for name in wanted.keys() | given.keys() if wanted.get(name) != given.get(name))
-            raise InputError("the parameters do not fit the radiance field", got=", ".join(odd[:4]), expected=f"{len(wanted)} tensors")
+            raise InputError(
+                "the parameters do not fit the radiance field",
+                got=", ".join(odd[:4]),
+                expected=f"{len(wanted)} tensors",
+            )
         field.load_state_dict(dict(tensors))
         return field
 
@@ -210,7 +224,9 @@ class _Mlp(nn.Module):
 class _GridNet(nn.Module):
     """A hash grid and the network that reads it."""
 
-    def __init__(self, dimensions: int, grid: tuple[int, int, int, int, int], layers: Sequence[int], draw: torch.Generator) -> None:
+    def __init__(
+        self, dimensions: int, grid: tuple[int, int, int, int, int], layers: Sequence[int], draw: torch.Generator
+    ) -> None:
         super().__init__()
         self.grid = HashGrid(dimensions, *grid)
         self.table = nn.Parameter(TABLE_START * (2 * torch.rand(self.grid.table_shape, generator=draw) - 1))

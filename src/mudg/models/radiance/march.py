@@ -37,7 +37,9 @@ class Rays:
 
     def to(self, device: torch.device) -> Rays:
         """The same rays on a device."""
-        return Rays(*(t.to(device, non_blocking=True) for t in (self.origins, self.directions, self.times, self.cameras)))
+        return Rays(
+            *(t.to(device, non_blocking=True) for t in (self.origins, self.directions, self.times, self.cameras))
+        )
 
     def part(self, begin: int, end: int) -> Rays:
         """Some of them."""
@@ -55,7 +57,7 @@ class Budget:
 
 
 @dataclass(frozen=True, eq=False)
-class Draws:
+class RayDraws:
     """Random numbers of a training batch, uniform in [0, 1): per ray and round ``[R, rounds + 1]``; of the flow, per sample ``[R * n, 1]``;
     samples of the cycle loss i64[K]."""
 
@@ -64,7 +66,7 @@ class Draws:
     cycle: Tensor
 
     @classmethod
-    def of(cls, rays: int, budget: Budget, generator: torch.Generator, device: torch.device) -> Draws:
+    def of(cls, rays: int, budget: Budget, generator: torch.Generator, device: torch.device) -> RayDraws:
         """Drawn on the CPU, so that every device gets the same."""
         count = rays * budget.samples
         jitter = torch.rand(rays, len(budget.proposals) + 1, generator=generator)
@@ -108,7 +110,9 @@ class Marched:
         return self.weights * (moving / (moving + still).clamp_min(TINY)).view_as(self.weights)
 
 
-def march(field: RadianceField, rays: Rays, budget: Budget, draws: Draws | None = None, learn_proposals: bool = False) -> Marched:
+def march(
+    field: RadianceField, rays: Rays, budget: Budget, draws: RayDraws | None = None, learn_proposals: bool = False
+) -> Marched:
     """Samples along rays, first where the proposal networks point, and the fields there.
 
     Args:
@@ -167,7 +171,12 @@ class Weights:
 
 
 def pixel_terms(
-    field: RadianceField, rays: Rays, marched: Marched, draws: Draws, truth: tuple[Tensor, Tensor, Tensor | None], weights: Weights
+    field: RadianceField,
+    rays: Rays,
+    marched: Marched,
+    draws: RayDraws,
+    truth: tuple[Tensor, Tensor, Tensor | None],
+    weights: Weights,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Weighted loss terms of a batch of pixels, and the colour error of every ray ``[R]``.
 
@@ -177,7 +186,11 @@ def pixel_terms(
     wanted, counts, sky = truth
     rgb, shadow = colors(field, rays, marched)
     error = (rgb - wanted).square().mean(1) * counts
-    terms = {"color": error.mean(), "shadow": weights.shadow * shadow.square().mean(), **_of_motion(field, marched, draws, weights)}
+    terms = {
+        "color": error.mean(),
+        "shadow": weights.shadow * shadow.square().mean(),
+        **_of_motion(field, marched, draws, weights),
+    }
     if sky is not None and weights.sky:
         opacity = marched.opacity.clamp(1e-4, 1 - 1e-4)
         entropy = -torch.where(sky, torch.log1p(-opacity), opacity.log())
@@ -186,7 +199,7 @@ def pixel_terms(
 
 
 def lidar_terms(
-    field: RadianceField, marched: Marched, draws: Draws, range_m: Tensor, weights: Weights, sight_m: float
+    field: RadianceField, marched: Marched, draws: RayDraws, range_m: Tensor, weights: Weights, sight_m: float
 ) -> dict[str, Tensor]:
     """Weighted loss terms of a batch of LiDAR rays that end at ``range_m`` f32[R].
 
@@ -204,7 +217,7 @@ def lidar_terms(
 def line_of_sight(weights: Tensor, middles_m: Tensor, range_m: Tensor, sight_m: float) -> Tensor:
     """How far weights are from a narrow bell at the measured range, and from 0 before it: sums along rays, mean of rays.
 
-    Near the surface (within ``sight_m``) the square of ``w - N(t - z; sight_m / 3)``, with N the normal density per metre; before it ``w^2``.
+    Near the surface (within ``sight_m``) the square of ``w - N(t - z; sight_m / 3)``, N the normal density per metre; before it ``w^2``.
     """
     off = middles_m - range_m[:, None]
     scale = sight_m / 3
@@ -213,12 +226,14 @@ def line_of_sight(weights: Tensor, middles_m: Tensor, range_m: Tensor, sight_m: 
     return loss.sum(1).mean()
 
 
-def _of_motion(field: RadianceField, marched: Marched, draws: Draws, weights: Weights) -> dict[str, Tensor]:
+def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, weights: Weights) -> dict[str, Tensor]:
     """What every batch has: little may move, and flow there and back ends where it began."""
     values, chosen = marched.values, draws.cycle
     terms: dict[str, Any] = {"dynamic": weights.dynamic * values.dynamic_density.mean()}
     if weights.cycle:
-        terms["cycle"] = weights.cycle * field.cycle_loss(marched.xyz[chosen], marched.times[chosen], values.flow[chosen])
+        terms["cycle"] = weights.cycle * field.cycle_loss(
+            marched.xyz[chosen], marched.times[chosen], values.flow[chosen]
+        )
     return terms
 
 

@@ -70,7 +70,7 @@ def resampled_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor, 
 def blurred_mass(edges: Tensor, weights: Tensor, wanted: Tensor, radius: float) -> Tensor:
     """Mass of a histogram, blurred by a box of half width ``radius``, in the intervals of other edges (zip-NeRF, section 4).
 
-    The blurred histogram is linear between the edges moved by +- radius; its integral is read off at the wanted edges. Radius 0: not blurred.
+    The blurred histogram is linear between the edges moved by +- radius; its integral is read off at the wanted edges.
 
     Args:
         edges: ``[R, n + 1]``. weights: ``[R, n]``. wanted: ``[R, m + 1]``.

@@ -27,8 +27,8 @@ from mudg.base.types import Scene
 from mudg.models.radiance.field import FieldSizes, RadianceField
 from mudg.models.radiance.march import (
     Budget,
-    Draws,
     Marched,
+    RayDraws,
     Rays,
     Weights,
     lidar_terms,
@@ -129,7 +129,9 @@ def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
                 folder.log(step=step, seconds=round(state.seconds, 3), **state.last)
                 bar.update(f"psnr {state.last['psnr']:.1f}")
             if step % config.preview_every == 0 and step < config.iterations:
-                write_preview(state.field, state.shown, budget_of(config.radiance), folder.path / "preview" / f"{step:06d}.png")
+                write_preview(
+                    state.field, state.shown, budget_of(config.radiance), folder.path / "preview" / f"{step:06d}.png"
+                )
             if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
                 with pace.saving():
                     save_checkpoint(state, folder)
@@ -152,7 +154,9 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     batch = state.pixels.batch(settings.rays, settings.error_share, generator)
     marched, draws, rays = _marched(field, batch.rays, budget, generator, learns)
     sky = None if batch.sky is None else batch.sky.to(device)
-    terms, error = pixel_terms(field, rays, marched, draws, (batch.rgb.to(device), batch.counts.to(device), sky), weights)
+    terms, error = pixel_terms(
+        field, rays, marched, draws, (batch.rgb.to(device), batch.counts.to(device), sky), weights
+    )
     _learn(state, terms, marched, learns, f"step {step}, pixels")
     state.pixels.note(batch.cells, error)
     if state.lidar is None:
@@ -167,10 +171,12 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
 
 
-def _marched(field: RadianceField, rays: Rays, budget: Budget, generator: torch.Generator, learns: bool) -> tuple[Marched, Draws, Rays]:
+def _marched(
+    field: RadianceField, rays: Rays, budget: Budget, generator: torch.Generator, learns: bool
+) -> tuple[Marched, RayDraws, Rays]:
     """A training batch on the device: marched, with what was drawn for it. The one way there."""
     there = rays.to(field.device)
-    draws = Draws.of(len(rays), budget, generator, field.device)
+    draws = RayDraws.of(len(rays), budget, generator, field.device)
     return march(field, there, budget, draws, learns), draws, there
 
 
@@ -228,7 +234,9 @@ def _optimisers(field: RadianceField, settings: RadianceConfig) -> tuple[torch.o
     own = {id(value) for value in proposals}
     fused = field.device.type in ("cpu", "cuda")
     first, second = (
-        torch.optim.Adam(given, settings.rate, BETAS, EPSILON, settings.weight_decay, fused=fused, foreach=None if fused else False)
+        torch.optim.Adam(
+            given, settings.rate, BETAS, EPSILON, settings.weight_decay, fused=fused, foreach=None if fused else False
+        )
         for given in ([value for value in field.parameters() if id(value) not in own], proposals)
     )
     return first, second
@@ -249,7 +257,9 @@ def save_checkpoint(state: RadianceState, folder: RunDir) -> None:
         "field": {name: value.cpu() for name, value in state.field.state_dict().items()},
         "moments": _moments(state), "errors": {"errors": state.pixels.errors},
     }  # fmt: skip
-    checkpoint.save(folder.path / "steps", state.step, groups, {"seconds": state.seconds, "last": dict(state.last or {})})
+    checkpoint.save(
+        folder.path / "steps", state.step, groups, {"seconds": state.seconds, "last": dict(state.last or {})}
+    )
 
 
 def _restore(state: RadianceState, found: checkpoint.Checkpoint) -> None:
@@ -258,7 +268,11 @@ def _restore(state: RadianceState, found: checkpoint.Checkpoint) -> None:
     for name, value in state.field.named_parameters():
         for optimiser in state.optimisers:
             if any(value is one for group in optimiser.param_groups for one in group["params"]):
-                kept = {kind: moments[f"{kind}.{name}"] for kind in ("step", "exp_avg", "exp_avg_sq") if f"{kind}.{name}" in moments}
+                kept = {
+                    kind: moments[f"{kind}.{name}"]
+                    for kind in ("step", "exp_avg", "exp_avg_sq")
+                    if f"{kind}.{name}" in moments
+                }
                 if kept:
                     optimiser.state[value] = {kind: tensor.to(value.device) for kind, tensor in kept.items()}
     state.pixels.errors = found.tensors("errors")["errors"]

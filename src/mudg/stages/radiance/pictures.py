@@ -41,7 +41,9 @@ def see(field: RadianceField, view: View, budget: Budget, stride: int = 1) -> Se
     """March all pixels of a view, or every ``stride``-th."""
     name = view.camera.name
     rays, z_per_m = view_rays(view, field.extent, field.cameras.index(name) if name in field.cameras else 0, stride)
-    parts = [_part(field, rays.part(begin, begin + RAYS_AT_ONCE), budget) for begin in range(0, len(rays), RAYS_AT_ONCE)]
+    parts = [
+        _part(field, rays.part(begin, begin + RAYS_AT_ONCE), budget) for begin in range(0, len(rays), RAYS_AT_ONCE)
+    ]
     width = -(-view.camera.width // stride)
     every = torch.cat(parts).view(-1, width, 9).permute(2, 0, 1)
     return Seen(every[:3], every[3] * z_per_m.view(-1, width), every[4], every[5], every[6:9])
@@ -56,14 +58,18 @@ def _part(field: RadianceField, rays: Rays, budget: Budget) -> Tensor:
     return torch.cat([colors(field, rays, marched)[0], rest, flow], 1).cpu()
 
 
-def observe(field: RadianceField, view: View, budget: Budget, sky_below_alpha: float = 0.5, source: str = "") -> Observation:
+def observe(
+    field: RadianceField, view: View, budget: Budget, sky_below_alpha: float = 0.5, source: str = ""
+) -> Observation:
     """One view as an observation of kind "virtual", without classes; where opacity is below ``sky_below_alpha`` there is no depth."""
     seen = see(field, view, budget)
     covered = seen.opacity[None] >= sky_below_alpha
     opacity = seen.opacity[None].clamp(0, 1)
     depth = torch.where(covered, seen.depth[None], torch.nan)
     mask = torch.ones_like(covered)
-    return Observation(view, seen.rgb.clamp(0, 1), depth, None, torch.where(covered, opacity, 1 - opacity), mask, "virtual", source)
+    return Observation(
+        view, seen.rgb.clamp(0, 1), depth, None, torch.where(covered, opacity, 1 - opacity), mask, "virtual", source
+    )
 
 
 def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path: Path, whole: bool = False) -> None:
@@ -72,7 +78,13 @@ def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path
     stride = 1 if whole else max(1, round((pixels / PREVIEW_RAYS) ** 0.5))
     seen = see(field, stored.view, budget, stride)
     depth = np.where(seen.opacity >= 0.5, seen.depth, np.nan)
-    panels = [stored.rgb[::stride, ::stride], to_bytes(seen.rgb), depth_colors(depth), gray(seen.moving.numpy()), flow_colors(seen.flow.numpy())]
+    panels = [
+        stored.rgb[::stride, ::stride],
+        to_bytes(seen.rgb),
+        depth_colors(depth),
+        gray(seen.moving.numpy()),
+        flow_colors(seen.flow.numpy()),
+    ]
     store.write_image(path, side_by_side(panels))
 
 

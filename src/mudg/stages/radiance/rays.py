@@ -55,7 +55,9 @@ def lidar_rays(scene: Scene) -> LidarRays | None:
         world = geometry.transform_points(sweep.world_from_lidar, points.xyz[kept]).astype(np.float64)
         time_s = sweep.time_s + points.dt_s[kept].astype(np.float64)
         path, keys = scene.ego.world_from_ego[:, :3, 3], scene.ego.times_s
-        moved = [np.interp(time_s, keys, path[:, axis]) - np.interp(sweep.time_s, keys, path[:, axis]) for axis in range(3)]
+        moved = [
+            np.interp(time_s, keys, path[:, axis]) - np.interp(sweep.time_s, keys, path[:, axis]) for axis in range(3)
+        ]
         origins = sweep.world_from_lidar[:3, 3] + np.stack(moved, -1)
         along = world - origins
         far = np.linalg.norm(along, axis=1)
@@ -73,7 +75,9 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
     if lidar is None:
         places = np.stack([frame.view.center_world for frame in scene.frames])
         low, high = places.min(0) - AROUND_CAMERAS_M, places.max(0) + AROUND_CAMERAS_M
-        log.warn(f"no LiDAR: the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras, and nothing measures distance")
+        log.warn(
+            f"no LiDAR: the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras, and nothing measures distance"
+        )
     else:
         points = (lidar.origins + lidar.range_m[:, None] * lidar.directions).numpy()
         low, high = np.percentile(points, BOX_PERCENTILES, axis=0)
@@ -89,7 +93,9 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
 def view_rays(view: View, extent: Extent, camera: int, stride: int = 1) -> tuple[Rays, Tensor]:
     """A ray for every (``stride``-th) pixel, row by row, and the camera depth of each ray's unit length ``[R]``."""
     x, y = (torch.from_numpy(values[::stride].astype(np.float32)) for values in geometry.pixel_rays(view.camera))
-    plane = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x)), torch.ones(len(y), len(x))], -1).reshape(-1, 3)
+    plane = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x)), torch.ones(len(y), len(x))], -1).reshape(
+        -1, 3
+    )
     return _rays(plane, torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4),
                  torch.full((len(plane), 1), extent.normalised(view.time_s)),
                  torch.full((len(plane),), camera, dtype=torch.int64)), 1 / plane.norm(dim=1)  # fmt: skip
@@ -132,7 +138,9 @@ class Pixels:
         self._counts = torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks]))
         skies = [view.sky for view in views]
         known = all(sky is not None for sky in skies)
-        self._sky = torch.from_numpy(np.concatenate([np.asarray(sky, bool).reshape(-1) for sky in skies])) if known else None
+        self._sky = (
+            torch.from_numpy(np.concatenate([np.asarray(sky, bool).reshape(-1) for sky in skies])) if known else None
+        )
         self._poses = torch.from_numpy(np.stack([view.view.world_from_cam for view in views])).float()
         lenses = [view.view.camera.intrinsics for view in views]
         self._lenses = torch.tensor(lenses, dtype=torch.float32)
@@ -180,7 +188,9 @@ class Pixels:
         self.errors[cells] = ERROR_KEPT * self.errors[cells] + (1 - ERROR_KEPT) * error.cpu().sqrt()
 
 
-def recorded_pixels(scene: Scene, frames: Sequence[Frame], width_px: int, cameras: Sequence[str], extent: Extent) -> tuple[Pixels, StoredView]:
+def recorded_pixels(
+    scene: Scene, frames: Sequence[Frame], width_px: int, cameras: Sequence[str], extent: Extent
+) -> tuple[Pixels, StoredView]:
     """The pixels of these frames, and the middle view."""
     places = dict(load_recorded(scene, frames, (), width_px, False))
     views = [places[index] for index in range(len(frames))]

@@ -14,8 +14,12 @@ from mudg.stages.fitting.storage import RADIANCE, kind_of
 
 def save_field(field: RadianceField, budget: Budget, folder: Path) -> None:
     """Field and sampling, without optimiser moments."""
-    store.write_json(folder / "model.json", {"schema": 1, "kind": RADIANCE, **field.description(), "budget": asdict(budget)})
-    store.write_safetensors(folder / "field.safetensors", {name: value.cpu() for name, value in field.state_dict().items()})
+    store.write_json(
+        folder / "model.json", {"schema": 1, "kind": RADIANCE, **field.description(), "budget": asdict(budget)}
+    )
+    store.write_safetensors(
+        folder / "field.safetensors", {name: value.cpu() for name, value in field.state_dict().items()}
+    )
 
 
 def load_field(folder: Path) -> tuple[RadianceField, Budget]:
@@ -26,7 +30,9 @@ def load_field(folder: Path) -> tuple[RadianceField, Budget]:
     """
     folder = Path(folder)
     if kind_of(folder) != RADIANCE:
-        raise InputError("this folder holds no radiance field", where=str(folder), expected="made by `mudg fit --method emernerf`")
+        raise InputError(
+            "this folder holds no radiance field", where=str(folder), expected="made by `mudg fit --method emernerf`"
+        )
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
     values = store.read_json(folder / "model.json")
