@@ -237,27 +237,35 @@ def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
     assert not (tmp_path / "fit" / "steps").exists()
 
 
-def test_a_short_fit_lowers_its_losses(world):
-    lines = []
-
+def started(world: Path, device: torch.device | str = "cpu", **changes: object) -> tuple[loop.RadianceState, FitConfig]:
     class Folder:
         path = world / "none"
 
-    config = fit_config(**TINY | {"iterations": 60, "radiance__rays": 128})
-    state = loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device("cpu"))  # type: ignore[arg-type]
-    for step in range(1, 61):
-        lines.append({name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()})
-    early, late = lines[:8], lines[-8:]
+    config = fit_config(**TINY | changes)
+    return loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device(device)), config  # type: ignore[arg-type]
+
+
+def test_a_short_fit_lowers_its_losses(world):
+    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128, radiance__samples=16)
+    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 81)]
     for name in ("color", "lidar"):
-        assert sum(line[name] for line in late) < 0.8 * sum(line[name] for line in early), name
+        assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
+
+
+def test_a_step_on_another_device_is_the_same(world):
+    from pretend_device import pretend_device
+
+    with pretend_device() as there:
+        state, config = started(world, there)
+        elsewhere = [{name: float(value.detach().cpu()) for name, value in loop.take_step(state, config, step).items()} for step in (1, 2)]
+    state, config = started(world)
+    for step, found in zip((1, 2), elsewhere):
+        for name, value in loop.take_step(state, config, step).items():
+            assert found[name] == pytest.approx(float(value.detach()), rel=1e-3, abs=1e-6), name
 
 
 def test_what_is_not_finite_never_reaches_the_parameters(world):
-    class Folder:
-        path = world / "none"
-
-    config = fit_config(**TINY)
-    state = loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device("cpu"))  # type: ignore[arg-type]
+    state, config = started(world)
     state.pixels._rgb = torch.full_like(state.pixels._rgb, 7).float() * torch.nan
     before = {name: value.clone() for name, value in state.field.state_dict().items()}
     with pytest.raises(NumericsError, match="color"):
@@ -334,12 +342,7 @@ def test_pixels_and_lidar_are_rays_of_the_world(world):
 
 
 def test_a_batch_of_pixels_shows_what_the_rays_meet(world):
-    config = fit_config(**TINY)
-
-    class Folder:
-        path = world / "none"
-
-    state = loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device("cpu"))  # type: ignore[arg-type]
+    state, _ = started(world)
     batch = state.pixels.batch(40, 0.25, seeds.torch_generator(0, 1, "batch"))
     assert batch.rgb.shape == (40, 3) and batch.sky.dtype == torch.bool
     assert not (batch.sky & (batch.rays.directions[:, 2] < -0.05)).any()  # no sky below the horizon
