@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
+from pretend_device import pretend_device
 from toy_world import fused_cloud, view_at, write_scene
 
 from mudg.base import config as configuration
@@ -253,8 +254,6 @@ def test_a_short_fit_lowers_its_losses(world):
 
 
 def test_a_step_on_another_device_is_the_same(world):
-    from pretend_device import pretend_device
-
     with pretend_device() as there:
         state, config = started(world, there)
         elsewhere = [{name: float(value.detach().cpu()) for name, value in loop.take_step(state, config, step).items()} for step in (1, 2)]
@@ -362,8 +361,6 @@ def test_flow_pictures_are_black_at_rest():
 
 
 def test_rays_move_to_a_device_and_back(world):
-    from pretend_device import pretend_device
-
     with pretend_device() as there:
         field = tiny_field().to(there)
         rays, _ = view_rays(view_at(0.0, _camera(3, 2)), field.extent, 0)
