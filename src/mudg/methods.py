@@ -36,5 +36,6 @@ METHODS: Final[dict[str, Method]] = {
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
     "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance"),
     "mudg_r": Method("Diffusion output", "synthesize"),
+    "freevs": Method("FreeVS condition, our network", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }
