@@ -155,8 +155,8 @@ class Fit(Output):
 
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory written by ingest or annotate."""
-    fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Point clouds written by fuse."""
+    fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Point clouds written by fuse; required by every method but emernerf."""
     observations: Annotated[tuple[Path, ...], arg(metavar="FOLDER")] = ()
     """Virtual views written by synthesize, in one folder or several; required by method mudg_s."""
     start_from: Annotated[Path | None, arg(metavar="FOLDER")] = None
