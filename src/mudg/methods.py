@@ -32,6 +32,7 @@ _STREET: Final = ("color", "semantics", "lidar", "sky")
 METHODS: Final[dict[str, Method]] = {
     "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics")),
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
+    "pvg": Method("PVG, our sky model", "render", ("static", "sky"), _STREET),
     "mudg_r": Method("Diffusion output", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }
