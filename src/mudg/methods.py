@@ -33,6 +33,9 @@ METHODS: Final[dict[str, Method]] = {
     "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics")),
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
     "pvg": Method("PVG, our sky model", "render", ("static", "sky"), _STREET),
+    "s3gaussian": Method("S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar")),
+    "bezier": Method("BezierGS", "render", ("static", "objects", "sky"), _STREET),
+    "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET),
     "mudg_r": Method("Diffusion output", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }

@@ -143,6 +143,12 @@ def dense_depth_map(depth_m: Tensor, target_m: Tensor, delta: float = 0.1) -> Te
     return F.huber_loss(difference, torch.zeros_like(difference), reduction="none", delta=delta) / delta
 
 
+def sparse_squared_depth(depth_m: Tensor, pixel: Tensor, target_m: Tensor, span_m: float) -> Tensor:
+    """Mean squared difference of depths over ``span_m``, over sparse LiDAR pixels that are at most that far (S3Gaussian)."""
+    near = (target_m > 0.01) & (target_m < span_m)
+    return weighted_mean(((depth_m.reshape(-1)[pixel] - target_m) / span_m).square(), near)
+
+
 def inverse_depth(depth_m: Tensor, alpha: Tensor, sky_m: float) -> Tensor:
     """Inverse depth of a pixel that is partly sky, in 1/m: ``alpha / depth + (1 - alpha) / sky_m`` (Periodic Vibration Gaussians).
 

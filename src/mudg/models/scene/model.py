@@ -34,12 +34,17 @@ from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
 from mudg.core import native_ops
 from mudg.core.table import Table
+from mudg.models.scene.bezier import BezierNode
+from mudg.models.scene.deformed import DeformationField, DeformedNode
+from mudg.models.scene.hexplane import HexPlaneNode
 from mudg.models.scene.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
 from mudg.models.scene.vibration import VibrationNode
 
 NODES: Final[dict[str, Any]] = {
     "static": StaticNode, "rigid": RigidNode, "deformable": DeformableNode, "sky": SkyNode, "vibration": VibrationNode,
+    "deformed": DeformedNode, "deformation": DeformationField, "hexplane": HexPlaneNode,
+    "bezier": BezierNode,
 }  # fmt: skip
 COLUMNS: Final = frozenset({"means", "quats", "log_scales", "logits", "sh_dc", "sh_rest", "semantics"})
 """Columns that every scene may have; others belong to a kind of node (``NodeRows.own``)."""
@@ -71,6 +76,9 @@ class SceneModel:
     facts: dict[str, Any] = field(default_factory=dict)
     colors: CameraColors = SAME_COLORS
     _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self.nodes = tuple(node.linked(self.nodes) for node in self.nodes)
 
     @property
     def device(self) -> torch.device:

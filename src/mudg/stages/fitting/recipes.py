@@ -5,10 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
+from mudg.stages.fitting.bezier import BezierRecipe
+from mudg.stages.fitting.omnire import OmniRecipe
 from mudg.stages.fitting.pvg import VibrationRecipe
 from mudg.stages.fitting.recipe import Recipe
+from mudg.stages.fitting.s3gaussian import FieldRecipe
 
-RECIPES: Final[Mapping[str, Recipe]] = {"pvg": VibrationRecipe()}
+RECIPES: Final[Mapping[str, Recipe]] = {
+    "bezier": BezierRecipe(),
+    "omnire": OmniRecipe(),
+    "pvg": VibrationRecipe(),
+    "s3gaussian": FieldRecipe(),
+}
 COMMON: Final = Recipe()
 
 

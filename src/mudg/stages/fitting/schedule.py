@@ -14,7 +14,7 @@ from mudg.models.scene.mcmc import McmcSettings
 from mudg.stages.config import FitConfig
 
 PUBLISHED_STEPS = 30_000
-LAST_DENSIFIED = {"pvg": 0.5}
+LAST_DENSIFIED = {"pvg": 0.5, "omnire": 0.5, "s3gaussian": 0.5}
 """Share of the run after which a method no longer densifies; 0.6 for all others."""
 LAST_POSE_ROUND = 0.85
 
@@ -38,6 +38,12 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "semantics": 1e-2 * boost,
         "panorama": 1e-2 * gentle,
         "deform": 1e-3 * boost * gentle,
+        "network": 1e-3 * gentle,
+        "embeddings": 1e-3 * gentle,
+        "planes": 1.6e-4 * 10.0 * boost * 0.1**along,
+        "plane_network": 1.6e-5 * 10.0 * boost * 0.1**along,
+        "curve": 1.6e-3 * 10.0 * boost * decay,
+        "trajectory": 1.6e-5 * 10.0 * boost * decay,
         "tau": 8e-4 * boost * decay,
         "log_beta": 2e-3 * boost,
         "velocity": 1e-3 * 10.0 * boost,
