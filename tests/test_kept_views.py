@@ -16,6 +16,7 @@ import pytest
 import torch
 from fit_settings import fit_config
 from pretend_device import pretend_device
+from scipy.spatial import cKDTree
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import store
@@ -372,6 +373,18 @@ def test_points_of_unseen_surfaces_are_bounded(world, monkeypatch):
     assert share == same_share == 1.0
     assert whole // 6 - 30 <= sum(held) <= whole // 3
     assert 0 < len(fewer["means"]) <= len(every["means"])
+
+
+def test_few_points_of_unseen_surfaces_still_cover_them():
+    """10,000 points on a square of 10 m: 100 of them are spread over all of it and are as large as their distance."""
+    grid = np.stack(np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 10, 0.1), [0.0]), -1).reshape(-1, 3).astype(np.float32)
+    points = StartPoints(grid, np.zeros((len(grid), 3), np.uint8), np.zeros(len(grid), np.uint8), np.full(len(grid), 0.05, np.float32))
+    few = trust._spread(points, 100, np.random.default_rng(0))
+    all_of_them = trust._spread(points, len(grid), np.random.default_rng(0))
+    assert 40 <= len(few) <= 100
+    distance, nearest = cKDTree(few.xyz).query(grid)
+    assert distance.max() < 2.5 and np.median(distance / few.scale_m[nearest]) < 1.5
+    assert np.array_equal(all_of_them.xyz, grid) and np.allclose(all_of_them.scale_m, 0.05)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the peak of resident memory as Linux gives it")

@@ -11,6 +11,7 @@ from test_mdm import TINY, randomised, some_condition, some_ids
 from toy_clips import made_up_clip, with_patch
 
 from mudg import native
+from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Camera, FusedCloud, Photo, PointCloud
@@ -86,6 +87,63 @@ def test_what_the_render_hardly_covers_is_far_away(alpha, depth, expected):
     made = build_conditions(NOTHING, [], [view_at()], [], RULES, render_at=lambda view: flat_render(view, depth, alpha))[0]
     assert not bool(made.valid.any())
     assert bool((made.depth == (RULES.far_m if expected == "far" else expected)).all())
+
+
+@pytest.mark.parametrize(("recorded", "above"), [(None, "far"), ("sky", "far"), ("building", "wall"), ("unlabelled", "far")])
+def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
+    """A wall measured on a band of rows only; the render covers nothing. Below the horizon the wall goes on, above it there is sky,
+    unless the recorded image shows a surface in that direction."""
+    points = wall(12.0, stripes, z_range=(-3, -2))
+    points = replace(points, semantics=np.full(len(points), 2, np.uint8))
+    view = view_at()
+    photos = []
+    if recorded is not None:
+        name = np.uint8(palette.UNLABELLED if recorded == "unlabelled" else palette.ID[recorded])
+        photos = [Photo(view, np.zeros((32, 48, 3), np.uint8), np.full((32, 48), name))]
+    empty = lambda view: flat_render(view, 1000.0, 0.1, (0.5, 0.7, 1.0), palette.ID["sky"])  # noqa: E731
+    rules = replace(RULES, warp=recorded is not None, hidden_share=-100.0)
+    made = build_conditions(FusedCloud(points, {}), [], [view], photos, rules, render_at=empty)[0]
+    depth, ids, shown = made.depth[0, 0], made.semantics[0, 0], made.renders
+    below, top = slice(20, None), slice(0, 12)
+    assert not bool(made.valid[0, 0][-4:].any())
+    assert bool((depth[below] < 12.01).all()) and bool((ids[below] == 2).all()) and bool((shown.semantics[0, 0][below] == 2).all())
+    assert not torch.allclose(shown.color[0][:, below], torch.tensor([0.5, 0.7, 1.0]).view(3, 1, 1), atol=0.1)
+    if above == "far":
+        assert bool((depth[top] == rules.far_m).all()) and torch.equal(shown.color[0][:, top], empty(view).color[:, top])
+    else:
+        assert bool((depth[top] < 12.01).all()) and bool((ids[top] == 2).all())
+
+
+def test_ground_that_no_image_shows_is_level():
+    """Road points from 8 m on, 1.6 m below the camera, rows as dense as pixels; nearer road is neither measured nor rendered: it goes
+    on at the same height, its truth. Of another class it keeps the depth of the nearest pixel."""
+    x, y = np.meshgrid(np.arange(8, 14, 0.04), np.arange(-10, 10, 0.04))
+    xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.6)], 1).astype(np.float32)
+    view = view_at()
+    falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
+    empty = lambda view: flat_render(view, 1000.0, 0.0, label=palette.ID["sky"])  # noqa: E731
+    for name in ("road", "building"):
+        cloud = PointCloud(xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID[name], np.uint8))
+        made = build_conditions(FusedCloud(cloud, {}), [], [view], [], RULES, render_at=empty)[0]
+        hole = ~made.valid[0, 0] & (falls > 0.25)
+        assert int(hole.sum()) > 100
+        depth = made.depth[0, 0][hole]
+        if name == "road":
+            assert float((depth * falls[hole] / 1.6 - 1).abs().max()) < 0.07  # half a row
+        else:
+            assert float(depth.min()) > 7.5
+
+
+def test_below_the_horizon_follows_the_camera():
+    level = clips.below_horizon(view_at(), 0.1)
+    rows = (torch.arange(32) + 0.5 - 16) / 40
+    expected = rows[:, None] > 0.1 * torch.hypot(torch.tensor(1.0), (torch.arange(48) + 0.5 - 24)[None] / 40)
+    assert torch.equal(level, expected)
+    upside_down = view_at()
+    turned = upside_down.world_from_cam.copy()
+    turned[:3, :2] *= -1
+    upside_down = replace(upside_down, world_from_cam=turned)
+    assert torch.equal(clips.below_horizon(upside_down, 0.1), expected.flip(0))
 
 
 def test_images_are_warped_by_rendered_depth():

@@ -21,7 +21,7 @@ Training clips are made of these in `from_city.py` and `from_log.py`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -72,7 +72,9 @@ class ConditionRules:
     measured_reach_px: int = 4
     """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where there is one."""
     solid_alpha: float = 0.5
-    """Coverage from which on a render has a surface; what it covers less is taken to be far away."""
+    """Coverage from which on a render has a surface; what it covers less is taken to be far away above the horizon."""
+    ground_slope: float = 0.05
+    """Rays that fall at least this much per metre ahead end on a surface, covered by the render or not."""
     published: bool = False
     """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
 
@@ -95,6 +97,9 @@ class ProjectedPoints:
 
 OVERLAP_GRID = 24, 16
 """Columns and rows of the places of a view by which it is told how much of it another image shows."""
+GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
+LEAST_FALL = 0.02
+"""Metres per metre of depth by which a ray must fall to be followed to the ground."""
 RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
 
@@ -108,17 +113,27 @@ class DrawnCloud:
     rules: ConditionRules
     render_at: RenderAt | None
 
-    def look(self, view: View) -> Surfaces:
-        """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured pixel."""
+    def look(self, view: View, far_ids: Tensor) -> Surfaces:
+        """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured pixel.
+
+        What the render does not cover is taken for sky, unless it lies below the horizon or `far_ids` u8[H,W], the classes of what
+        a recorded image shows in the same direction (255 = unknown), are something else: there a surface stands that no image
+        shows, and the nearest measured pixel stands for it, in the render too.
+        """
         sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
-        color, depth, moving, ids = _filled(sparse, self.rules)
+        nearest = _nearest_measured(sparse)
+        color, depth, moving, ids = _filled(sparse, nearest, self.rules)
         if self.render_at is None:
             return Surfaces(sparse.valid, color, depth, moving, ids, None)
         render = self.render_at(view)
         near = torch.from_numpy(ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1)))
         solid = render.alpha[0] >= self.rules.solid_alpha
+        surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
+        hidden = ~solid & (below_horizon(view, self.rules.ground_slope) | surface_seen) & bool(sparse.valid.any())
+        depth = torch.where(hidden, _levelled(view, depth, ids, nearest).clamp(max=self.rules.far_m), depth)
+        render = replace(render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics))
         shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(max=self.rules.far_m)
-        pick = lambda mine, theirs: torch.where(near, mine, theirs)  # noqa: E731
+        pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
         return Surfaces(
             sparse.valid, pick(color, render.color), pick(depth, shown), moving & near, pick(ids, render.semantics[0]), render
         )
@@ -159,6 +174,22 @@ def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tenso
     px, py, pz = (turned[i] * depth + m[i, 3] for i in range(3))
     safe = pz.clamp(min=0.1)
     return *geometry.pinhole(target.intrinsics, px, py, safe), pz
+
+
+def ray_directions(view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """World x, y and z, f32[H,W] each, of the pixels' rays, of length 1 along the camera's z."""
+    camera = view.camera
+    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
+    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
+    turn = torch.from_numpy(view.world_from_cam[:3, :3].astype(np.float32))
+    x, y, z = (turn[i, 0] * u[None, :] + turn[i, 1] * v[:, None] + turn[i, 2] for i in range(3))
+    return x, y, z
+
+
+def below_horizon(view: View, slope: float) -> Tensor:
+    """Which pixels' rays fall by more than `slope` metres per horizontal metre, bool[H,W]."""
+    x, y, z = ray_directions(view)
+    return z < -slope * torch.hypot(x, y)
 
 
 def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> Tensor:
@@ -263,7 +294,7 @@ def build_conditions(
             reduced(renders.color), picked(renders.depth), reduced(renders.alpha), reduced(renders.certainty), picked(renders.semantics)
         )
     small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders))
-    own = [small_points.look(view) for view in small]
+    own = [small_points.look(view, there[0]) for view, there in zip(small, picked(far_ids))]
     own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
     condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
                           reduced(backdrop), picked(ids), picked(far_ids), small_renders)  # fmt: skip
@@ -299,17 +330,19 @@ def _condition_of_view(
             sources[number] = _prepare_source(points, recorded[number], view, rules)
         return sources[number]
 
-    here = points.look(view)
-    color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
+    shape = (view.camera.height, view.camera.width)
     if not (rules.warp and recorded):
-        return (color, depth[None], here.measured[None], found[None], color, ids[None], ids[None]), here.render
-    order = _order_of_images(view, depth, recorded, rules)
-    nearest = source(order[0])
-    x, y, _ = carry(view, torch.full((1, *depth.shape), rules.backdrop_m), nearest.view)
+        here = points.look(view, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
+        color, ids, found = here.color, here.ids[None], torch.zeros_like(here.measured)
+        return (color, here.depth[None], here.measured[None], found[None], color, ids, ids), here.render
+    nearest = source(min(range(len(recorded)), key=_rank_of_images(view, recorded, rules)))
+    x, y, _ = carry(view, torch.full((1, *shape), rules.backdrop_m), nearest.view)
     backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
+    here = points.look(view, far_ids[0])
+    color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     shown = points.cloud.colors
     backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
-    for number in order:
+    for number in _order_of_images(view, depth, recorded, rules):
         image = source(number)
         fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
@@ -322,13 +355,29 @@ def _condition_of_view(
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
 
 
-def _filled(sparse: ProjectedPoints, rules: ConditionRules) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest valid pixel, for every pixel."""
+def _nearest_measured(sparse: ProjectedPoints) -> tuple[Tensor, Tensor]:
+    """Row and column of the nearest measured pixel, i64[H,W] each, for every pixel."""
+    rows, columns = nearest_valid(sparse.valid.numpy())
+    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))
+
+
+def _filled(
+    sparse: ProjectedPoints, nearest: tuple[Tensor, Tensor], rules: ConditionRules
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest measured pixel, for every pixel."""
     if not bool(sparse.valid.any()):
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
-    rows, columns = (torch.from_numpy(i.astype(np.int64)) for i in nearest_valid(sparse.valid.numpy()))
-    here = (..., rows, columns)
+    here = (..., *nearest)
     return sparse.rgb[here], sparse.depth[here], sparse.moving[here], sparse.semantics[here]
+
+
+def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Tensor]) -> Tensor:
+    """Filled depth f32[H,W] in which ground goes on at the height, not at the depth, of the nearest measured pixel; `ids` u8[H,W] are
+    that pixel's classes."""
+    falls = -ray_directions(view)[2]
+    there = falls[nearest]
+    level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (there > LEAST_FALL)
+    return torch.where(level, depth * there / falls.clamp(min=LEAST_FALL), depth)
 
 
 def _published_condition(
@@ -364,9 +413,10 @@ def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
 
 
-def _order_of_images(view: View, depth: Tensor, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
-    """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the same camera
-    before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
+def _rank_of_images(
+    view: View, recorded: Sequence[Photo], rules: ConditionRules
+) -> Callable[[int], tuple[float, bool, float]]:
+    """What sorts recorded images by how well they serve a view (see `_order_of_images`)."""
 
     def rank(number: int) -> tuple[float, bool, float]:
         other = recorded[number].view
@@ -374,11 +424,18 @@ def _order_of_images(view: View, depth: Tensor, recorded: Sequence[Photo], rules
         elsewhere = other.camera.name != view.camera.name
         return round((abs(other.time_s - view.time_s) + rules.other_camera_s * elsewhere) / 0.02), elsewhere, distance_m
 
+    return rank
+
+
+def _order_of_images(view: View, depth: Tensor, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
+    """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the same camera
+    before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
+
     columns, rows = min(view.camera.width, OVERLAP_GRID[0]), min(view.camera.height, OVERLAP_GRID[1])
     coarse = view.resized(columns, rows)
     there = functional.interpolate(depth[None, None], size=(rows, columns), mode="nearest-exact")[0]
     chosen: list[int] = []
-    for number in sorted(range(len(recorded)), key=rank):
+    for number in sorted(range(len(recorded)), key=_rank_of_images(view, recorded, rules)):
         if len(chosen) == rules.images_per_view:
             break
         other = recorded[number].view
@@ -393,10 +450,11 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
-    here = points.look(view)
+    ids = _ids_at(recorded, width, height)
+    here = points.look(view, ids)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
     common = points.cloud.colors.image_to_common(camera.name, rgb)
-    return WarpSource(view, common, here.depth, here.moving, _ids_at(recorded, width, height))
+    return WarpSource(view, common, here.depth, here.moving, ids)
 
 
 def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:

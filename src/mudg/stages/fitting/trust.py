@@ -10,7 +10,7 @@ something behind it, the pixel is *seen*. Points that are hidden in every record
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ SEED_STRIDE_PX = 3
 SEED_NEAREST_M, SEED_FARTHEST_M = 2.0, 80.0
 SEED_CONFIDENCE = 0.2
 """Least confidence of a virtual pixel that may become a Gaussian."""
+SPREAD_ROUNDS = 12
 MOST_SEEDS = 8_000_000
 """Points held at once; thinning them takes about 150 bytes each."""
 
@@ -125,15 +126,29 @@ def unseen_rows(
         if not parts:
             continue
         points = StartPoints.joined(parts)
-        rows = voxel_filter(points.xyz, np.maximum(2.0 * points.scale_m, 0.08))
         share = max(1, most * len(points) // total)
-        rows = rows[np.sort(seeds.numpy_rng(run_seed, index, "unseen rows").permutation(len(rows))[:share])]
-        columns.append(points[rows].columns(model.classes, model.sh_degree))
-        owners.append(torch.full((len(rows),), index, dtype=torch.int32))
+        kept = _spread(points, share, seeds.numpy_rng(run_seed, index, "unseen rows"))
+        columns.append(kept.columns(model.classes, model.sh_degree))
+        owners.append(torch.full((len(kept),), index, dtype=torch.int32))
     if not columns:
         none = {name: value.detach()[:0].cpu() for name, value in model.table.columns.items()}
         return none, {"node": torch.zeros(0, dtype=torch.int32)}, float(np.mean(shares))
     return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}, float(np.mean(shares))
+
+
+def _spread(points: StartPoints, most: int, rng: np.random.Generator) -> StartPoints:
+    """At most ``most`` of the points, one per cube; the cubes, and the scales of what stands for them, grow until that suffices, so that
+    few points still leave no holes between them."""
+    size = np.maximum(2.0 * points.scale_m, 0.08)
+    rows = voxel_filter(points.xyz, size)
+    for _ in range(SPREAD_ROUNDS):
+        if len(rows) <= most:
+            break
+        size = size * np.clip((len(rows) / most) ** 0.5, 1.05, 2.0)
+        rows = voxel_filter(points.xyz, size)
+    rows = rows[np.sort(rng.permutation(len(rows))[:most])]
+    kept = points[rows]
+    return replace(kept, scale_m=np.maximum(kept.scale_m, size[rows] / 2).astype(np.float32))
 
 
 def _seeds_of(
