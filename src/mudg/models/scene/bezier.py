@@ -151,7 +151,7 @@ class BezierNode(RigidNode):
 
     def _center(self, time_s: float) -> Tensor:
         weights, _, center = self._at(float(self.path.tau_at(time_s)))
-        return center + weights @ self.learnt["trajectory"][0]
+        return center + (weights[:, None] * self.learnt["trajectory"][0]).sum(0)
 
     def _at(self, tau: float) -> tuple[Tensor, Tensor, Tensor]:
         """Weights of the control points [4], what turns places (transposed, [3, 3]) and the track's own centre [3], where the rows

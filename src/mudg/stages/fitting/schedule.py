@@ -14,6 +14,9 @@ from mudg.models.scene.mcmc import McmcSettings
 from mudg.stages.config import FitConfig
 
 PUBLISHED_STEPS = 30_000
+FIELD_STEPS = 55_000
+"""Published steps of the field of ``s3gaussian``, whose rates a shorter run raises in proportion, within bounds: the field starts from
+nothing, and has as far to go."""
 LAST_DENSIFIED = {"pvg": 0.5, "omnire": 0.5, "s3gaussian": 0.5}
 """Share of the run after which a method no longer densifies; 0.6 for all others."""
 LAST_POSE_ROUND = 0.85
@@ -40,8 +43,8 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "deform": 1e-3 * boost * gentle,
         "network": 1e-3 * gentle,
         "embeddings": 1e-3 * gentle,
-        "planes": 1.6e-4 * 10.0 * boost * 0.1**along,
-        "plane_network": 1.6e-5 * 10.0 * boost * 0.1**along,
+        "planes": min(2e-2, 1.6e-4 * FIELD_STEPS / iterations) * 0.1**along,
+        "plane_network": min(2e-3, 1.6e-5 * FIELD_STEPS / iterations) * 0.1**along,
         "curve": 1.6e-3 * 10.0 * boost * decay,
         "trajectory": 1.6e-5 * 10.0 * boost * decay,
         "tau": 8e-4 * boost * decay,
