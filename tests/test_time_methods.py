@@ -433,6 +433,7 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
         fit.run(settings(method), world["scene"], world["fuse"], tmp_path / "fit", start=tmp_path / "other")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", RECIPES)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
     small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch", "hexplane__space": 4}
