@@ -245,10 +245,11 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Annotated[str, tyro.conf.Positional, arg(metavar="BENCHMARK")]
-    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), shift (complete methods off the recorded path) or
-    real (complete methods on real logs)."""
+    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), shift (complete methods off the recorded path), real
+    (complete methods on real logs) or paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, arg(metavar="[LOG ...]")] = ()
-    """real: folders of dataset logs, or scenes made by ingest."""
+    """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
+    generated cities."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")]
 
 

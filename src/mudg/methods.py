@@ -37,5 +37,6 @@ METHODS: Final[dict[str, Method]] = {
     "bezier": Method("BezierGS", "render", ("static", "objects", "sky"), _STREET),
     "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET),
     "mudg_r": Method("Diffusion output", "synthesize"),
+    "freevs": Method("FreeVS condition, our network", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }

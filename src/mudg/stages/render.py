@@ -66,20 +66,19 @@ def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite:
 
 
 def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
-    """The trajectories a configuration names: every camera at every shift (0 = recorded).
+    """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path.
 
     Raises:
         UsageError: an unknown camera, or nothing to render.
     """
     cameras = config.cameras or tuple(scene.cameras)[:1]
-    if not config.shifts_m:
+    if not config.shifts_m and not config.paths:
         raise UsageError("nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path")
+    moved = {"height_m": config.height_m, "yaw_rad": math.radians(config.yaw_deg)}
     paths = []
     for camera in cameras:
-        for shift_m in config.shifts_m:
-            path = trajectory.at_shift(
-                scene, camera, shift_m, height_m=config.height_m, yaw_rad=math.radians(config.yaw_deg)
-            )
+        found = [trajectory.at_shift(scene, camera, shift_m, **moved) for shift_m in config.shifts_m]
+        for path in (*found, *(trajectory.named(scene, camera, name) for name in config.paths)):
             paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
     return tuple(paths)
 

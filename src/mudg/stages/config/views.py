@@ -19,10 +19,13 @@ class RenderConfig:
     """Cameras to render (empty = the first camera). A name that the scene lacks is an error."""
     shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
     """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path."""
+    paths: tuple[str, ...] = ()
+    """Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m
+    further ahead with every frame. A minus means down, right, slower."""
     height_m: float = 0.0
-    """Vertical shift in metres, positive upwards; applies to every trajectory."""
+    """Vertical shift in metres, positive upwards; applies to every shift."""
     yaw_deg: float = 0.0
-    """Yaw in degrees, counter-clockwise seen from above; applies to every trajectory."""
+    """Yaw in degrees, counter-clockwise seen from above; applies to every shift."""
     width_px: int = Field(default=0, ge=0)
     """Image width in pixels (0 = as recorded); the height follows."""
     remove_tracks: tuple[str, ...] = ()
