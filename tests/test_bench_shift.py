@@ -19,6 +19,7 @@ from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import LogRules
 from mudg.data.clips import from_city
 from mudg.data.observations import list_observation_sets, read_observations
+from mudg.methods import METHODS, PUBLISHED
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages import score_truth
@@ -101,6 +102,14 @@ def test_ablation_brings_the_rows_it_is_compared_with():
     }
     assert all(rows[name] == dataclasses.replace(full, virtual=terms) for name, terms in expected.items())
     assert rows["exact"] == full
+
+
+def test_published_methods_are_rows_where_they_are_asked_for():
+    rows = {r.name: r.fit for r in bench_shift.rows_of(BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30))}
+    assert list(rows) == ["street_gaussians", "pvg", "emernerf"]
+    assert {name: (fit.method, fit.iterations) for name, fit in rows.items()} == {name: (name, 30) for name in rows}
+    assert not set(PUBLISHED) & set(BenchConfig().methods)
+    assert set(PUBLISHED) < set(METHODS)
 
 
 def test_unknown_methods_and_repeated_names_are_refused():

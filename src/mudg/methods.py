@@ -43,3 +43,6 @@ METHODS: Final[dict[str, Method]] = {
     "freevs": Method("FreeVS condition, our network", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }
+
+PUBLISHED: Final = ("pvg", "s3gaussian", "bezier", "omnire", "emernerf")
+"""Published methods for comparison, fitted to recorded views alone."""

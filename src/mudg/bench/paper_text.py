@@ -12,6 +12,8 @@ from mudg.report.score_tables import markdown_table
 
 ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
 PUBLISHED: Final = "published"
+NONE: Final = "-"
+"""What stands in a column without any number; a note gives the reason once."""
 _LATEX: Final = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$",
@@ -20,11 +22,11 @@ _LATEX: Final = {
 
 @dataclass(frozen=True)
 class PrintedCell:
-    """A printed cell: ``best``, the best number of its column among ours; ``reason``, no number but why there is none."""
+    """A printed cell: ``best``, the best number of its column among ours; ``reason``, why there is no number."""
 
     text: str
     best: bool = False
-    reason: bool = False
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ def notes_of(doc: Mapping[str, Any]) -> list[str]:
         f"{settings['seed']}.",
         "Means over logs; in brackets the standard error over logs. Bold: best of ours; truth and published rows are not ranked.",
         *table["notes"],
+        *_empty_columns(doc),
         *_notes_of_sets(doc["made"]),
         *(f"{entry['log']}: {entry['note']}." for entry in doc["logs"] if entry["note"]),
     ]
@@ -122,10 +125,32 @@ def further_lines(doc: Mapping[str, Any], place: str) -> list[PrintedRow]:
     return _ours(doc, [(place, column["key"]) for column in doc["further"]])
 
 
+def _shared_reason(doc: Mapping[str, Any], place: str, key: str) -> str:
+    """Why no row at all has a number in a column; empty if one has, or if reasons differ."""
+    reasons = {found[place][key].get("reason", "") for found in doc["cells"].values()}
+    return reasons.pop() if len(reasons) == 1 else ""
+
+
+def _empty_columns(doc: Mapping[str, Any]) -> list[str]:
+    """Sentences on columns in which no row has a number."""
+    columns = _columns(doc)
+    wanted = [tuple(cell) for cell in doc["table"]["cells"]]
+    wanted += [(place["name"], column["key"]) for place in doc["table"]["places"] for column in doc["further"]]
+    of: dict[str, dict[str, None]] = {}
+    for place, key in wanted:
+        if reason := _shared_reason(doc, place, key):
+            of.setdefault(reason, {})[columns[key]["title"]] = None
+    return [f"{', '.join(titles)} ({NONE}): {reason}." for reason, titles in of.items()]
+
+
 def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> list[PrintedRow]:
     lines = []
+    shared = [_shared_reason(doc, place, key) for place, key in wanted]
     for row in doc["rows"]:
-        cells = [_cell(doc, row["name"], place, key) for place, key in wanted]
+        cells = [
+            PrintedCell(NONE, reason=reason) if reason else _cell(doc, row["name"], place, key)
+            for (place, key), reason in zip(wanted, shared, strict=True)
+        ]
         lines.append(PrintedRow(row["title"], "ours" if row["method"] else "anchor", tuple(cells)))
     counts = [_count(doc, place, key) for place, key in wanted]
     return [*lines, PrintedRow("n", "n", tuple(map(PrintedCell, counts)))]
@@ -134,7 +159,7 @@ def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> list[Pri
 def _cell(doc: Mapping[str, Any], row: str, place: str, key: str) -> PrintedCell:
     found, column = doc["cells"][row][place][key], _columns(doc)[key]
     if "mean" not in found:
-        return PrintedCell(found["reason"], reason=True)
+        return PrintedCell(found["reason"], reason=found["reason"])
     error = found["standard_error"]
     behind = "" if error is None else f" ({_digits(error, column)})"
     return PrintedCell(_digits(found["mean"], column) + behind, row in doc["best"][place][key])
@@ -148,7 +173,7 @@ def _count(doc: Mapping[str, Any], place: str, key: str) -> str:
     """Views (or clips) behind the numbers of a column, over all logs; the same for every row that has one."""
     counts = [of[place][key] for of in doc["cells"].values() if "n" in of[place][key]]
     if not counts:
-        return "-"
+        return NONE
     reference = counts[0].get("n_reference")
     return str(sum(counts[0]["n"])) + (f" against {sum(reference)}" if reference else "")
 
@@ -249,7 +274,7 @@ def latex(doc: Mapping[str, Any]) -> str:
 
 def _tabular(heads: Sequence[str], rows: Sequence[PrintedRow]) -> list[str]:
     reasons = dict.fromkeys(
-        f"{head}: {cell.text}" for row in rows for head, cell in zip(heads, row.cells, strict=True) if cell.reason
+        f"{head}: {cell.reason}" for row in rows for head, cell in zip(heads, row.cells, strict=True) if cell.reason
     )
     lines = [*(f"% -- {reason}" for reason in reasons), r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline"]
     lines += [" & ".join(["", *map(escaped, heads)]) + r" \\", r"\hline"]

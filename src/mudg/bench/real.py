@@ -42,6 +42,7 @@ from mudg.bench.real_protocols import (
 from mudg.bench.shift import variant_of, write_fill
 from mudg.data.scene import SCENE_FILES, read_scene
 from mudg.data.scene.part import write_part
+from mudg.methods import PUBLISHED
 from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
 from mudg.stages import adapt, annotate, fuse, ingest, render, score, synthesize
@@ -99,6 +100,7 @@ METHOD_ROWS: Final[tuple[RealMethod, ...]] = (
     RealMethod(FILL),
     RealMethod("gs3d", "gs3d"),
     RealMethod(BASE, BASE),
+    *(RealMethod(name, name) for name in PUBLISHED),
     *(RealMethod(DIFFUSION + ending, sees=sees) for sees, ending in LESS.items()),
     *(RealMethod(FULL + ending, FULL, sees) for sees, ending in LESS.items()),
 )

@@ -40,6 +40,7 @@ from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
+from mudg.methods import PUBLISHED
 from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import title_of
 from mudg.stages import fuse, ingest, render, score, score_truth, synthesize
@@ -163,7 +164,7 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     Raises:
         UsageError: an unknown method, or a malformed or repeated variant.
     """
-    known = (FILL, "gs3d", WITHOUT, DIFFUSION, WITH)
+    known = (FILL, "gs3d", WITHOUT, *PUBLISHED, DIFFUSION, WITH)
     wanted = set(config.methods) | ({WITHOUT, WITH} if config.ablation else set())
     if not wanted or wanted - set(known):
         raise UsageError("unknown method", where="--methods", expected=", ".join(known),
