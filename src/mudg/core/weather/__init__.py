@@ -1,0 +1,18 @@
+"""Weather and light as pure functions of a G-buffer, in linear light. Models, sources and assumptions: docs/weather.md."""
+
+from mudg.core.weather.apply import Weathered, apply
+from mudg.core.weather.gbuffer import (
+    GBuffer,
+    HeightMap,
+    Surroundings,
+    estimate_surroundings,
+    from_render,
+    mirror_view,
+    sun_visibility,
+)
+from mudg.core.weather.tone import FilmicResponse, ToneCurve, curve_of
+
+__all__ = [
+    "FilmicResponse", "GBuffer", "HeightMap", "Surroundings", "ToneCurve", "Weathered", "apply", "curve_of", "estimate_surroundings",
+    "from_render", "mirror_view", "sun_visibility",
+]  # fmt: skip
