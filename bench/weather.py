@@ -47,6 +47,8 @@ from mudg.data.city.world import CityTruth
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
 WET_IDS = (ID["road"], ID["sidewalk"])
+KERB_M = 0.13
+"""Height of sidewalks above the road in the generated city."""
 
 
 def say(line: str) -> None:
@@ -197,12 +199,12 @@ def score_wet(case: Case) -> list[str]:
     own, around = case.light.response.curve(), case.light.surroundings
     dry = case.gbuffer(own)
     # the vignette belongs to the pixel, so the mirrored image is decoded as it was taken, then turned
-    below = mirror_view(case.view, 0.0)
-    mirrored = own.decode(case.world.render(below, supersample=2).rgb)[::-1]
+    planes = [own.decode(case.world.render(mirror_view(case.view, z)).rgb)[::-1] for z in (0.0, KERB_M)]
+    mirrored = np.where(dry.classes[..., None] == ID["road"], *planes)
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, where):.1f}"]
     for label, gbuffer in (
         ("mirror in the image", dry),
-        ("mirror pass", replace(dry, mirror=np.ascontiguousarray(mirrored))),
+        ("mirror pass", replace(dry, mirror=mirrored)),
     ):
         shown, _ = ground.wet_ground(gbuffer, case.view, around, 1.0, 0.35, config.seed)
         lines.append(f"{label} {psnr(own.encode(shown), truth.rgb, where):.1f}")

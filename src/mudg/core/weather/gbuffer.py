@@ -91,6 +91,30 @@ def euclidean_range(view: View, depth: NDArray[np.floating]) -> Array:
     return depth.astype(np.float64) * world_rays(view)[1]
 
 
+_SUB_PIXELS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+
+
+def places_within_pixels(view: View, gbuffer: GBuffer, where: NDArray[np.bool_]) -> list[Array]:
+    """World places f64[N, 3] of four points in each of the N pixels that a mask names, on the planes through the surfaces there.
+
+    Patterns of the ground are finer than a pixel a little way off; they are averaged over these.
+    """
+    rays, _ = world_rays(view)
+    normal = gbuffer.normal[where].astype(np.float64)
+    middle, depth = rays[where], gbuffer.depth[where].astype(np.float64)
+    across, down = view.world_from_cam[:3, 0] / view.camera.fx, view.world_from_cam[:3, 1] / view.camera.fy
+    offset = (normal * middle).sum(1)
+    found = []
+    for du, dv in _SUB_PIXELS:
+        ray = middle + du * across + dv * down
+        against = (normal * ray).sum(1)
+        scale = np.where(
+            offset * against > 0, offset / np.where(against == 0, 1, against), 1.0
+        )  # grazing: stay at the depth
+        found.append(view.center_world + ray * (depth * np.clip(scale, 0.5, 2))[:, None])
+    return found
+
+
 def _smaller_step(w: Array, axis: int) -> Array:
     """Per pixel the smaller of the differences to both neighbours: it does not cross the edge of a surface."""
     ahead = np.diff(w, axis=axis, append=np.take(w, [-1], axis))
@@ -160,6 +184,11 @@ def from_render(
 # --- what stands above ------------------------------------------------------------------------------------------------
 
 _LIFT_M = 0.35
+
+
+def sky_share(openness: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Share of the sky's light that arrives, by the openness: what stands in the way reflects much of it again."""
+    return 0.75 + 0.25 * openness
 
 
 def open_directions() -> Array:
@@ -279,7 +308,7 @@ def _quantile_color(colors: Image, share: float, otherwise: Array) -> Array:
 def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: float | None = None) -> Surroundings:
     """Light of a drive from its own images.
 
-    Sky pixels below 20 degrees give the horizon, those above the zenith; the airlight is the horizon. Without sky, the brightest tenth
+    Sky pixels below 20 degrees give the horizon, those above the zenith, and the lowest tenth of them the airlight. Without sky, the brightest tenth
     of everything stands for it. The sky's irradiance is a third horizon and two thirds zenith (cosine weights of both bands,
     rounded). Level ground in light and shadow gives the sun: what the brightest ground has beyond the darkest, over the same albedo.
     Its direction is not found: straight above is assumed.
@@ -288,12 +317,13 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: flo
         views: views and G-buffers of some frames.
         ground_z_m: height of the road; None = median of road pixels.
     """
-    low, high, rest, ground, heights = [], [], [], [], []
+    low, high, rises, rest, ground, heights = [], [], [], [], [], []
     for view, gbuffer in views:
         rays, length = world_rays(view)
         up, sky = rays[..., 2] / length, gbuffer.sky
         low.append(gbuffer.color[sky & (up < 0.34)])
         high.append(gbuffer.color[sky & (up >= 0.34)])
+        rises.append((up[sky], gbuffer.color[sky]))
         rest.append(gbuffer.color[~sky].reshape(-1, 3))
         road = gbuffer.classes == ID["road"]
         ground.append(gbuffer.color[road])
@@ -309,7 +339,10 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: flo
     sun = ambient * np.clip(bright / np.maximum(dark, 1e-4) - 1.6, 0, 5)  # 1.6: texture of asphalt alone
     z = np.concatenate(heights)
     ground_z = ground_z_m if ground_z_m is not None else (float(np.median(z)) if len(z) else 0.0)
-    return Surroundings(horizon, zenith, ambient, sun, np.array([0.0, 0.0, 1.0]), horizon, ground_z)
+    up, color = (np.concatenate(parts) for parts in zip(*rises, strict=True))
+    lowest = color[up <= np.quantile(up, 0.1)] if len(up) else color
+    airlight = _quantile_color(lowest, 0.5, horizon)
+    return Surroundings(horizon, zenith, ambient, sun, np.array([0.0, 0.0, 1.0]), airlight, ground_z)
 
 
 def mirror_view(view: View, ground_z_m: float) -> View:

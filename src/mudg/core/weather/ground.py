@@ -14,7 +14,7 @@ from scipy import ndimage
 from mudg.base import seeds
 from mudg.base.palette import ID
 from mudg.base.types import View
-from mudg.core.weather.gbuffer import GBuffer, Surroundings, world_points, world_rays
+from mudg.core.weather.gbuffer import GBuffer, Surroundings, places_within_pixels, sky_share, world_points, world_rays
 from mudg.core.weather.noise import patch_threshold, patches, smoothstep
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> t
     """What level ground mirrors, found in the image itself.
 
     Rays are followed from the ground in steps that grow with distance, until they pass behind a surface by less than a step. Rays
-    that leave the image see the sky's gradient.
+    that leave the image see what stands at its edge there, or else the sky's gradient.
 
     Returns:
         Mirrored light f32[H, W, 3] on the ground pixels (0 elsewhere), and whether it was seen in the image f32[H, W], 0 or 1.
@@ -110,9 +110,14 @@ def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> t
     )
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (z > 0)
     light = sky_light(surroundings, direction[:, 2])
-    at = (np.clip(v[inside] - 0.5, 0, height - 1), np.clip(u[inside] - 0.5, 0, width - 1))
+    at = (np.clip(np.nan_to_num(v) - 0.5, 0, height - 1), np.clip(np.nan_to_num(u) - 0.5, 0, width - 1))
+    shown = (z > 0) & ~gbuffer.ground[at[0].astype(np.int64), at[1].astype(np.int64)]
     for channel in range(3):
-        light[inside, channel] = ndimage.map_coordinates(gbuffer.color[..., channel], at, order=1, mode="nearest")
+        seen = ndimage.map_coordinates(
+            gbuffer.color[..., channel], (at[0][shown], at[1][shown]), order=1, mode="nearest"
+        )
+        light[shown, channel] = seen
+    inside &= shown
     mirror[wet], found[wet] = light, inside
     return mirror, found
 
@@ -138,9 +143,9 @@ def wet_ground(
         seed: of the places of puddles.
     """
     ground = np.isin(gbuffer.classes, _WET_IDS) & ~gbuffer.sky & (gbuffer.normal[..., 2] > _LEVEL)
-    points = world_points(view, gbuffer.depth)[..., :2]
     water = np.zeros(ground.shape)
-    water[ground] = wet * puddle_mask(points[ground], puddles, seed)
+    places = places_within_pixels(view, gbuffer, ground)
+    water[ground] = wet * np.mean([puddle_mask(p[:, :2], puddles, seed) for p in places], axis=0)
     if gbuffer.mirror is None:
         mirror, found = screen_mirror(gbuffer, view, surroundings)
     else:
@@ -194,13 +199,15 @@ def snow_cover(gbuffer: GBuffer, view: View, cover: float, seed: int) -> Plane:
     """Cover f32[H, W] in [0, 1] of all surfaces: none on people and in the sky, less in trees."""
     weight = np.zeros(gbuffer.depth.shape, np.float32)
     solid = ~gbuffer.sky & ~np.isin(gbuffer.classes, _BARE_IDS)
-    xyz = world_points(view, gbuffer.depth)[solid]
-    weight[solid] = snow_weight(xyz, gbuffer.normal[solid], gbuffer.openness[solid], cover, seed)
+    places = places_within_pixels(view, gbuffer, solid)
+    weight[solid] = np.mean(
+        [snow_weight(p, gbuffer.normal[solid], gbuffer.openness[solid], cover, seed) for p in places], axis=0
+    )
     return weight * np.where(gbuffer.classes == ID["vegetation"], np.float32(TREE_COVER), np.float32(1))
 
 
 def snow_light(gbuffer: GBuffer, surroundings: Surroundings, sunlit: Plane) -> Array:
     """Linear light f64[H, W, 3] of snow on the surfaces: albedo 0.9, slightly blue, under sky and sun."""
     facing = np.maximum(gbuffer.normal @ surroundings.sun_direction, 0) * sunlit
-    sky = (0.4 + 0.6 * gbuffer.openness)[..., None] * surroundings.ambient
+    sky = sky_share(gbuffer.openness)[..., None] * surroundings.ambient
     return SNOW_COLOR * (sky + facing[..., None] * surroundings.sun)

@@ -129,7 +129,9 @@ def in_fog(
     return BeamReturns(shown, np.where(kind == _LOST, 0.0, power * math.pi * range_m**2), kind)
 
 
-def in_rain(range_m: Array, reflectance: Array, mm_h: float, seed: int, sensor: LidarSensor | None = None) -> BeamReturns:
+def in_rain(
+    range_m: Array, reflectance: Array, mm_h: float, seed: int, sensor: LidarSensor | None = None
+) -> BeamReturns:
     """A sweep in rain of a rate in mm/h: weaker and lost returns, and noise of the range. Arguments as of ``in_fog``."""
     sensor = sensor or LidarSensor()
     range_m, reflectance = np.asarray(range_m, np.float64), np.asarray(reflectance, np.float64)

@@ -17,7 +17,7 @@ from scipy import ndimage
 from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.base.weather_settings import LightSettings
-from mudg.core.weather.gbuffer import GBuffer, Surroundings, world_points, world_rays
+from mudg.core.weather.gbuffer import GBuffer, Surroundings, sky_share, world_points, world_rays
 from mudg.core.weather.ground import sky_light
 from mudg.core.weather.noise import smoothstep
 
@@ -53,7 +53,7 @@ def irradiance(
     bounce = (0.30 * light.ambient + 0.22 * max(float(light.sun_direction[2]), 0.0) * light.sun) * GROUND_ALBEDO
     up = (0.5 + 0.5 * normal[..., 2])[..., None]
     sky = bounce + (light.ambient - bounce) * up
-    return facing[..., None] * light.sun + sky * (0.4 + 0.6 * openness)[..., None]
+    return facing[..., None] * light.sun + sky * sky_share(openness)[..., None]
 
 
 def refined_sunlit(gbuffer: GBuffer, light: Surroundings, given: Plane, trust: float = 2.0) -> Plane:
