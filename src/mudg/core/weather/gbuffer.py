@@ -308,9 +308,9 @@ def _quantile_color(colors: Image, share: float, otherwise: Array) -> Array:
 def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: float | None = None) -> Surroundings:
     """Light of a drive from its own images.
 
-    Sky pixels below 20 degrees give the horizon, those above the zenith, and the lowest tenth of them the airlight. Without sky, the brightest tenth
-    of everything stands for it. The sky's irradiance is a third horizon and two thirds zenith (cosine weights of both bands,
-    rounded). Level ground in light and shadow gives the sun: what the brightest ground has beyond the darkest, over the same albedo.
+    Sky pixels below 20 degrees give the horizon, those above the zenith, and the lowest tenth of them the airlight. Without sky, the
+    brightest tenth of everything stands for it. The sky's irradiance is a third horizon and two thirds zenith (cosine weights of both
+    bands, rounded). Level ground in light and shadow gives the sun: what the brightest ground has beyond the darkest, over the same albedo.
     Its direction is not found: straight above is assumed.
 
     Args:

@@ -28,6 +28,15 @@ Image = NDArray[np.float32]
 GROUND_ALBEDO = np.array([0.36, 0.34, 0.31])
 LEAST_ALBEDO, MOST_ALBEDO = 0.01, 0.9
 _CLASS_SPREAD = 0.35
+_TYPICAL_SPREAD = 0.5
+TYPICAL_ALBEDO = {
+    ID["road"]: 0.085,
+    ID["sidewalk"]: 0.23,
+    ID["building"]: 0.25,
+    ID["vegetation"]: 0.09,
+    ID["terrain"]: 0.12,
+}
+"""What decides whether all of a class is dark material in the sun or bright material in shadow."""
 
 # Night: irradiance 1 (times pi) stands for 50 lux.
 LAMP_COLOR = np.array([1.0, 0.82, 0.55])
@@ -59,8 +68,8 @@ def irradiance(
 def refined_sunlit(gbuffer: GBuffer, light: Surroundings, given: Plane, trust: float = 2.0) -> Plane:
     """Where the recorded sun reaches, f32[H, W], from a first guess and the image.
 
-    Each pixel is explained twice, lit and in shadow; the albedo of its class and the guess, blurred by a pixel or two as shadows of a
-    height map are, decide between the two. Surfaces that face away from the sun are in shadow.
+    Each pixel is explained twice, lit and in shadow. The albedo of its class, halfway between typical and found, and the guess, blurred
+    by a pixel or two as shadows of a height map are, decide between the two. Surfaces that face away from the sun are in shadow.
 
     Args:
         gbuffer: the image.
@@ -73,13 +82,17 @@ def refined_sunlit(gbuffer: GBuffer, light: Surroundings, given: Plane, trust: f
     value = np.log(np.maximum(gbuffer.color.mean(-1), 1e-4))
     as_lit, as_shade = value - np.log(np.maximum(lit_level, 1e-4)), value - np.log(np.maximum(shade_level, 1e-4))
     prior = trust * (2 * ndimage.gaussian_filter(given, 1.5) - 1)
-    lit = given.astype(np.float64)
+    typical = np.log(np.array([TYPICAL_ALBEDO.get(n, np.nan) for n in range(256)]))[gbuffer.classes]
+    first = ((as_shade - typical) ** 2 - (as_lit - typical) ** 2) / (2 * _TYPICAL_SPREAD**2)
+    lit = 1 / (1 + np.exp(-np.clip(prior + np.nan_to_num(first), -30, 30)))
     for _ in range(3):
         odds = prior.copy()
         for number in np.unique(gbuffer.classes[~gbuffer.sky]):
             of_class = (gbuffer.classes == number) & ~gbuffer.sky
             albedo = np.where(lit > 0.5, as_lit, as_shade)[of_class]
             middle = np.median(albedo)
+            if number in TYPICAL_ALBEDO:
+                middle = (middle + np.log(TYPICAL_ALBEDO[number])) / 2
             spread = max(1.4826 * float(np.median(np.abs(albedo - middle))), _CLASS_SPREAD)
             odds[of_class] += ((as_shade[of_class] - middle) ** 2 - (as_lit[of_class] - middle) ** 2) / (2 * spread**2)
         lit = 1 / (1 + np.exp(-np.clip(odds, -30, 30)))
