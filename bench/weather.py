@@ -3,6 +3,7 @@
 python bench/weather.py                                   all edits, seeds 41 and 42
 python bench/weather.py --only fog --fit RUN              with the depth of a fitted scene (folder of mudg demo or mudg run)
 python bench/weather.py --only none --sheet weather.png   a picture of all effects
+python bench/weather.py --seeds 41 --pairs pairs.png      a picture of all edits (above) and the truth (below)
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -62,18 +63,32 @@ def psnr(a: NDArray[np.floating], b: NDArray[np.floating], where: Mask) -> float
     return float(-10 * np.log10(np.mean((a[where].astype(np.float64) - b[where]) ** 2) + 1e-12))
 
 
-def reinhard(image: Picture, target: Picture, where: Mask) -> Picture:
-    """Global colour transfer (Reinhard et al. 2001): mean and deviation per axis of l-alpha-beta of the true target, over a mask."""
+def matched(image: NDArray[np.floating], target: NDArray[np.floating], where: Mask) -> NDArray[np.float64]:
+    """Values with the means and deviations per channel of the target, both over a mask."""
+    spread = np.maximum(image[where].std(0), 1e-6)
+    return (image - image[where].mean(0)) / spread * target[where].std(0) + target[where].mean(0)
+
+
+def best_transfer(image: Picture, target: Picture, where: Mask) -> float:
+    """PSNR of the better of two global colour transfers that know the true target: means and deviations of display values, and of
+    l-alpha-beta (Reinhard et al. 2001)."""
     lms = np.array([[0.3811, 0.5783, 0.0402], [0.1967, 0.7244, 0.0782], [0.0241, 0.1288, 0.8444]])
     axes = np.diag([3**-0.5, 6**-0.5, 2**-0.5]) @ np.array([[1, 1, 1], [1, 1, -2], [1, -1, 0]])
 
     def to(x: Picture) -> NDArray[np.float64]:
-        return np.log10(np.maximum(x.astype(np.float64) @ lms.T, 1e-3)) @ axes.T
+        return np.log10(np.maximum(x.astype(np.float64) @ lms.T, 1e-2)) @ axes.T
 
-    mine, wanted = to(image), to(target)
-    means, spreads = (f(mine[where], axis=0) for f in (np.mean, np.std))
-    moved = (mine - means) / spreads * wanted[where].std(0) + wanted[where].mean(0)
-    return np.clip(10 ** (moved @ np.linalg.inv(axes).T) @ np.linalg.inv(lms).T, 0, 1).astype(np.float32)
+    moved = 10 ** (matched(to(image), to(target), where) @ np.linalg.inv(axes).T) @ np.linalg.inv(lms).T
+    return max(psnr(np.clip(x, 0, 1), target, where) for x in (moved, matched(image, target, where)))
+
+
+@dataclass(frozen=True)
+class Result:
+    """Scores as text, and display values of the edit and of the truth."""
+
+    lines: list[str]
+    edited: Picture
+    truth: Picture
 
 
 @dataclass(frozen=True)
@@ -126,15 +141,15 @@ def foggy(case: Case, gbuffer: GBuffer, visibility_m: float, light: Surroundings
 
 def score_fog(
     case: Case, visibility_m: float = 150.0, fitted: tuple[Picture, NDArray[np.float32]] | None = None
-) -> list[str]:
+) -> Result:
     """Right curve and plain sRGB curve, exact depth and depth of a fitted scene."""
     truth = CityWorld(replace(case.world.config, fog_visibility_m=visibility_m)).render(case.view)
     solid = ~truth.sky
     own, around = case.light.response.curve(), case.light.surroundings
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}"]
     exact = case.gbuffer(own)
-    shown = own.encode(foggy(case, exact, visibility_m, around, case.light.visibility_m))
-    lines.append(f"city's curve, exact depth {psnr(shown, truth.rgb, solid):.1f}")
+    best = own.encode(foggy(case, exact, visibility_m, around, case.light.visibility_m))
+    lines.append(f"city's curve, exact depth {psnr(best, truth.rgb, solid):.1f}")
     generic = case.gbuffer(SRGB)
     guess = weather.estimate_surroundings([(case.view, generic)])
     lines.append(
@@ -154,10 +169,10 @@ def score_fog(
             lines.append(
                 f"fitted depth, {name}: city's curve {a:.1f}, sRGB {b:.1f} (unedited {psnr(colors, case.truth.rgb, solid):.1f})"
             )
-    return lines
+    return Result(lines, np.where(solid[..., None], best, case.truth.rgb), truth.rgb)
 
 
-def score_light(case: Case, name: str) -> list[str]:
+def score_light(case: Case, name: str) -> Result:
     """Another light against a global colour transfer that knows the target's statistics."""
     config = replace(case.world.config, light=name)  # type: ignore[arg-type]
     world = CityWorld(config)
@@ -165,14 +180,14 @@ def score_light(case: Case, name: str) -> list[str]:
     solid = ~truth.sky
     own, there = case.light.response.curve(), target.response.curve()
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}",
-             f"global transfer {psnr(reinhard(case.truth.rgb, truth.rgb, solid), truth.rgb, solid):.1f}"]  # fmt: skip
+             f"global transfer {best_transfer(case.truth.rgb, truth.rgb, solid):.1f}"]  # fmt: skip
     heights = case.heights()
     around, goal = case.light.surroundings, target.surroundings
     estimated = case.gbuffer(own, heights)
     estimated = replace(estimated, sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction),
                         new_sunlit=sun_visibility(estimated, case.view, heights, goal.sun_direction))  # fmt: skip
     exact = replace(case.exact(own), new_sunlit=world.surfaces(case.view).sunlit)
-    for label, gbuffer in (("height map", estimated), ("exact surfaces", exact)):
+    for label, gbuffer in (("exact surfaces", exact), ("height map", estimated)):
         clear = np.exp(
             -fog.extinction(case.light.visibility_m)
             * np.where(truth.sky, 0, weather.gbuffer.euclidean_range(case.view, gbuffer.depth))
@@ -188,10 +203,10 @@ def score_light(case: Case, name: str) -> list[str]:
         )
         shown = there.encode(fog.veiled(lit, np.where(truth.sky, 1, hazy), goal.airlight))
         lines.append(f"{label} {psnr(shown, truth.rgb, solid):.1f}")
-    return lines
+    return Result(lines, shown, truth.rgb)
 
 
-def score_wet(case: Case) -> list[str]:
+def score_wet(case: Case) -> Result:
     """Road and sidewalk, mirrored in the image itself and by a second render."""
     config = replace(case.world.config, wet=1.0, puddles=0.35)
     truth = CityWorld(config).render(case.view)
@@ -206,12 +221,13 @@ def score_wet(case: Case) -> list[str]:
         ("mirror in the image", dry),
         ("mirror pass", replace(dry, mirror=mirrored)),
     ):
-        shown, _ = ground.wet_ground(gbuffer, case.view, around, 1.0, 0.35, config.seed)
-        lines.append(f"{label} {psnr(own.encode(shown), truth.rgb, where):.1f}")
-    return lines
+        light, _ = ground.wet_ground(gbuffer, case.view, around, 1.0, 0.35, config.seed)
+        shown = own.encode(light)
+        lines.append(f"{label} {psnr(shown, truth.rgb, where):.1f}")
+    return Result(lines, shown, truth.rgb)
 
 
-def score_snow(case: Case, cover: float = 0.7) -> list[str]:
+def score_snow(case: Case, cover: float = 0.7) -> Result:
     """Where snow lies, and the image."""
     config = replace(case.world.config, snow_cover=cover)
     world = CityWorld(config)
@@ -222,13 +238,14 @@ def score_snow(case: Case, cover: float = 0.7) -> list[str]:
     estimated = case.gbuffer(own, heights)
     estimated = replace(estimated, sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction))
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}", f"covered {lies.mean():.2f}"]
-    for label, gbuffer in (("height map", estimated), ("exact surfaces", case.exact(own))):
+    for label, gbuffer in (("exact surfaces", case.exact(own)), ("height map", estimated)):
         found = ground.snow_cover(gbuffer, case.view, cover, config.seed)
         iou = ((found > 0.5) & lies).sum() / max(((found > 0.5) | lies).sum(), 1)
         sunlit = relight.refined_sunlit(gbuffer, around, gbuffer.sunlit)
         light = gbuffer.color + (ground.snow_light(gbuffer, around, sunlit) - gbuffer.color) * found[..., None]
-        lines.append(f"{label}: IoU {iou:.3f}, PSNR {psnr(own.encode(light), truth.rgb, solid):.1f}")
-    return lines
+        shown = own.encode(light)
+        lines.append(f"{label}: IoU {iou:.3f}, PSNR {psnr(shown, truth.rgb, solid):.1f}")
+    return Result(lines, shown, truth.rgb)
 
 
 def fitted_view(run: Path, size: tuple[int, int]) -> tuple[Case, tuple[Picture, NDArray[np.float32]]]:
@@ -256,8 +273,15 @@ SHEET: dict[str, Conditions] = {
         weather=WeatherSettings(snow=SnowSettings(cover=0.85, mm_h=2)), light=LightSettings(time="overcast")
     ),
     "dusk": Conditions(light=LightSettings(time="dusk", sun_azimuth_deg=60)),
-    "wet night": Conditions(weather=WeatherSettings(wet=1.0, puddles=0.3), light=LightSettings(time="night")),
+    "wet night": Conditions(
+        weather=WeatherSettings(wet=1.0, puddles=0.3), light=LightSettings(time="night", exposure_ev=1.0)
+    ),
 }
+
+
+def write_picture(path: Path, rows: list[Picture]) -> None:
+    """Rows of display values as one image."""
+    store.write_image(path, (np.clip(np.concatenate(rows, 0), 0, 1) * 255 + 0.5).astype(np.uint8), optimize=True)
 
 
 def sheet(case: Case, path: Path) -> None:
@@ -273,33 +297,45 @@ def sheet(case: Case, path: Path) -> None:
         for c in SHEET.values()
     ]
     rows = [np.concatenate(shown[i : i + 3], 1) for i in (0, 3)]
-    store.write_image(path, (np.concatenate(rows, 0) * 255 + 0.5).astype(np.uint8), optimize=True)
+    write_picture(path, rows)
     say(f"{path}: " + ", ".join(SHEET))
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[41, 42])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[41, 42])
     parser.add_argument("--size", default="240x160")
     parser.add_argument("--only", nargs="+", default=["fog", "dusk", "overcast", "night", "wet", "snow"])
     parser.add_argument("--fit", type=Path)
     parser.add_argument("--sheet", type=Path)
+    parser.add_argument("--pairs", type=Path)
     options = parser.parse_args()
     width, height = (int(n) for n in options.size.split("x"))
-    scores: dict[str, Callable[[Case], Iterable[str]]] = {"fog": score_fog, "wet": score_wet, "snow": score_snow}
+    scores: dict[str, Callable[[Case], Result]] = {"fog": score_fog, "wet": score_wet, "snow": score_snow}
     scores |= {name: (lambda case, name=name: score_light(case, name)) for name in ("dusk", "overcast", "night")}
     if options.fit is not None:
         case, fitted = fitted_view(options.fit, (width, height))
-        say(f"fog, {options.fit}: " + "; ".join(score_fog(case, fitted=fitted)))
+        say(f"fog, {options.fit}: " + "; ".join(score_fog(case, fitted=fitted).lines))
     for seed in options.seeds:
         case = case_of(config_of(seed, (width, height)))
+        results: dict[str, Result] = {}
         for name in options.only:
             if name in scores:
                 begin = time.perf_counter()
-                say(f"seed {seed} {name}: " + "; ".join(scores[name](case)) + f" ({time.perf_counter() - begin:.0f} s)")
+                results[name] = scores[name](case)
+                say(
+                    f"seed {seed} {name}: " + "; ".join(results[name].lines) + f" ({time.perf_counter() - begin:.0f} s)"
+                )
         if options.sheet is not None:
             sheet(case, options.sheet)
+        if options.pairs is not None:
+            rows = [
+                np.concatenate([getattr(result, kind) for result in results.values()], 1)
+                for kind in ("edited", "truth")
+            ]
+            write_picture(options.pairs, rows)
+            say(f"{options.pairs}: " + ", ".join(results))
 
 
 if __name__ == "__main__":

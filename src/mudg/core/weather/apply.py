@@ -105,6 +105,8 @@ def _in_new_light(
     target = relight.target_light(light, settings)
     lamps = relight.night_lights(gbuffer, view, target, settings) if settings.time == "night" else None
     color, sure = relight.relit(gbuffer, view, light, target, lamps)
+    if settings.time == "night" and settings.lamps and light.lamps is not None:
+        color[relight.lamp_heads(gbuffer, view, light.lamps)] = relight.LAMP_RADIANCE * relight.LAMP_COLOR
     # what was given for the recorded light is none for the new one
     return replace(gbuffer, color=color, sunlit=gbuffer.new_sunlit, mirror=None), target, sure
 

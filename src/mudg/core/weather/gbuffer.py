@@ -177,13 +177,14 @@ def from_render(
     if heights is not None:
         points = world_points(view, clean)
         openness = np.ones_like(openness)
-        openness[~sky] = heights.openness(points[~sky])
+        openness[~sky] = heights.openness(points[~sky] + heights.clear_of(normal[~sky]))
     return GBuffer(np.maximum(light, 0).astype(np.float32), clean, classes, normal, openness)
 
 
 # --- what stands above ------------------------------------------------------------------------------------------------
 
 _LIFT_M = 0.35
+CLEAR_CELLS = 1.0
 
 
 def sky_share(openness: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -230,6 +231,10 @@ class HeightMap:
         top[np.bincount(index, minlength=len(top)) < least] = -np.inf
         return cls(float(low[0]), float(low[1]), cell_m, top.reshape(rows, columns))
 
+    def clear_of(self, normal: NDArray[np.floating]) -> Array:
+        """How far places f64[N, 3] are moved along normals [N, 3] before rays start, so that a wall does not stand in its own light."""
+        return CLEAR_CELLS * self.cell_m * normal.astype(np.float64)
+
     def at(self, xy: Array) -> Array:
         """Heights f64[...] at world places [..., 2]; -inf outside and where nothing is known."""
         column = np.floor((xy[..., 0] - self.x0_m) / self.cell_m).astype(np.int64)
@@ -267,7 +272,8 @@ def sun_visibility(gbuffer: GBuffer, view: View, heights: HeightMap, direction: 
     out = np.zeros(gbuffer.depth.shape, np.float32)
     facing = ~gbuffer.sky & (gbuffer.normal @ np.asarray(direction) > 0)
     points = world_points(view, gbuffer.depth)
-    out[facing] = heights.free(points[facing], np.asarray(direction, np.float64), 120.0)
+    start = points[facing] + heights.clear_of(gbuffer.normal[facing])
+    out[facing] = heights.free(start, np.asarray(direction, np.float64), 120.0)
     return out
 
 

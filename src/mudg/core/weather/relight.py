@@ -29,6 +29,7 @@ GROUND_ALBEDO = np.array([0.36, 0.34, 0.31])
 LEAST_ALBEDO, MOST_ALBEDO = 0.01, 0.9
 _CLASS_SPREAD = 0.35
 _TYPICAL_SPREAD = 0.5
+_PAINT_WEIGHT = 0.2  # vehicles and signs have any albedo: the image says little
 TYPICAL_ALBEDO = {
     ID["road"]: 0.085,
     ID["sidewalk"]: 0.23,
@@ -43,6 +44,8 @@ LAMP_COLOR = np.array([1.0, 0.82, 0.55])
 LAMP_POWER = 64.0
 """50 lux at 8 m below the lamp."""
 LAMP_HALF_ANGLE_DEG = 75.0
+LAMP_HEAD_M = 0.5
+LAMP_RADIANCE = 2.5
 LAMP_REACH_M = 45.0
 BEAM_COLOR = np.array([1.0, 0.95, 0.85])
 BEAM_POWER = 400.0
@@ -94,7 +97,9 @@ def refined_sunlit(gbuffer: GBuffer, light: Surroundings, given: Plane, trust: f
             if number in TYPICAL_ALBEDO:
                 middle = (middle + np.log(TYPICAL_ALBEDO[number])) / 2
             spread = max(1.4826 * float(np.median(np.abs(albedo - middle))), _CLASS_SPREAD)
-            odds[of_class] += ((as_shade[of_class] - middle) ** 2 - (as_lit[of_class] - middle) ** 2) / (2 * spread**2)
+            weight = 1.0 if number in TYPICAL_ALBEDO else _PAINT_WEIGHT
+            evidence = (as_shade[of_class] - middle) ** 2 - (as_lit[of_class] - middle) ** 2
+            odds[of_class] += weight * evidence / (2 * spread**2)
         lit = 1 / (1 + np.exp(-np.clip(odds, -30, 30)))
     facing = gbuffer.normal @ light.sun_direction > 0.02
     return np.where(facing & ~gbuffer.sky, lit, 0).astype(np.float32)
@@ -248,7 +253,19 @@ def night_lights(gbuffer: GBuffer, view: View, target: Surroundings, settings: L
         out[solid] += lamp_light(xyz, normal, np.asarray(target.lamps, np.float64))
     if settings.headlights:
         out[solid] += headlight(xyz, normal, vehicle_lights(view, target.ground_z_m))
-    return out
+    # single normals at kerbs are wrong now and then, and a headlight shows every one
+    calm = ndimage.median_filter(out, (3, 3, 1))
+    return np.where(gbuffer.ground[..., None], calm, out)
+
+
+def lamp_heads(gbuffer: GBuffer, view: View, lamps: Array) -> NDArray[np.bool_]:
+    """bool[H, W]: what stands within ``LAMP_HEAD_M`` of a street lamp's place, and so shines."""
+    heads = np.zeros(gbuffer.depth.shape, bool)
+    solid = ~gbuffer.sky
+    xyz = world_points(view, gbuffer.depth)[solid]
+    for lamp in np.asarray(lamps, np.float64):
+        heads[solid] |= np.linalg.norm(xyz - lamp, axis=1) < LAMP_HEAD_M
+    return heads & (gbuffer.classes == ID["pole"])
 
 
 def glow(color: Image, share: float = 0.06, sigma_px: float = 4.0) -> Image:
