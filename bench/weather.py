@@ -113,7 +113,7 @@ class Case:
         """From depth images of all frames and cameras."""
         parts = []
         for name in self.world.cameras():
-            for view in self.world.frame_views(name)[::2]:
+            for view in self.world.frame_views(name)[1::2]:
                 truth = self.world.render(view, supersample=1)
                 static = ~truth.sky & ((truth.instance == 0) | (view.time_s == self.view.time_s))
                 parts.append(world_points(view, truth.depth)[static])
