@@ -189,8 +189,7 @@ def score_light(case: Case, name: str) -> Result:
     exact = replace(case.exact(own), new_sunlit=world.surfaces(case.view).sunlit)
     for label, gbuffer in (("exact surfaces", exact), ("height map", estimated)):
         clear = np.exp(
-            -fog.extinction(case.light.visibility_m)
-            * np.where(truth.sky, 0, weather.gbuffer.euclidean_range(case.view, gbuffer.depth))
+            -fog.extinction(case.light.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
         )
         gbuffer = replace(gbuffer, color=fog.unveiled(gbuffer.color, clear, around.airlight))
         points = None
@@ -198,8 +197,7 @@ def score_light(case: Case, name: str) -> Result:
             points = relight.night_lights(gbuffer, case.view, goal, LightSettings(time="night", headlights=False))
         lit, _ = relight.relit(gbuffer, case.view, around, goal, points)
         hazy = np.exp(
-            -fog.extinction(target.visibility_m)
-            * np.where(truth.sky, 0, weather.gbuffer.euclidean_range(case.view, gbuffer.depth))
+            -fog.extinction(target.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
         )
         shown = there.encode(fog.veiled(lit, np.where(truth.sky, 1, hazy), goal.airlight))
         lines.append(f"{label} {psnr(shown, truth.rgb, solid):.1f}")
@@ -241,7 +239,7 @@ def score_snow(case: Case, cover: float = 0.7) -> Result:
     for label, gbuffer in (("exact surfaces", case.exact(own)), ("height map", estimated)):
         found = ground.snow_cover(gbuffer, case.view, cover, config.seed)
         iou = ((found > 0.5) & lies).sum() / max(((found > 0.5) | lies).sum(), 1)
-        sunlit = relight.refined_sunlit(gbuffer, around, gbuffer.sunlit)
+        sunlit = relight.sunlit_of(gbuffer, around)
         light = gbuffer.color + (ground.snow_light(gbuffer, around, sunlit) - gbuffer.color) * found[..., None]
         shown = own.encode(light)
         lines.append(f"{label}: IoU {iou:.3f}, PSNR {psnr(shown, truth.rgb, solid):.1f}")
@@ -260,7 +258,7 @@ def fitted_view(run: Path, size: tuple[int, int]) -> tuple[Case, tuple[Picture, 
     folder = next(p for name in ("mudg_s", "street_gaussians") if (p := run / "fit" / name).is_dir())
     shown = FittedScene.read(folder, "cpu").render(view.camera, view.world_from_cam, view.time_s)
     case = Case(world, view, world.render(view), city_light(world.config, world.lamps))
-    return case, (shown.rgb.astype(np.float32) / 255, shown.depth_m)
+    return case, ((shown.rgb / 255).astype(np.float32), shown.depth_m)
 
 
 SHEET: dict[str, Conditions] = {

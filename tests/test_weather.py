@@ -112,6 +112,13 @@ def test_normals_of_planes_come_out_exactly(view: View) -> None:
     assert not found[scene.sky].any()
 
 
+def test_near_kerbs_stay_steep_and_far_noise_of_the_ground_does_not() -> None:
+    view, classes = forward_view(), np.full((HEIGHT, WIDTH), ID["sidewalk"], np.uint8)
+    near, far = (normals_from_depth(view, np.full((HEIGHT, WIDTH), d, np.float32), classes) for d in (5.0, 30.0))
+    np.testing.assert_allclose(near[20, 30], [-1, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(far[20, 30], [0, 0, 1], atol=1e-5)
+
+
 def test_range_is_longer_than_depth_beside_the_axis() -> None:
     view = forward_view()
     distance = euclidean_range(view, np.full((HEIGHT, WIDTH), 10.0))
@@ -366,3 +373,24 @@ def test_settings_go_through_plain_values_and_refuse_what_is_out_of_range() -> N
         assert build(Conditions, to_dict(case), "edits") == case
     with pytest.raises(UsageError, match="visibility_m"):
         build(Conditions, {"weather": {"fog": {"visibility_m": 0.1}}}, "edits.yaml")
+
+
+def test_a_drive_is_edited_image_by_image() -> None:
+    shown = []
+    for yaw in (-0.2, 0.2):
+        view = forward_view(yaw)
+        scene = street(view)
+        shown.append(weather.ShownView(view, tone.SRGB.encode(scene.color), scene.depth, scene.classes))
+    drive = weather.drive_facts(shown, tone.SRGB)
+    assert drive.surroundings.ground_z_m == pytest.approx(0, abs=1e-3)
+    assert drive.heights is not None
+    assert drive.heights.top_m.max() == pytest.approx(6, abs=0.3)
+    same, result = weather.edited_view(shown[0], Conditions(), 1, drive)
+    np.testing.assert_allclose(same, shown[0].rgb, atol=1e-5)
+    assert (result.confidence == 1).all()
+    foggy, _ = weather.edited_view(shown[0], CASES["fog"], 1, drive)
+    wall = shown[0].classes == ID["building"]
+    air = tone.SRGB.encode(drive.surroundings.airlight[None])[0]
+    assert np.abs(foggy - air)[wall].mean() < 0.5 * np.abs(shown[0].rgb - air)[wall].mean()
+    with pytest.raises(InputError, match="estimated from views"):
+        weather.drive_facts([], tone.SRGB)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mudg.base import geometry
-from mudg.base.types import Camera, View
+from mudg.base.types import Camera, SweepPoints, View
+from mudg.base.weather_settings import FogSettings, RainSettings, WeatherSettings
 from mudg.core.weather import lidar, particles
 
 
@@ -198,3 +199,30 @@ def test_thicker_fog_never_returns_more_of_the_surfaces() -> None:
     clear = lidar.in_fog(ranges, reflectances, 1e9, 1, SENSOR)
     assert (clear.kind == 1).mean() == pytest.approx(detected_in(np.ones(4001), np.linspace(5, 120, 4001)), abs=0.02)
     assert replace(SENSOR, range_10_m=45).threshold == pytest.approx(4 * SENSOR.threshold)
+
+
+def test_a_sweep_in_fog_and_rain_keeps_its_beams() -> None:
+    rng = np.random.default_rng(4)
+    ranges, reflectances = beams()
+    directions = rng.normal(size=(COUNT, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = SweepPoints(
+        (directions * ranges[:, None]).astype(np.float32), reflectances.astype(np.float32), np.zeros(COUNT, np.float32),
+        np.full(COUNT, 2, np.uint8),
+    )  # fmt: skip
+    clear, kinds = lidar.sweep_in_weather(points, WeatherSettings(), 1, LATE)
+    np.testing.assert_allclose(clear.xyz, points.xyz, rtol=1e-5, atol=1e-5)
+    assert (kinds == 1).all()
+    bad = WeatherSettings(fog=FogSettings(visibility_m=150), rain=RainSettings(mm_h=10))
+    found, _ = lidar.sweep_in_weather(points, bad, 1, LATE)
+    assert 0 < len(found.xyz) < COUNT
+    near, kinds = lidar.sweep_in_weather(points, bad, 1, SENSOR)
+    assert near.classes is not None
+    assert set(near.classes[kinds == 2].tolist()) == {255}
+    assert set(near.classes[kinds == 1].tolist()) == {2}
+    again = lidar.sweep_in_weather(points, bad, 1, LATE)[0]
+    np.testing.assert_array_equal(found.xyz, again.xyz)
+    fog_alone, _ = lidar.sweep_in_weather(points, WeatherSettings(fog=FogSettings(visibility_m=150)), 1, LATE)
+    assert len(found.xyz) < len(fog_alone.xyz)
+    got = found.xyz / np.linalg.norm(found.xyz, axis=1, keepdims=True)
+    assert {tuple(d) for d in np.round(got[:200], 4)} <= {tuple(d) for d in np.round(directions.astype(np.float32), 4)}

@@ -1,6 +1,7 @@
 """Weather and light as pure functions of a G-buffer, in linear light. Models, sources and assumptions: docs/weather.md."""
 
 from mudg.core.weather.apply import Weathered, apply
+from mudg.core.weather.drive import DriveFacts, ShownView, drive_facts, edited_view
 from mudg.core.weather.gbuffer import (
     GBuffer,
     HeightMap,
@@ -13,6 +14,6 @@ from mudg.core.weather.gbuffer import (
 from mudg.core.weather.tone import FilmicResponse, ToneCurve, curve_of
 
 __all__ = [
-    "FilmicResponse", "GBuffer", "HeightMap", "Surroundings", "ToneCurve", "Weathered", "apply", "curve_of", "estimate_surroundings",
-    "from_render", "mirror_view", "sun_visibility",
+    "DriveFacts", "FilmicResponse", "GBuffer", "HeightMap", "ShownView", "Surroundings", "ToneCurve", "Weathered", "apply", "curve_of",
+    "drive_facts", "edited_view", "estimate_surroundings", "from_render", "mirror_view", "sun_visibility",
 ]  # fmt: skip

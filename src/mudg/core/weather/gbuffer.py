@@ -21,7 +21,8 @@ Plane = NDArray[np.float32]
 Array = NDArray[np.float64]
 
 GROUND_IDS = (ID["road"], ID["sidewalk"], ID["terrain"])
-_LEVEL_GROUND = np.cos(np.radians(30.0))
+_LEVEL_GROUND, _KERB = np.cos(np.radians(30.0)), np.cos(np.radians(65.0))
+KERBS_WITHIN_M = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +130,8 @@ def normals_from_depth(view: View, depth: NDArray[np.floating], classes: NDArray
     """Unit normals f32[H, W, 3] in the world, towards the camera; 0 in the sky.
 
     The inverse depth of a plane is linear in the pixel, so its gradient gives the normal exactly. At edges the smaller of two
-    one-sided differences is taken. With ``classes``, ground that comes out steeper than 30 degrees is taken as level.
+    one-sided differences is taken. With ``classes``, ground that comes out steeper than 30 degrees is taken as level, other than kerbs:
+    nearer than ``KERBS_WITHIN_M`` and steeper than 65 degrees.
     """
     camera = view.camera
     w = np.where(np.isfinite(depth) & (depth > 0), 1.0 / np.maximum(depth, 1e-6), 0.0).astype(np.float64)
@@ -144,7 +146,8 @@ def normals_from_depth(view: View, depth: NDArray[np.floating], classes: NDArray
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(size > 0, normal / np.maximum(size, 1e-300), 0.0)
     if classes is not None:
-        steep = np.isin(classes, GROUND_IDS) & (normal[..., 2] < _LEVEL_GROUND)
+        kerb = (normal[..., 2] < _KERB) & (depth < KERBS_WITHIN_M)
+        steep = np.isin(classes, GROUND_IDS) & (normal[..., 2] < _LEVEL_GROUND) & ~kerb
         normal[steep] = (0.0, 0.0, 1.0)
     normal[w == 0] = 0
     return normal.astype(np.float32)

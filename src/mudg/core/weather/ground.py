@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from mudg.base import seeds
 from mudg.base.palette import ID
@@ -46,7 +47,7 @@ def noise_seed(seed: int, purpose: str) -> int:
 
 def fresnel(cosine: NDArray[np.floating]) -> Array:
     """Share of light that water mirrors, by the cosine between ray and normal (Schlick's form, n = 1.33)."""
-    return 0.02 + 0.98 * (1 - np.clip(cosine, 0, 1)) ** 5
+    return 0.02 + 0.98 * (1 - np.clip(np.asarray(cosine, np.float64), 0, 1)) ** 5
 
 
 def puddle_mask(xy: Array, share: float, seed: int) -> Array:
@@ -179,8 +180,6 @@ def snow_weight(
 
 def wheel_tracks(xy: Array, path: Array) -> Array:
     """1 at places [..., 2] where the two wheels of a vehicle went whose centre followed a path [N, 3] of x, y, yaw; 0 elsewhere."""
-    from scipy.spatial import cKDTree
-
     steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.arange(0, along[-1] + 0.1, 0.1)
@@ -191,7 +190,7 @@ def wheel_tracks(xy: Array, path: Array) -> Array:
     )
     left = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
     wheels = np.concatenate([np.stack([x, y], 1) + side * WHEEL_OFFSET_M * left for side in (-1, 1)])
-    distance, _ = cKDTree(wheels).query(xy.reshape(-1, 2))
+    distance, _ = KDTree(wheels).query(xy.reshape(-1, 2))
     return (distance.reshape(xy.shape[:-1]) < WHEEL_HALF_M).astype(np.float64)
 
 

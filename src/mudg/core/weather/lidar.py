@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import seeds
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import SweepPoints
+from mudg.base.weather_settings import WeatherSettings
 
 Array = NDArray[np.float64]
 
@@ -87,13 +90,13 @@ def soft_response(
         Distances f64[M] in metres and powers f64[M].
     """
     alpha = math.log(20.0) / visibility_m
-    r = (np.arange(int(reach_m / step_m)) + 0.5) * step_m
+    r = (np.arange(int(reach_m / step_m), dtype=np.float64) + 0.5) * step_m
     density = (
         np.exp(-2 * alpha * r)
         / r**2
         * np.clip((r - sensor.cross_from_m) / (sensor.cross_to_m - sensor.cross_from_m), 0, 1)
     )
-    shape = _pulse((np.arange(int(2 * PULSE_M / step_m)) + 0.5) * step_m)
+    shape = _pulse((np.arange(int(2 * PULSE_M / step_m), dtype=np.float64) + 0.5) * step_m)
     power = np.convolve(density, shape, mode="same") * step_m
     return r, BACKSCATTER / visibility_m * power
 
@@ -146,3 +149,43 @@ def in_rain(
 def rain_share(range_m: Array, mm_h: float) -> Array:
     """Share of the power that comes back through rain, f64[N]."""
     return np.exp(-0.02 * mm_h**0.6 * range_m) if mm_h > 0 else np.ones_like(range_m)
+
+
+def sweep_in_weather(
+    points: SweepPoints, weather: WeatherSettings, seed: int, sensor: LidarSensor | None = None
+) -> tuple[SweepPoints, NDArray[np.uint8]]:  # fmt: skip
+    """A sweep as it would have been in fog and rain.
+
+    The recorded intensity is taken as reflectance times the cosine of incidence, 0 to 1: sensors whose intensity means something else
+    need it converted first. Snow in the air is not modelled.
+
+    Args:
+        points: in the LiDAR's frame, recorded in clear air.
+        weather: fog and rain of it.
+        seed: another for every sweep.
+        sensor: thresholds.
+
+    Returns:
+        The points that return, moved along their beams, and for each 1 = surface, 2 = fog, u8[N].
+    """
+    xyz = points.xyz.astype(np.float64)
+    distance = np.maximum(np.linalg.norm(xyz, axis=1), 1e-3)
+    beams = xyz / distance[:, None]
+    shown, intensity = distance, points.intensity.astype(np.float64)
+    kind = np.full(len(xyz), _HARD, np.uint8)
+    if weather.fog is not None:
+        fog = in_fog(shown, intensity, weather.fog.visibility_m, seed, sensor)
+        shown, intensity, kind = fog.range_m, fog.intensity, fog.kind
+    if weather.rain is not None:
+        # fog that returned stands near the sensor and is recorded as it is
+        rain = in_rain(shown, intensity, weather.rain.mm_h, seed, sensor)
+        hard = kind == _HARD
+        shown, intensity = np.where(hard, rain.range_m, shown), np.where(hard, rain.intensity, intensity)
+        kind = np.where(hard, rain.kind, kind).astype(np.uint8)
+    kept = kind != _LOST
+    classes = (
+        None if points.classes is None else np.where(kind == _SOFT, UNLABELLED, points.classes).astype(np.uint8)[kept]
+    )
+    moved = (beams * shown[:, None]).astype(np.float32)[kept]
+    result = SweepPoints(moved, np.clip(intensity, 0, 1).astype(np.float32)[kept], points.dt_s[kept], classes)
+    return result, kind[kept]
