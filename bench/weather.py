@@ -35,6 +35,7 @@ from mudg.core.weather.gbuffer import (
     GBuffer,
     HeightMap,
     Surroundings,
+    euclidean_range,
     from_render,
     mirror_view,
     sun_visibility,
