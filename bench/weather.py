@@ -32,6 +32,7 @@ from mudg.base.weather_settings import (
 from mudg.core import weather
 from mudg.core.weather import fog, ground, relight
 from mudg.core.weather.gbuffer import (
+    BufferRules,
     GBuffer,
     HeightMap,
     Surroundings,
@@ -103,7 +104,9 @@ class Case:
 
     def gbuffer(self, curve: ToneCurve, heights: HeightMap | None = None) -> GBuffer:
         """From the image, exact depth and exact classes."""
-        return from_render(self.view, curve.decode(self.truth.rgb), self.truth.depth, self.truth.semantics, heights)
+        return from_render(
+            self.view, curve.decode(self.truth.rgb), self.truth.depth, self.truth.semantics, BufferRules(heights)
+        )
 
     def exact(self, curve: ToneCurve) -> GBuffer:
         """With exact normals and visible share of the sky, too."""
@@ -266,10 +269,12 @@ SHEET: dict[str, Conditions] = {
     "as recorded": Conditions(),
     "fog, 100 m": Conditions(weather=WeatherSettings(fog=FogSettings(visibility_m=100))),
     "overcast, rain 25 mm/h": Conditions(
-        weather=WeatherSettings(rain=RainSettings(mm_h=25), wet=1.0, puddles=0.35), light=LightSettings(time="overcast")
+        weather=WeatherSettings(rain=RainSettings(mm_h=25), wet=1.0, puddles=0.35),
+        light=LightSettings(time="overcast", exposure_ev=-0.3),
     ),
     "overcast, snow": Conditions(
-        weather=WeatherSettings(snow=SnowSettings(cover=0.85, mm_h=2)), light=LightSettings(time="overcast")
+        weather=WeatherSettings(snow=SnowSettings(cover=0.85, mm_h=2)),
+        light=LightSettings(time="overcast", exposure_ev=-0.7),
     ),
     "dusk": Conditions(light=LightSettings(time="dusk", sun_azimuth_deg=60)),
     "wet night": Conditions(

@@ -119,6 +119,36 @@ def test_near_kerbs_stay_steep_and_far_noise_of_the_ground_does_not() -> None:
     np.testing.assert_allclose(far[20, 30], [0, 0, 1], atol=1e-5)
 
 
+def test_noisy_depth_gives_steady_normals() -> None:
+    view = forward_view()
+    scene = street(view)
+    noise_share = 1 + 0.01 * np.random.default_rng(3).normal(size=scene.depth.shape).astype(np.float32)
+
+    def error_deg(smooth_px: int) -> float:
+        found = from_render(
+            view, scene.color, scene.depth * noise_share, scene.classes, weather.BufferRules(smooth_px=smooth_px)
+        )
+        return float(np.degrees(np.arccos(np.clip((found.normal * scene.normal).sum(-1)[~scene.sky], -1, 1))).mean())
+
+    assert error_deg(2) < 0.5 * error_deg(0)
+
+
+def test_guessed_light_does_not_exceed_what_a_camera_exposes_for() -> None:
+    view = forward_view()
+    scene = street(view)
+    color = np.where(scene.sky[..., None], 1.0, scene.color).astype(np.float32)
+    color[:, ::2][scene.classes[:, ::2] == ID["road"]] = 0.5
+    found = weather.estimate_surroundings([(view, replace(scene, color=color))])
+    assert float((found.ambient + found.sun).mean()) < 1.41
+    assert found.airlight.max() <= 0.8
+
+
+@pytest.mark.parametrize(("time", "share"), [("overcast", 1.0), ("dusk", 0.5)])
+def test_new_light_is_exposed_as_a_camera_would(time: str, share: float) -> None:
+    target = relight.target_light(sunny(), LightSettings(time=time))  # type: ignore[arg-type]
+    assert relight.ground_level(target) == pytest.approx(share * relight.ground_level(sunny()), rel=0.01)
+
+
 def test_range_is_longer_than_depth_beside_the_axis() -> None:
     view = forward_view()
     distance = euclidean_range(view, np.full((HEIGHT, WIDTH), 10.0))

@@ -3,6 +3,7 @@
 from mudg.core.weather.apply import Weathered, apply
 from mudg.core.weather.drive import DriveFacts, ShownView, drive_facts, edited_view
 from mudg.core.weather.gbuffer import (
+    BufferRules,
     GBuffer,
     HeightMap,
     Surroundings,
@@ -14,6 +15,6 @@ from mudg.core.weather.gbuffer import (
 from mudg.core.weather.tone import FilmicResponse, ToneCurve, curve_of
 
 __all__ = [
-    "DriveFacts", "FilmicResponse", "GBuffer", "HeightMap", "ShownView", "Surroundings", "ToneCurve", "Weathered", "apply", "curve_of",
-    "drive_facts", "edited_view", "estimate_surroundings", "from_render", "mirror_view", "sun_visibility",
+    "BufferRules", "DriveFacts", "FilmicResponse", "GBuffer", "HeightMap", "ShownView", "Surroundings", "ToneCurve", "Weathered", "apply",
+    "curve_of", "drive_facts", "edited_view", "estimate_surroundings", "from_render", "mirror_view", "sun_visibility",
 ]  # fmt: skip

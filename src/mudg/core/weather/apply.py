@@ -103,10 +103,12 @@ def _in_new_light(
     gbuffer: GBuffer, view: View, light: Surroundings, settings: LightSettings
 ) -> tuple[GBuffer, Surroundings, Plane]:  # fmt: skip
     target = relight.target_light(light, settings)
-    lamps = relight.night_lights(gbuffer, view, target, settings) if settings.time == "night" else None
+    lamps, scale = None, relight.NIGHT_LEVEL * relight.ground_level(light)
+    if settings.time == "night":
+        lamps = scale * relight.night_lights(gbuffer, view, target, settings)
     color, sure = relight.relit(gbuffer, view, light, target, lamps)
     if settings.time == "night" and settings.lamps and light.lamps is not None:
-        color[relight.lamp_heads(gbuffer, view, light.lamps)] = relight.LAMP_RADIANCE * relight.LAMP_COLOR
+        color[relight.lamp_heads(gbuffer, view, light.lamps)] = scale * relight.LAMP_RADIANCE * relight.LAMP_COLOR
     # what was given for the recorded light is none for the new one
     return replace(gbuffer, color=color, sunlit=gbuffer.new_sunlit, mirror=None), target, sure
 

@@ -13,6 +13,7 @@ from mudg.base.types import View
 from mudg.base.weather_settings import Conditions
 from mudg.core.weather.apply import Weathered, apply
 from mudg.core.weather.gbuffer import (
+    BufferRules,
     HeightMap,
     Surroundings,
     estimate_surroundings,
@@ -24,6 +25,8 @@ from mudg.core.weather.relight import target_light
 from mudg.core.weather.tone import ToneCurve, curve_of
 
 Image = NDArray[np.float32]
+LEAST_POINTS = 2
+"""Pixels that a cell of the height map needs, so that single wrong depths do not stand in the air."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,10 +42,17 @@ class ShownView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveFacts:
-    """What all frames of a drive share: its light, and a height map for shadows and snow (None = by class alone)."""
+    """What all frames of a drive share.
+
+    Args:
+        surroundings: its light.
+        heights: height map for shadows and snow; None = by class alone.
+        smooth_px: smoothing of normals, ``BufferRules.smooth_px``.
+    """
 
     surroundings: Surroundings
     heights: HeightMap | None = None
+    smooth_px: int = 2
 
 
 def drive_facts(
@@ -62,7 +72,7 @@ def drive_facts(
     points = [world_points(view, buffer.depth)[~buffer.sky] for view, buffer in pairs]
     around = replace(estimate_surroundings(pairs), path=path)
     xyz = np.concatenate(points)
-    return DriveFacts(around, HeightMap.from_points(xyz, cell_m) if len(xyz) else None)
+    return DriveFacts(around, HeightMap.from_points(xyz, cell_m, least=LEAST_POINTS) if len(xyz) else None)
 
 
 def edited_view(
@@ -85,7 +95,9 @@ def edited_view(
         Display values f32[H, W, 3] and the linear light with its confidence.
     """
     tone, around, view = curve_of(settings.response), drive.surroundings, shown.view
-    gbuffer = from_render(view, tone.decode(shown.rgb), shown.depth, shown.classes, drive.heights)
+    gbuffer = from_render(
+        view, tone.decode(shown.rgb), shown.depth, shown.classes, BufferRules(drive.heights, drive.smooth_px)
+    )
     gbuffer = replace(gbuffer, camera_velocity=velocity)
     if drive.heights is not None:
         goal = target_light(around, settings.light)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from mudg.base import geometry
 from mudg.base.errors import InputError
@@ -161,9 +162,39 @@ def openness_by_class(classes: NDArray[np.uint8], normal: Image) -> Plane:
     return np.where(classes == ID["sky"], 1.0, share).astype(np.float32)
 
 
+def steadied(normal: Image, classes: NDArray[np.uint8], radius: int) -> Image:
+    """Unit normals f32[H, W, 3], each the mean of those of its class within a square of ``2 radius + 1`` pixels; 0 stays 0."""
+    if radius == 0:
+        return normal
+    mean = np.zeros(normal.shape, np.float64)
+    for number in np.unique(classes):
+        of_class = (classes == number)[..., None]
+        box = (2 * radius + 1, 2 * radius + 1, 1)
+        mean += of_class * ndimage.uniform_filter(
+            np.where(of_class, normal, 0).astype(np.float64), box, mode="constant"
+        )
+    size = np.linalg.norm(mean, axis=-1, keepdims=True)
+    known = normal.any(-1, keepdims=True)
+    return np.where(known & (size > 1e-9), mean / np.maximum(size, 1e-9), 0).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BufferRules:
+    """How surfaces are found in a render.
+
+    Args:
+        heights: height map of the drive; None = the sky's visibility is a guess by class.
+        smooth_px: radius in pixels over which inverse depth (median) and normals (mean, per class) are smoothed: 0 for exact depth, about
+            2 for the depth of a fitted scene.
+    """
+
+    heights: HeightMap | None = None
+    smooth_px: int = 0
+
+
 def from_render(
-    view: View, light: Image, depth: NDArray[np.floating], classes: NDArray[np.uint8], heights: HeightMap | None = None
-) -> GBuffer:
+    view: View, light: Image, depth: NDArray[np.floating], classes: NDArray[np.uint8], rules: BufferRules | None = None
+) -> GBuffer:  # fmt: skip
     """A G-buffer from the planes of a render.
 
     Args:
@@ -171,22 +202,31 @@ def from_render(
         light: linear light f32[H, W, 3] (a ``ToneCurve`` decodes display values).
         depth: camera z; 0, negative or not finite = sky, as is everything of that class.
         classes: u8[H, W].
-        heights: of the drive; without it the sky's visibility is a guess by class.
+        rules: how; None = for exact depth, without a height map.
     """
+    rules = rules or BufferRules()
     sky = ~np.isfinite(depth) | (depth <= 0) | (classes == ID["sky"])
     clean = np.where(sky, np.inf, depth).astype(np.float32)
-    normal = normals_from_depth(view, clean, classes)
+    calm = clean
+    if rules.smooth_px:
+        inverse = ndimage.median_filter(1 / clean, 2 * rules.smooth_px + 1)
+        calm = np.where(sky | (inverse <= 0), clean, 1 / np.maximum(inverse, 1e-6)).astype(np.float32)
+    normal = steadied(normals_from_depth(view, calm, classes), classes, rules.smooth_px)
     openness = openness_by_class(classes, normal)
-    if heights is not None:
+    if rules.heights is not None:
         points = world_points(view, clean)
         openness = np.ones_like(openness)
-        openness[~sky] = heights.openness(points[~sky] + heights.clear_of(normal[~sky]))
+        openness[~sky] = rules.heights.openness(points[~sky] + rules.heights.clear_of(normal[~sky]))
     return GBuffer(np.maximum(light, 0).astype(np.float32), clean, classes, normal, openness)
 
 
 # --- what stands above ------------------------------------------------------------------------------------------------
 
+WHITE_IN_SUN = 1.4
+"""Cameras expose so that a white surface in the sun is about at their limit of 1: light that is guessed is no brighter than this."""
 _LIFT_M = 0.35
+BRIGHTEST_FOG = 0.8
+"""Airlight that is guessed from a sky is no brighter: cameras expose for fog, and a clipped sky says little."""
 CLEAR_CELLS = 1.0
 
 
@@ -346,11 +386,14 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: flo
     pixels = np.concatenate(ground)
     dark, bright = (_quantile_color(pixels, share, np.full(3, 0.1)) for share in (0.1, 0.9))
     sun = ambient * np.clip(bright / np.maximum(dark, 1e-4) - 1.6, 0, 5)  # 1.6: texture of asphalt alone
+    too_bright = max(float((ambient + sun).mean()) / WHITE_IN_SUN, 1.0)
+    ambient, sun = ambient / too_bright, sun / too_bright
     z = np.concatenate(heights)
     ground_z = ground_z_m if ground_z_m is not None else (float(np.median(z)) if len(z) else 0.0)
     up, color = (np.concatenate(parts) for parts in zip(*rises, strict=True))
     lowest = color[up <= np.quantile(up, 0.1)] if len(up) else color
     airlight = _quantile_color(lowest, 0.5, horizon)
+    airlight = airlight * min(1.0, BRIGHTEST_FOG / max(float(airlight.max()), 1e-6))
     return Surroundings(horizon, zenith, ambient, sun, np.array([0.0, 0.0, 1.0]), airlight, ground_z)
 
 

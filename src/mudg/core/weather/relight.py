@@ -54,6 +54,7 @@ BEAM_CUT_DEG = -1.0
 BEAM_SIDE_M = 0.65
 BEAM_WIDTH_DEG = 14.0
 NIGHT_SKY = 0.012
+NIGHT_LEVEL = 0.55
 _LIT_IDS = (ID["traffic light"],)
 
 
@@ -132,35 +133,35 @@ def albedo_of(gbuffer: GBuffer, light: Surroundings, sunlit: Plane) -> Array:
     return albedo
 
 
+def ground_level(light: Surroundings) -> float:
+    """Irradiance over pi of level ground, half of it in the sun: what automatic exposure follows."""
+    return float((light.ambient + 0.5 * light.sun * max(float(light.sun_direction[2]), 0.0)).mean())
+
+
 def target_light(recorded: Surroundings, settings: LightSettings) -> Surroundings:
-    """The light that settings name, in the unit of the recorded one: its level stays that of a camera with automatic exposure."""
-    level = float(recorded.ambient.mean())
+    """The light that settings name, in the unit of the recorded one, as a camera with automatic exposure shows it: ground as bright
+    as recorded under an overcast sky, half as bright at dusk; at night a lamp's 50 lux stand for ``NIGHT_LEVEL`` of the recorded light."""
+    level = ground_level(recorded)
     azimuth, elevation = np.radians(settings.sun_azimuth_deg), np.radians(settings.sun_elevation_deg)
     low_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     zero, upright = np.zeros(3), np.array([0.0, 0.0, 1.0])
 
-    def light(horizon: Array, zenith: Array, ambient: Array, sun: Array, direction: Array) -> Surroundings:
-        return replace(
-            recorded,
-            horizon=horizon,
-            zenith=zenith,
-            ambient=ambient,
-            sun=sun,
-            sun_direction=direction,
-            airlight=0.9 * horizon,
-        )
+    def light(scale: float, sky: tuple[Array, Array, Array], sun: Array, direction: Array) -> Surroundings:
+        horizon, zenith, ambient = (scale * part for part in sky)
+        return replace(recorded, horizon=horizon, zenith=zenith, ambient=ambient, sun=scale * sun, sun_direction=direction,
+                       airlight=0.9 * horizon)  # fmt: skip
 
     if settings.time == "overcast":
-        grey = level * np.array([0.97, 1.0, 1.04])
-        return light(1.05 * grey, 0.9 * grey, grey, zero, upright)
+        grey = np.array([0.97, 1.0, 1.04])
+        return light(level, (1.05 * grey, 0.9 * grey, grey), zero, upright)
     if settings.time == "dusk":
         sun = np.array([2.6, 1.45, 0.68]) * 0.8 * float(smoothstep(-2.0, 6.0, settings.sun_elevation_deg))
-        return light(
-            np.array([1.05, 0.68, 0.45]), np.array([0.2, 0.27, 0.5]), np.array([0.4, 0.42, 0.56]), sun, low_sun
-        )
+        sky = np.array([1.05, 0.68, 0.45]), np.array([0.2, 0.27, 0.5]), np.array([0.4, 0.42, 0.56])
+        plain = light(1.0, sky, sun, low_sun)
+        return light(0.5 * level / ground_level(plain), sky, sun, low_sun)
     if settings.time == "night":
-        sky = NIGHT_SKY * np.array([0.8, 0.85, 1.0])
-        return light(2.5 * sky * np.array([1.3, 1.0, 0.7]), 0.6 * sky, sky, zero, upright)
+        dark = NIGHT_SKY * np.array([0.8, 0.85, 1.0])
+        return light(NIGHT_LEVEL * level, (2.5 * dark * np.array([1.3, 1.0, 0.7]), 0.6 * dark, dark), zero, upright)
     return recorded
 
 
