@@ -168,11 +168,10 @@ def steadied(normal: Image, classes: NDArray[np.uint8], radius: int) -> Image:
         return normal
     mean = np.zeros(normal.shape, np.float64)
     for number in np.unique(classes):
-        of_class = (classes == number)[..., None]
-        box = (2 * radius + 1, 2 * radius + 1, 1)
-        mean += of_class * ndimage.uniform_filter(
-            np.where(of_class, normal, 0).astype(np.float64), box, mode="constant"
-        )
+        of_class = classes == number
+        for axis in range(3):
+            part = np.where(of_class, normal[..., axis], 0).astype(np.float64)
+            mean[..., axis] += of_class * ndimage.uniform_filter(part, 2 * radius + 1, mode="constant")
     size = np.linalg.norm(mean, axis=-1, keepdims=True)
     known = normal.any(-1, keepdims=True)
     return np.where(known & (size > 1e-9), mean / np.maximum(size, 1e-9), 0).astype(np.float32)
