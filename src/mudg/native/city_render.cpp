@@ -5,6 +5,26 @@ namespace {
 constexpr float kNear = 0.05f;
 constexpr float kFar = 900.0f;
 constexpr float kLift = 0.012f;  // start of shadow rays above a surface, metres
+
+// Snow and water on a surface: its albedo and gloss change. Returns the wetness of road and sidewalk that is not under snow.
+template <class Open>
+float take_weather(const Weather& weather, Vec3 point, bool on_ground, Surface& surface, Moment::Sample& sample, const Open& open) {
+  float wet = 0;
+  if (weather.wet > 0 && on_ground && surface.cls != kTerrain && surface.normal.z > 0.8f) {
+    wet = weather.wet;
+    sample.water = wet * water_at(weather, point);
+    surface.albedo *= 1 - wet * 0.6f;
+  }
+  if (weather.snow_level < 1.5f && surface.normal.z > 0.3f && surface.cls != kPerson && surface.cls != kRider) {
+    sample.snow = snow_at(weather, point, surface.normal, open()) * (surface.cls == kVegetation ? 0.6f : 1.0f);
+    surface.albedo = mix(surface.albedo, Vec3{0.882f, 0.891f, 0.918f}, sample.snow);
+    surface.gloss *= 1 - sample.snow;
+    surface.emission *= 1 - sample.snow;
+    wet *= 1 - sample.snow;
+    sample.water *= 1 - sample.snow;
+  }
+  return wet;
+}
 }  // namespace
 
 Moment::Moment(const World& world, const double* poses, int knots, const double* phases) : world_(world), knots_(knots) {
@@ -303,6 +323,11 @@ Moment::Sample Moment::look(Vec3 origin, Vec3 direction, float fraction, float p
     surface.occlusion = ground_openness(point, fraction);
   }
   sample.cls = surface.cls;
+  float wet = 0;
+  if (world_.weather.any) wet = take_weather(world_.weather, point, !on_shape, surface, sample, [&] { return openness(point, surface.normal, fraction); });
+  sample.point = point;
+  sample.normal = surface.normal;
+  sample.albedo = surface.albedo;
   // sun
   Vec3 lit{0, 0, 0};
   const float facing = dot(surface.normal, light.sun_dir);
@@ -316,6 +341,8 @@ Moment::Sample Moment::look(Vec3 origin, Vec3 direction, float fraction, float p
     sunny = sun_reaches(hit, surface, !on_shape, point, to_sun, fraction);
     if (sunny) lit = light.sun * direct;
   }
+  sample.sunny = sunny;
+  if (world_.weather.lamp_power > 0) lit += lamp_light(point, surface.normal, fraction);
   const float up = 0.5f + 0.5f * surface.normal.z;
   const Vec3 bounce = (light.ambient * 0.30f + light.sun * (0.22f * std::max(0.0f, light.sun_dir.z))) * Vec3{0.36f, 0.34f, 0.31f};
   const Vec3 ambient = mix(bounce, light.ambient, up) * surface.occlusion;
@@ -328,10 +355,58 @@ Moment::Sample Moment::look(Vec3 origin, Vec3 direction, float fraction, float p
       radiance += light.sun * (k * 2.5f * std::pow(s, 180.0f) + 0.12f * k * std::pow(s, 14.0f));
     }
   }
+  if (wet > 0) radiance = wet_mirror(sample, direction, radiance, wet, fraction, jitter);
   const float haze = 1 - std::exp(-sample.t / light.haze_m);
   const Vec3 air = mix(light.horizon, light.horizon * 0.75f + light.ambient * 0.15f, 0.5f);
   sample.radiance = mix(radiance, air, haze);
   return sample;
+}
+
+float Moment::openness(Vec3 point, Vec3 normal, float fraction) const {
+  const Vec3 start = point + normal * kLift;
+  Hit hit;
+  int open = 0;
+  for (int i = 0; i < 9; ++i) {
+    const float a = (i - 1) * (kPi / 4);
+    const Vec3 d = i == 0 ? Vec3{0, 0, 1} : Vec3{0.5f * std::cos(a), 0.5f * std::sin(a), 0.8660254f};
+    open += !closest(Ray(start, d), 0.02f, 46.0f, fraction, hit);
+  }
+  return open / 9.0f;
+}
+
+Vec3 Moment::lamp_light(Vec3 point, Vec3 normal, float fraction) const {
+  float total = 0;
+  for (const Vec3& lamp : world_.weather.lamps) {
+    const Vec3 to = lamp - point;
+    const float d = std::max(length(to), 0.5f);
+    if (d > 45) continue;
+    const Vec3 l = to * (1 / d);
+    const float power = std::max(0.0f, dot(normal, l)) * lamp_cone(l.z);
+    Hit hit;
+    if (power <= 0 || closest(Ray(point + normal * kLift, l), 0.02f, d - 0.9f, fraction, hit)) continue;
+    total += power / (d * d);
+  }
+  return lamp_color() * (total * world_.weather.lamp_power);
+}
+
+// Fresnel mirror of water: sharp in puddles, weak and rough (four tilted normals) on the film between them.
+Vec3 Moment::wet_mirror(const Sample& ground, Vec3 direction, Vec3 radiance, float wet, float fraction, uint32_t jitter) const {
+  const float share = 0.02f + 0.98f * std::pow(1 - clamp01(-direction.z), 5.0f);
+  const float pool = ground.water * share, film = (wet - ground.water) * 0.25f * share;
+  const Vec3 start = ground.point + Vec3{0, 0, kLift};
+  const auto mirrored = [&](Vec3 n) {
+    Vec3 d = direction - n * (2 * dot(direction, n));
+    d.z = std::max(d.z, 1e-3f);
+    return look(start, normalize(d), fraction, 1e-3f, jitter + 5u, nullptr).radiance;
+  };
+  radiance = radiance * (1 - pool - film);
+  if (pool > 1e-3f) radiance += mirrored({0, 0, 1}) * pool;
+  if (film > 1e-3f)
+    for (uint32_t k = 0; k < 4; ++k) {
+      const float r = 0.01f * std::sqrt(-2 * std::log(std::max(1e-6f, unit(mix_bits(jitter + 31u * k + 7u))))), a = (unit(mix_bits(jitter ^ (k + 977u))) + k) * (kPi / 2);
+      radiance += mirrored(normalize(Vec3{r * std::cos(a), r * std::sin(a), 1})) * (0.25f * film);
+    }
+  return radiance;
 }
 
 Moment::Sample Moment::range(Vec3 origin, Vec3 direction, float fraction, float t_max, const TileCandidates* tile) const {

@@ -45,8 +45,13 @@ class Moment {
     int32_t instance = 0;
     float reflectance = 0, incidence = 1;  // for the LiDAR
     bool glass = false;
+    Vec3 point, normal, albedo;  // of the surface, for the planes of city_weather.cpp
+    float snow = 0, water = 0;
+    bool sunny = false;
   };
   Sample look(Vec3 origin, Vec3 direction, float fraction, float pixel_angle, uint32_t jitter, const TileCandidates* tile) const;
+  // Share of nine directions towards the sky (core/weather/gbuffer.py, open_directions) that nothing stands in.
+  float openness(Vec3 point, Vec3 normal, float fraction) const;
   Sample range(Vec3 origin, Vec3 direction, float fraction, float t_max, const TileCandidates* tile) const;
 
  private:
@@ -60,6 +65,8 @@ class Moment {
   }
   PosedState interpolated(int object, float fraction) const;
   bool first_hit(Vec3 origin, Vec3 direction, float fraction, float t_max, Hit& hit, GroundHit& ground, const TileCandidates* tile) const;
+  Vec3 lamp_light(Vec3 point, Vec3 normal, float fraction) const;
+  Vec3 wet_mirror(const Sample& ground, Vec3 direction, Vec3 radiance, float wet, float fraction, uint32_t jitter) const;
   bool sun_reaches(const Hit& hit, const Surface& surface, bool on_ground, Vec3 point, Vec3 to_sun, float fraction) const;
 
   const World& world_;

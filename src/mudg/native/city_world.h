@@ -87,6 +87,20 @@ struct Texture {
 };
 void fill_texture(Texture& texture, const float* rgb, int width, int height, float metres);
 
+// Wet ground, snow and street lamps; the same rules as core/weather/ground.py and relight.py. A world without them is never asked.
+struct Weather {
+  bool any = false;
+  float wet = 0;                                // 0..1
+  float puddle_level = 2, snow_level = 2;       // levels that noise has to exceed; 2 = nowhere
+  int puddle_seed = 0, snow_seed = 0;
+  float lamp_power = 0;                         // irradiance over pi at 1 m below a lamp
+  std::vector<Vec3> lamps;
+};
+float water_at(const Weather& weather, Vec3 p);
+float snow_at(const Weather& weather, Vec3 p, Vec3 normal, float openness);
+Vec3 lamp_color();
+float lamp_cone(float down);                    // by the cosine of the angle from straight down
+
 struct World {
   ShapePools pools;
   std::vector<Shape> shapes;
@@ -104,6 +118,7 @@ struct World {
   Road road;
   Light light;
   Texture textures[kTexSlots];
+  Weather weather;
   int seed = 0;
 };
 Vec3 textured(const World& world, TextureSlot slot, Vec3 point, Vec3 normal, float footprint_m);

@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 from mudg.base.config import STRICT
 
 CameraName = Literal["front", "front_left", "front_right"]
-LightName = Literal["auto", "day", "dusk", "overcast"]
+LightName = Literal["auto", "day", "dusk", "overcast", "night"]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -48,7 +48,15 @@ class CityConfig:
     lidar_dropout: Annotated[float, Field(ge=0, le=0.9)] = 0.03
     """Share of LiDAR returns lost at random, 0 to 0.9; glass and weak returns lose more."""
     light: LightName = "auto"
-    """Time of day and weather; auto picks one by seed."""
+    """Time of day and weather; auto picks one of day, dusk and overcast by seed. night has street lamps and no moon."""
+    wet: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Wetness of road and sidewalk: darker, and they mirror."""
+    puddles: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the wet ground under standing water."""
+    snow_cover: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of open level surfaces under snow."""
+    fog_visibility_m: Annotated[float, Field(ge=0, le=100_000)] = 0.0
+    """Visibility in fog, metres; 0 = the haze that belongs to the light."""
     style: Literal["auto", "urban", "suburban"] = "auto"
     """Kind of neighbourhood; auto picks one by seed."""
     crossing: Literal["auto", "yes", "no"] = "auto"

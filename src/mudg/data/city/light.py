@@ -70,7 +70,13 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
         name = str(pick)
     azimuth = rng.uniform(0, 2 * np.pi)
     tint = rng.uniform(0.96, 1.04, 3)
-    if name == "day":
+    if name == "night":
+        elevation = 1.0
+        sun = np.zeros(3)
+        zenith, horizon = np.array([0.006, 0.006, 0.0072]), np.array([0.039, 0.0306, 0.0252])
+        ambient, cloud = np.array([0.0096, 0.0102, 0.012]), np.array([0.02, 0.02, 0.02])
+        cloudiness, haze, night, exposure = rng.uniform(0.0, 0.6), rng.uniform(600, 1600), 1.0, rng.uniform(0.9, 1.3)
+    elif name == "day":
         elevation = np.deg2rad(rng.uniform(18, 62))
         sun = np.array([3.3, 3.05, 2.65]) * rng.uniform(0.85, 1.15)
         zenith, horizon = np.array([0.20, 0.40, 0.86]) * rng.uniform(0.8, 1.1), np.array([0.66, 0.80, 0.98])
@@ -93,6 +99,8 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
         plain = Sky(sun, zenith, horizon, ambient, cloud, cloudiness, float(elevation))
         sky = _other_sky(seeds.numpy_rng(config.seed, 0, "city sky"), plain)
         sun, zenith, horizon, ambient, cloud, cloudiness, elevation = (getattr(sky, name) for name in Sky.__slots__)
+    if config.fog_visibility_m > 0:
+        haze = config.fog_visibility_m / 3.0
     direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     numbers = [
         *direction, *sun, *zenith, *horizon, *ambient, *cloud, *tint, cloudiness, haze, night, exposure,

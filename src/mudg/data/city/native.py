@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mudg import native
 from mudg.base.errors import ResourceError
+from mudg.base.types import Camera
 from mudg.data.city.layout import StreetPlan
 
 _P, _I, _L, _U = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64, ctypes.c_uint32
@@ -28,6 +29,10 @@ def library() -> ctypes.CDLL:
     lib.mudg_city_destroy.restype = None
     lib.mudg_city_set_texture.argtypes = [_P, _I, _P, _I, _I, ctypes.c_float]
     lib.mudg_city_set_texture.restype = _I
+    lib.mudg_city_set_weather.argtypes = [_P, _P, _P, _L]
+    lib.mudg_city_set_weather.restype = _I
+    lib.mudg_city_planes.argtypes = [_P, _P, _P, _P, _I, _I, _P, _P]
+    lib.mudg_city_planes.restype = _I
     lib.mudg_city_shape_count.argtypes = [_P]
     lib.mudg_city_shape_count.restype = _L
     lib.mudg_city_render.argtypes = [_P, _P, _P, _P, _I, _I, _P, _I, _U, _P, _P, _P, _P]
@@ -71,6 +76,25 @@ class CityHandle:
         pixels = np.ascontiguousarray(rgb, np.float32)
         if self._lib.mudg_city_set_texture(self._handle, slot, pixels.ctypes.data, pixels.shape[1], pixels.shape[0], metres):
             raise ResourceError("not enough memory for a texture of the city")
+
+    def set_weather(self, numbers: NDArray[np.float64], lamps: NDArray[np.float64]) -> None:
+        """Wet ground, snow and lamps f64[N, 3]; before anything is rendered. Numbers as in native/city_weather.cpp."""
+        values, places = _f64(numbers), _f64(lamps).reshape(-1, 3)
+        if self._lib.mudg_city_set_weather(self._handle, values.ctypes.data, places.ctypes.data, len(places)):
+            raise ResourceError("not enough memory for the lamps of the city")
+
+    def planes(
+        self, poses: NDArray[np.float64], phases: NDArray[np.float64], camera: Camera, world_from_cam: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Normal, albedo, open sky, sun, snow and water f32[H, W, 10] of what the rays through pixel centres meet."""
+        out = np.empty((camera.height, camera.width, 10), np.float32)
+        poses, phases, numbers, pose = _f64(poses), _f64(phases), _f64(camera.intrinsics), _f64(world_from_cam)
+        if self._lib.mudg_city_planes(
+            self._handle, poses.ctypes.data, phases.ctypes.data, numbers.ctypes.data, camera.width, camera.height, pose.ctypes.data,
+            out.ctypes.data,
+        ):  # fmt: skip
+            raise ResourceError("not enough memory to render the city")
+        return out
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None):

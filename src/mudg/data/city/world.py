@@ -28,6 +28,7 @@ from mudg.data.city.light import light_numbers
 from mudg.data.city.native import CityHandle
 from mudg.data.city.photos import draw_photos
 from mudg.data.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
+from mudg.data.city.weather import lamp_places, weather_numbers
 
 DATASET = "mudg procedural city"
 GENERATOR_VERSION = 1
@@ -62,6 +63,19 @@ class CityTruth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CitySurfaces:
+    """Exact surfaces behind pixel centres, 0 in the sky: unit normals f32[H, W, 3] in the world and albedo f32[H, W, 3]; and f32[H, W]
+    in [0, 1]: share of the sky that is seen, whether the sun shines on it, snow cover, standing water."""
+
+    normal: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    openness: NDArray[np.float32]
+    sunlit: NDArray[np.float32]
+    snow: NDArray[np.float32]
+    water: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CitySweep:
     """One turn of the LiDAR with its truth. ``points`` are in the LiDAR frame at ``time_s``, compensated for the motion of
     the recording vehicle (each point was measured at ``time_s + dt_s``; moving objects are where they were then).
@@ -89,6 +103,7 @@ class CityWorld:
         self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
         self._key_times = key_times(config)
         rows = furnish(config, self.plan) + [m.row for m in self.objects]
+        self.lamps: NDArray[np.float64] = lamp_places(rows)
         no_keys = np.zeros((len(self._key_times), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
@@ -97,6 +112,9 @@ class CityWorld:
         self._handle = CityHandle(records, self.plan, _road_numbers(config, self.plan), light, _seed31(config, "city surfaces"))
         for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
             self._handle.set_texture(slot, rgb, metres)
+        numbers = weather_numbers(config)
+        if numbers is not None:
+            self._handle.set_weather(numbers, self.lamps)
         self._cameras = rig.cameras(config)
         self._mounts = rig.ego_from_camera(config)
         self._ego_path = EgoPath(self._ego_times, self._ego_poses)
@@ -256,6 +274,12 @@ class CityWorld:
         poses = self._object_keys_at(np.array([view.time_s]))[0]
         return CityTruth(*self._handle.render(poses, self._phases(view.time_s), intrinsics, camera.width, camera.height,
                                               view.world_from_cam, per_axis, noise_key))  # fmt: skip
+
+    def surfaces(self, view: View) -> CitySurfaces:
+        """Exact surfaces behind the pixel centres of a view, as ``render`` sees them."""
+        poses = self._object_keys_at(np.array([view.time_s]))[0]
+        planes = self._handle.planes(poses, self._phases(view.time_s), view.camera, view.world_from_cam)
+        return CitySurfaces(planes[..., :3], planes[..., 3:6], *(planes[..., i] for i in range(6, 10)))
 
     def observation(self, view: View, truth: CityTruth | None = None) -> Observation:
         """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what ``render``

@@ -1,0 +1,160 @@
+"""All effects on one view, in the order in which light takes them: surfaces, then light, then air, then the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base.types import View
+from mudg.base.weather_settings import (
+    Conditions,
+    FogSettings,
+    LightSettings,
+    RainSettings,
+    SnowSettings,
+    WeatherSettings,
+)
+from mudg.core.weather import fog, ground, particles, relight
+from mudg.core.weather.gbuffer import (
+    GBuffer,
+    Surroundings,
+    estimate_surroundings,
+    euclidean_range,
+    world_points,
+    world_rays,
+)
+from mudg.core.weather.tone import ToneCurve
+
+Array = NDArray[np.float64]
+Plane = NDArray[np.float32]
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weathered:
+    """An edited view.
+
+    Args:
+        color: f32[H, W, 3] linear light.
+        confidence: f32[H, W] in [0, 1]: how far known physics and what was seen determine it.
+    """
+
+    color: Image
+    confidence: Plane
+
+    def display(self, tone: ToneCurve) -> Image:
+        """Display values f32[H, W, 3] in [0, 1]."""
+        return tone.encode(self.color)
+
+
+def apply(
+    gbuffer: GBuffer, settings: Conditions, view: View, time_s: float, seed: int, surroundings: Surroundings | None = None
+) -> Weathered:  # fmt: skip
+    """Weather and light on one view. The same arguments give the same result; frames and cameras agree with each other.
+
+    Args:
+        gbuffer: what the view shows as recorded.
+        settings: weather, light and shutter. Defaults change nothing.
+        view: camera and pose.
+        time_s: moment of falling drops and flakes, on the scene's clock (``view.time_s`` is not used).
+        seed: run seed; puddles, patches of snow and drops follow from it.
+        surroundings: light and ground of the drive; None = estimated from this view alone, so frames may differ a little.
+    """
+    view = View(view.camera, view.world_from_cam, time_s)
+    light = surroundings if surroundings is not None else estimate_surroundings([(view, gbuffer)])
+    weather, confidence = settings.weather, np.ones(gbuffer.depth.shape, np.float32)
+    if weather.recorded_visibility_m > 0:
+        gbuffer, confidence = _without_haze(gbuffer, view, weather.recorded_visibility_m, light)
+    if settings.light.time != "as_recorded":
+        gbuffer, light, sure = _in_new_light(gbuffer, view, light, settings.light)
+        confidence = confidence * sure
+    if weather.wet > 0:
+        color, sure = ground.wet_ground(gbuffer, view, light, weather.wet, weather.puddles, seed)
+        gbuffer, confidence = replace(gbuffer, color=color), confidence * sure
+    if weather.snow is not None and weather.snow.cover > 0:
+        gbuffer, sure = _snowed(gbuffer, view, light, weather.snow, seed)
+        confidence = confidence * sure
+    color, share = _through_air(gbuffer, view, light, weather)
+    confidence = confidence * share + (1 - share)
+    color = _with_particles(color, gbuffer, view, light, settings, seed)
+    if settings.light.time == "night":
+        color = relight.glow(color)
+    color = color * np.float32(2.0**settings.light.exposure_ev)
+    return Weathered(color.astype(np.float32), confidence.astype(np.float32))
+
+
+def _air_path(gbuffer: GBuffer, view: View, ground_z_m: float) -> tuple[Array, Array, float]:
+    """Range f64[H, W], sine of elevation f64[H, W] and the camera's height above the ground."""
+    rays, length = world_rays(view)
+    return euclidean_range(view, gbuffer.depth), rays[..., 2] / length, float(view.center_world[2]) - ground_z_m
+
+
+def _without_haze(gbuffer: GBuffer, view: View, visibility_m: float, light: Surroundings) -> tuple[GBuffer, Plane]:
+    """Surfaces without the haze of the recording's day; the sky stays. Confidence is what had come through."""
+    share = np.exp(-fog.extinction(visibility_m) * euclidean_range(view, gbuffer.depth))
+    sky = gbuffer.sky
+    clear = np.where(sky[..., None], gbuffer.color, fog.unveiled(gbuffer.color, share, light.airlight))
+    return replace(gbuffer, color=clear.astype(np.float32)), np.where(sky, 1, share).astype(np.float32)
+
+
+def _in_new_light(
+    gbuffer: GBuffer, view: View, light: Surroundings, settings: LightSettings
+) -> tuple[GBuffer, Surroundings, Plane]:  # fmt: skip
+    target = relight.target_light(light, settings)
+    lamps, scale = None, relight.NIGHT_LEVEL * relight.ground_level(light)
+    if settings.time == "night":
+        lamps = scale * relight.night_lights(gbuffer, view, target, settings)
+    color, sure = relight.relit(gbuffer, view, light, target, lamps)
+    if settings.time == "night" and settings.lamps and light.lamps is not None:
+        color[relight.lamp_heads(gbuffer, view, light.lamps)] = scale * relight.LAMP_RADIANCE * relight.LAMP_COLOR
+    # what was given for the recorded light is none for the new one
+    return replace(gbuffer, color=color, sunlit=gbuffer.new_sunlit, mirror=None), target, sure
+
+
+def _snowed(gbuffer: GBuffer, view: View, light: Surroundings, snow: SnowSettings, seed: int) -> tuple[GBuffer, Plane]:
+    cover = ground.snow_cover(gbuffer, view, snow.cover, seed)
+    if light.path is not None and snow.tracks < 1:
+        road = gbuffer.ground
+        tracks = ground.wheel_tracks(world_points(view, gbuffer.depth)[road][:, :2], light.path)
+        cover[road] *= (1 - (1 - snow.tracks) * tracks).astype(np.float32)
+    white = ground.snow_light(gbuffer, light, relight.sunlit_of(gbuffer, light))
+    color = gbuffer.color + (white - gbuffer.color) * cover[..., None]
+    return replace(gbuffer, color=color.astype(np.float32)), 1 - 0.3 * cover
+
+
+def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: WeatherSettings) -> tuple[Image, Plane]:
+    """Fog, or the haze of the recording again, and the veil of distant rain and snow; and the share of light that comes through."""
+    distance, rise, height = _air_path(gbuffer, view, light.ground_z_m)
+    share = np.ones(distance.shape)
+    if weather.fog is not None:
+        share = fog.transmittance(distance, rise, height, weather.fog)
+    elif weather.recorded_visibility_m > 0:
+        share = np.where(gbuffer.sky, 1.0, np.exp(-fog.extinction(weather.recorded_visibility_m) * distance))
+    falling = FogSettings(top_m=1000.0)  # below the clouds
+    path = fog.optical_depth(distance, rise, height, falling) / fog.extinction(falling.visibility_m)
+    for fall, extinction in ((weather.rain, particles.rain_extinction), (weather.snow, particles.snow_extinction)):
+        if fall is not None:
+            share = share * np.exp(-extinction(fall.mm_h) * np.maximum(path - fall.reach_m, 0))
+    return fog.veiled(gbuffer.color, share, light.airlight), share.astype(np.float32)
+
+
+def _with_particles(
+    color: Image, gbuffer: GBuffer, view: View, light: Surroundings, settings: Conditions, seed: int
+) -> Image:  # fmt: skip
+    """Drops and flakes near the camera, one by one."""
+    kinds: list[tuple[RainSettings | SnowSettings, list[particles.ParticleSize], Array, str]] = []
+    if settings.weather.rain is not None:
+        rain = settings.weather.rain
+        kinds.append((rain, particles.rain_sizes(rain.mm_h), particles.DROP_LIGHT * light.ambient, "rain"))
+    if settings.weather.snow is not None:
+        snow = settings.weather.snow
+        kinds.append(
+            (snow, particles.snow_sizes(snow.mm_h), ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun), "flakes")
+        )
+    for fall, sizes, radiance, purpose in kinds:
+        what = particles.Falling(sizes, fall.wind_m_s, fall.reach_m, settings.response.shutter_s, purpose)
+        depth = particles.falling(view, gbuffer.depth, what, gbuffer.camera_velocity, seed)
+        color = fog.veiled(color, np.exp(-depth), radiance)
+    return color

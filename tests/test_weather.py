@@ -1,0 +1,426 @@
+"""Weather on G-buffers: closed forms, exact inverses, invariants."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mudg.base import geometry
+from mudg.base.config import build, to_dict
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.base.types import Camera, View
+from mudg.base.weather_settings import (
+    Conditions,
+    FogSettings,
+    LightSettings,
+    RainSettings,
+    SnowSettings,
+    WeatherSettings,
+)
+from mudg.core import weather
+from mudg.core.weather import fog, ground, noise, relight, tone
+from mudg.core.weather.gbuffer import (
+    GBuffer,
+    HeightMap,
+    Surroundings,
+    euclidean_range,
+    from_render,
+    mirror_view,
+    normals_from_depth,
+    openness_by_class,
+    world_points,
+    world_rays,
+)
+
+WIDTH, HEIGHT, CAMERA_Z = 60, 40, 1.5
+WALL_X = 20.0
+
+
+def forward_view(yaw: float = 0.0, pitch: float = 0.0) -> View:
+    """A camera 1.5 m above the ground that looks along world x, turned by yaw and downwards by pitch (radians)."""
+    c, s = np.cos(pitch), np.sin(pitch)
+    body = geometry.yaw_matrix(yaw)[:3, :3] @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    pose = np.eye(4)
+    pose[:3, :3] = body @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    pose[:3, 3] = (0, 0, CAMERA_Z)
+    return View(Camera("front", WIDTH, HEIGHT, 50.0, 50.0, WIDTH / 2, HEIGHT / 2), pose, 0.0)
+
+
+def street(view: View) -> GBuffer:
+    """Level road up to a wall across it, 6 m high and with a bright stripe; sky above."""
+    rays, _ = world_rays(view)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_ground = np.where(rays[..., 2] < 0, -CAMERA_Z / rays[..., 2], np.inf)
+        to_wall = np.where(rays[..., 0] > 0, WALL_X / rays[..., 0], np.inf)
+    at_wall = CAMERA_Z + to_wall * rays[..., 2]
+    to_wall = np.where((at_wall < 0) | (at_wall > 6), np.inf, to_wall)
+    depth = np.minimum(to_ground, to_wall).astype(np.float32)
+    classes = np.where(to_ground < to_wall, ID["road"], ID["building"]).astype(np.uint8)
+    classes[~np.isfinite(depth)] = ID["sky"]
+    color = np.full((*depth.shape, 3), 0.08, np.float32)
+    color[classes == ID["building"]] = (0.3, 0.2, 0.1)
+    color[(classes == ID["building"]) & (at_wall > 3) & (at_wall < 4)] = (0.9, 0.8, 0.2)
+    color[classes == ID["sky"]] = (0.5, 0.6, 0.8)
+    normal = np.zeros_like(color)
+    normal[classes == ID["road"]] = (0, 0, 1)
+    normal[classes == ID["building"]] = (-1, 0, 0)
+    return GBuffer(color, depth, classes, normal, openness_by_class(classes, normal))
+
+
+LIGHT = Surroundings(
+    np.array([0.7, 0.75, 0.8]), np.array([0.3, 0.5, 0.9]), np.array([0.8, 0.9, 1.0]), np.zeros(3), np.array([0.0, 0, 1]),
+    np.array([0.7, 0.75, 0.8]),
+)  # fmt: skip
+
+
+# --- response ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("curve", [tone.SRGB, tone.LINEAR, tone.gamma_curve(2.2)], ids=lambda c: c.name)
+def test_a_curve_and_its_inverse_give_back_the_light(curve: tone.ToneCurve) -> None:
+    light = np.linspace(0, 1, 300, dtype=np.float32).reshape(10, 10, 3)
+    np.testing.assert_allclose(curve.decode(curve.encode(light)), light, atol=2e-6)
+
+
+def test_the_srgb_curve_has_its_known_values() -> None:
+    assert tone.srgb_encode(np.array([0.0, 0.0031308, 0.18, 1.0])) == pytest.approx([0, 0.04045, 0.46135, 1], abs=2e-5)
+
+
+def test_a_filmic_camera_is_inverted_where_nothing_was_clipped() -> None:
+    curve = tone.FilmicResponse(0.6, (1.02, 1.0, 0.97), saturation=0.9, contrast=1.05, vignette=0.3).curve()
+    light = np.random.default_rng(1).uniform(0.05, 1.2, (12, 16, 3))
+    shown = curve.encode(light)
+    inside = ((shown > 0.001) & (shown < 0.999)).all(-1)
+    assert inside.mean() > 0.9
+    np.testing.assert_allclose(curve.decode(shown)[inside], light[inside], rtol=2e-4)
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", [forward_view(), forward_view(0.4, 0.2)], ids=["level", "turned"])
+def test_normals_of_planes_come_out_exactly(view: View) -> None:
+    scene = street(view)
+    found = normals_from_depth(view, scene.depth)
+    surface = ~scene.sky
+    error = np.degrees(np.arccos(np.clip((found * scene.normal).sum(-1)[surface], -1, 1)))
+    assert np.median(error) < 0.05
+    assert (error < 1).mean() > 0.95  # all but pixels at the corner of road and wall
+    assert not found[scene.sky].any()
+
+
+def test_near_kerbs_stay_steep_and_far_noise_of_the_ground_does_not() -> None:
+    view, classes = forward_view(), np.full((HEIGHT, WIDTH), ID["sidewalk"], np.uint8)
+    near, far = (normals_from_depth(view, np.full((HEIGHT, WIDTH), d, np.float32), classes) for d in (5.0, 30.0))
+    np.testing.assert_allclose(near[20, 30], [-1, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(far[20, 30], [0, 0, 1], atol=1e-5)
+
+
+def test_noisy_depth_gives_steady_normals() -> None:
+    view = forward_view()
+    scene = street(view)
+    noise_share = 1 + 0.01 * np.random.default_rng(3).normal(size=scene.depth.shape).astype(np.float32)
+
+    def error_deg(smooth_px: int) -> float:
+        found = from_render(
+            view, scene.color, scene.depth * noise_share, scene.classes, weather.BufferRules(smooth_px=smooth_px)
+        )
+        return float(np.degrees(np.arccos(np.clip((found.normal * scene.normal).sum(-1)[~scene.sky], -1, 1))).mean())
+
+    assert error_deg(2) < 0.5 * error_deg(0)
+
+
+def test_guessed_light_does_not_exceed_what_a_camera_exposes_for() -> None:
+    view = forward_view()
+    scene = street(view)
+    color = np.where(scene.sky[..., None], 1.0, scene.color).astype(np.float32)
+    color[:, ::2][scene.classes[:, ::2] == ID["road"]] = 0.5
+    found = weather.estimate_surroundings([(view, replace(scene, color=color))])
+    assert float((found.ambient + found.sun).mean()) < 1.41
+    assert found.airlight.max() <= 0.8
+
+
+@pytest.mark.parametrize(("time", "share"), [("overcast", 1.0), ("dusk", 0.5)])
+def test_new_light_is_exposed_as_a_camera_would(time: str, share: float) -> None:
+    target = relight.target_light(sunny(), LightSettings(time=time))  # type: ignore[arg-type]
+    assert relight.ground_level(target) == pytest.approx(share * relight.ground_level(sunny()), rel=0.01)
+
+
+def test_range_is_longer_than_depth_beside_the_axis() -> None:
+    view = forward_view()
+    distance = euclidean_range(view, np.full((HEIGHT, WIDTH), 10.0))
+    corner = np.array([(0.5 - 30) / 50, (0.5 - 20) / 50, 1.0])
+    assert distance[0, 0] == pytest.approx(10 * np.linalg.norm(corner))
+
+
+def test_a_height_map_sees_a_wall_on_one_side() -> None:
+    x, y = np.meshgrid(np.arange(0, 20, 0.25), np.arange(-10, 10, 0.25))
+    z = np.where(x > 10, 12.0, 0.0)
+    heights = HeightMap.from_points(np.stack([x, y, z], -1).reshape(-1, 3), 0.5)
+    far, near = np.array([[1.0, 0, 0]]), np.array([[8.5, 0, 0]])
+    assert heights.openness(far)[0] == 1  # at 9 m a ray of 60 degrees is 15 m up
+    assert heights.openness(near)[0] == pytest.approx(6 / 9)  # three of eight directions lead to the wall
+    assert heights.free(near, np.array([1.0, 0, 0.5])).tolist() == [False]
+    assert heights.free(near, np.array([-1.0, 0, 0.5])).tolist() == [True]
+    assert heights.free(near, np.array([0, 0, -1.0])).tolist() == [False]
+
+
+def test_the_mirror_view_sees_mirrored_points_upside_down() -> None:
+    view = forward_view(0.3, 0.1)
+    points = np.array([[8.0, 1.0, 2.0], [15, -3, 0.5], [6, 2, 1.0]])
+    below = points * [1, 1, -1] + [0, 0, 2 * 0.2]
+    seen, depth = geometry.project(view, below)
+    mirrored, mirror_depth = geometry.project(mirror_view(view, 0.2), points)
+    np.testing.assert_allclose(mirror_depth, depth)
+    np.testing.assert_allclose(mirrored[:, 0], seen[:, 0])
+    np.testing.assert_allclose(HEIGHT - mirrored[:, 1], seen[:, 1])
+
+
+def test_planes_of_different_sizes_are_refused() -> None:
+    scene = street(forward_view())
+    with pytest.raises(InputError, match="openness"):
+        replace(scene, openness=np.zeros((3, 3), np.float32))
+
+
+# --- noise ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_patches_cover_the_share_that_is_asked(share: float) -> None:
+    x, y = np.random.default_rng(5).uniform(-400, 400, (2, 200_000))
+    level = noise.patch_threshold(share, 77)
+    assert (noise.patches(x, y, 1.0, 77) > level).mean() == pytest.approx(share, abs=0.02)
+
+
+def test_the_hash_is_that_of_the_generated_city() -> None:
+    """Values of hash_bits in native/city_math.h, worked out by hand in arbitrary precision."""
+
+    def mix(h: int) -> int:
+        for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+            h = ((h ^ (h >> shift)) * factor) % 2**32
+        return h ^ (h >> 16)
+
+    for a, b, c in ((0, 0, 0), (1, 2, 3), (-5, 70000, 123456)):
+        text = (a * 0x9E3779B1) % 2**32 ^ ((b * 0x85EBCA77 + 0x165667B1) % 2**32) ^ ((c * 0xC2B2AE3D) % 2**32)
+        assert int(noise.hash_bits(a, b, c)) == mix(text)
+        assert int(noise.hash_bits(a, b, c, 9)) == mix((mix(text) + 9 * 0x27D4EB2F) % 2**32)
+
+
+# --- fog --------------------------------------------------------------------------------------------------------------
+
+
+def test_contrast_falls_to_a_twentieth_at_the_visibility() -> None:
+    share = fog.transmittance(np.array([150.0]), np.array([0.0]), 1.5, FogSettings(visibility_m=150))
+    assert share[0] == pytest.approx(0.05, rel=0.01)
+
+
+def test_fog_that_fades_with_height_agrees_with_integration() -> None:
+    settings = FogSettings(visibility_m=100, height_m=30)
+    for rise in (-0.05, 0.0, 0.02, 0.4):
+        s = (np.arange(200_000) + 0.5) / 200_000 * 60.0
+        expected = (0.03 * np.exp(-(5 + s * rise) / 30)).mean() * 60.0
+        found = fog.optical_depth(np.array([60.0]), np.array([rise]), 5.0, settings)[0]
+        assert found == pytest.approx(expected, rel=1e-6)
+    towards_sky = fog.optical_depth(np.array([np.inf]), np.array([0.5]), 5.0, settings)[0]
+    assert towards_sky == pytest.approx(0.03 * np.exp(-5 / 30) * 30 / 0.5)
+
+
+def test_uniform_fog_ends_at_its_top() -> None:
+    settings = FogSettings(visibility_m=300, top_m=50)
+    depth = fog.optical_depth(np.array([np.inf, 10.0, np.inf]), np.array([1.0, 1.0, 0.0]), 2.0, settings)
+    assert depth == pytest.approx([0.01 * 48, 0.1, np.inf])
+    from_above = fog.optical_depth(np.array([100.0]), np.array([-1.0]), 80.0, settings)
+    assert from_above == pytest.approx([0.01 * 70])
+
+
+def test_two_layers_of_haze_are_one() -> None:
+    color, air = np.random.default_rng(2).uniform(0, 1, (50, 3)), np.array([0.7, 0.7, 0.8])
+    a, b = np.full(50, 0.6), np.full(50, 0.5)
+    np.testing.assert_allclose(fog.veiled(fog.veiled(color, a, air), b, air), fog.veiled(color, a * b, air), atol=1e-6)
+    np.testing.assert_allclose(fog.unveiled(fog.veiled(color, a, air), a, air), color, atol=1e-6)
+
+
+# --- wet ground and snow ----------------------------------------------------------------------------------------------
+
+
+def test_water_mirrors_by_fresnel() -> None:
+    assert ground.fresnel(np.array([1.0, 0.0])) == pytest.approx([0.02, 1.0])
+    exact = np.cos(np.radians(60)), np.sqrt(1 - (np.sin(np.radians(60)) / 1.33) ** 2)
+    rs = ((exact[0] - 1.33 * exact[1]) / (exact[0] + 1.33 * exact[1])) ** 2
+    rp = ((exact[1] - 1.33 * exact[0]) / (exact[1] + 1.33 * exact[0])) ** 2
+    assert float(ground.fresnel(np.array(exact[0]))) == pytest.approx((rs + rp) / 2, abs=0.012)
+
+
+def test_the_image_of_a_wall_is_found_in_the_road() -> None:
+    """A ray from the road at distance x meets the wall at the height that similar triangles give."""
+    view = forward_view()
+    scene = street(view)
+    mirror, found = ground.screen_mirror(scene, view, LIGHT)
+    rays, _ = world_rays(view)
+    points = world_points(view, scene.depth)
+    road = (scene.classes == ID["road"]) & (np.abs(rays[..., 1]) < 0.2)
+    with np.errstate(invalid="ignore"):
+        height = (WALL_X - points[..., 0]) * -rays[..., 2] / rays[..., 0]
+    stripe = road & (height > 3.2) & (height < 3.8)
+    plain = road & (height > 0.4) & (height < 2.7)
+    assert stripe.sum() > 5
+    np.testing.assert_allclose(mirror[stripe], np.broadcast_to([0.9, 0.8, 0.2], (stripe.sum(), 3)), atol=0.02)
+    np.testing.assert_allclose(mirror[plain], np.broadcast_to([0.3, 0.2, 0.1], (plain.sum(), 3)), atol=0.02)
+    assert found[plain].min() == 1
+
+
+def test_wet_road_is_darker_below_the_camera_and_changes_nothing_else() -> None:
+    view = forward_view(pitch=0.6)
+    scene = street(view)
+    wet, sure = ground.wet_ground(scene, view, LIGHT, 1.0, 0.0, 3)
+    road = scene.classes == ID["road"]
+    np.testing.assert_array_equal(wet[~road], scene.color[~road])
+    steep = road & (world_points(view, scene.depth)[..., 0] < 2.5)
+    assert steep.sum() > 20
+    np.testing.assert_allclose(wet[steep], 0.08 * ground.WET_DARKENING, atol=0.03)
+    assert sure.min() > 0
+
+
+def test_snow_lies_on_level_open_ground_only() -> None:
+    view = forward_view()
+    scene = street(view)
+    cover = ground.snow_cover(scene, view, 1.0, 4)
+    assert (cover[scene.classes == ID["road"]] == 1).all()
+    assert not cover[scene.classes == ID["building"]].any()
+    assert not cover[scene.sky].any()
+    covered_over = replace(scene, openness=np.zeros_like(scene.openness))
+    assert not ground.snow_cover(covered_over, view, 1.0, 4).any()
+
+
+def test_wheels_leave_two_tracks() -> None:
+    path = np.array([[0.0, 0, 0], [10, 0, 0]])
+    xy = np.array([[5, 0.75], [5, -0.75], [5, 0.0], [5, 1.2]])
+    assert ground.wheel_tracks(xy, path).tolist() == [1, 1, 0, 0]
+
+
+# --- light ------------------------------------------------------------------------------------------------------------
+
+
+def sunny() -> Surroundings:
+    return replace(LIGHT, sun=np.array([2.0, 1.9, 1.7]), sun_direction=np.array([-0.6, 0, 0.8]))
+
+
+def test_the_same_light_changes_nothing_but_the_sky() -> None:
+    view, light = forward_view(), sunny()
+    scene = street(view)
+    lit = np.ones_like(scene.openness)
+    albedo = np.where(scene.classes[..., None] == ID["road"], 0.1, 0.4) * np.ones(3)
+    scene = replace(
+        scene,
+        color=(albedo * relight.irradiance(scene.normal, scene.openness, lit, light)).astype(np.float32),
+        sunlit=lit,
+    )
+    found = relight.albedo_of(scene, light, lit)
+    np.testing.assert_allclose(found[~scene.sky], albedo[~scene.sky], rtol=1e-5)
+    for name, value in (("overcast", 0.0), ("sunny", 1.0)):
+        target = replace(light, sun=value * light.sun)
+        changed, _ = relight.relit(scene, view, light, target)
+        expected = albedo * relight.irradiance(scene.normal, scene.openness, lit, target)
+        np.testing.assert_allclose(changed[~scene.sky], expected[~scene.sky], rtol=2e-2, err_msg=name)
+
+
+def test_a_shadow_is_found_from_a_rough_guess() -> None:
+    view, light = forward_view(pitch=0.3), sunny()
+    scene = street(view)
+    x = world_points(view, scene.depth)[..., 1]
+    road = scene.classes == ID["road"]
+    truth = (~scene.sky & ~(road & (x > 0.0))).astype(np.float32)
+    guess = (~scene.sky & ~(road & (x > 0.25))).astype(np.float32)
+    albedo = np.where(road, 0.1, 0.4)[..., None] * np.ones(3)
+    color = (albedo * relight.irradiance(scene.normal, scene.openness, truth, light)).astype(np.float32)
+    found = relight.refined_sunlit(replace(scene, color=color), light, guess)
+    assert ((found > 0.5) == (truth > 0.5))[road].mean() > 0.98
+    assert ((guess > 0.5) == (truth > 0.5))[road].mean() < 0.97
+
+
+def test_a_lamp_gives_fifty_lux_below_it_and_none_above() -> None:
+    up = np.array([[0.0, 0, 1]])
+    assert relight.lamp_light(np.zeros((1, 3)), up, np.array([[0, 0, 8.0]]))[0, 0] == pytest.approx(1.0)
+    assert relight.lamp_light(np.array([[0, 0, 9.0]]), -up, np.array([[0, 0, 8.0]]))[0, 0] == 0
+
+
+def test_headlights_cut_off_above_the_horizon() -> None:
+    vehicle = geometry.yaw_matrix(0.0, (0, 0, 0.65))
+    wall = np.array([[-1.0, 0, 0]] * 3)
+    places = np.array([[20.0, 0, 0.1], [20, 0, 2.0], [-5, 0, 0.1]])
+    low, high, behind = relight.headlight(places, wall, vehicle)[:, 0]
+    assert low > 20 * high
+    assert behind == 0
+
+
+# --- all together -----------------------------------------------------------------------------------------------------
+
+
+def test_defaults_change_nothing() -> None:
+    view = forward_view()
+    scene = street(view)
+    shown = weather.apply(scene, Conditions(), view, 0.0, 1)
+    np.testing.assert_array_equal(shown.color, scene.color)
+    assert (shown.confidence == 1).all()
+
+
+def conditions(**weather_settings: object) -> Conditions:
+    return Conditions(weather=WeatherSettings(**weather_settings))  # type: ignore[arg-type]
+
+
+CASES = {
+    "fog": conditions(fog=FogSettings(visibility_m=60)),
+    "rain": conditions(rain=RainSettings(mm_h=20), wet=0.8, puddles=0.3),
+    "snow": conditions(snow=SnowSettings(cover=0.7, mm_h=2)),
+    "haze removed": conditions(recorded_visibility_m=500.0, fog=FogSettings(visibility_m=100)),
+    "dusk": Conditions(light=LightSettings(time="dusk")),
+    "overcast": Conditions(light=LightSettings(time="overcast")),
+    "night": Conditions(light=LightSettings(time="night", exposure_ev=1.0), weather=WeatherSettings(wet=1.0)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_effect_is_finite_repeatable_and_visible(name: str) -> None:
+    view = forward_view()
+    scene = from_render(view, street(view).color, street(view).depth, street(view).classes)
+    first = weather.apply(scene, CASES[name], view, 0.4, 7)
+    again = weather.apply(scene, CASES[name], view, 0.4, 7)
+    np.testing.assert_array_equal(first.color, again.color)
+    assert np.isfinite(first.color).all()
+    assert first.color.min() >= 0
+    assert first.confidence.min() >= 0
+    assert first.confidence.max() <= 1
+    assert np.abs(first.color - scene.color).mean() > 0.005
+    shown = first.display(weather.curve_of(CASES[name].response))
+    assert 0 <= shown.min() <= shown.max() <= 1
+
+
+def test_settings_go_through_plain_values_and_refuse_what_is_out_of_range() -> None:
+    for case in CASES.values():
+        assert build(Conditions, to_dict(case), "edits") == case
+    with pytest.raises(UsageError, match="visibility_m"):
+        build(Conditions, {"weather": {"fog": {"visibility_m": 0.1}}}, "edits.yaml")
+
+
+def test_a_drive_is_edited_image_by_image() -> None:
+    shown = []
+    for yaw in (-0.2, 0.2):
+        view = forward_view(yaw)
+        scene = street(view)
+        shown.append(weather.ShownView(view, tone.SRGB.encode(scene.color), scene.depth, scene.classes))
+    drive = weather.drive_facts(shown, tone.SRGB)
+    assert drive.surroundings.ground_z_m == pytest.approx(0, abs=1e-3)
+    assert drive.heights is not None
+    assert drive.heights.top_m.max() == pytest.approx(6, abs=0.3)
+    same, result = weather.edited_view(shown[0], Conditions(), 1, drive)
+    np.testing.assert_allclose(same, shown[0].rgb, atol=1e-5)
+    assert (result.confidence == 1).all()
+    foggy, _ = weather.edited_view(shown[0], CASES["fog"], 1, drive)
+    wall = shown[0].classes == ID["building"]
+    air = tone.SRGB.encode(drive.surroundings.airlight[None])[0]
+    assert np.abs(foggy - air)[wall].mean() < 0.5 * np.abs(shown[0].rgb - air)[wall].mean()
+    with pytest.raises(InputError, match="estimated from views"):
+        weather.drive_facts([], tone.SRGB)
