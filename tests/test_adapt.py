@@ -156,6 +156,7 @@ def test_adapting_on_a_device_is_adapting(log, result, tmp_path):
         assert there[name]["psnr"] == pytest.approx(here[name]["psnr"], abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_model_that_gains_nothing_is_not_taken(log, tmp_path):
     adapted(log, tmp_path / "out", lr=1e-12, steps=1)
     record = store.read_json(tmp_path / "out" / "adapt.json")

@@ -45,6 +45,7 @@ def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., dic
     return run
 
 
+@pytest.mark.slow
 def test_passes_and_clips(script: Callable[..., dict[str, Any]]) -> None:
     rows = script("published_passes", "--batches", "3", "6")["rows"]
     passes = {row["batch"]: row["seconds"] for row in rows if row["what"] == "pass"}

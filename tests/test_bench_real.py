@@ -185,7 +185,7 @@ def untouched(city, model, tmp_path_factory):
     return {name: made_from(city, tmp_path_factory.mktemp(name), SPLITS[name], model) for name in ("gap-3", "camera")}
 
 
-@pytest.mark.parametrize("split", ["gap-3", "camera"])
+@pytest.mark.parametrize("split", ["gap-3", pytest.param("camera", marks=pytest.mark.slow)])
 def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(city, model, tmp_path, split, untouched):
     scene, plain, split = read_scene(city), untouched[split], SPLITS[split]
     held = real_protocols.held_out(scene, split, ())
@@ -197,6 +197,7 @@ def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(city, mod
     assert [name for name in plain if again[name] != plain[name]] == [] and set(again) == set(plain)
 
 
+@pytest.mark.slow
 def test_shown_content_changes_the_fit(city, model, tmp_path, untouched):
     scene, split = read_scene(city), SPLITS["gap-3"]
     corrupted(scene, tmp_path / "noise", {"front/000000"}, ())

@@ -235,6 +235,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     assert [m["name"] for m in store.read_json(again / "bench.json")["methods"]] == ["street_gaussians", "still"]
 
 
+@pytest.mark.slow
 def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp_path):
     out, config = made
     torch.manual_seed(0)

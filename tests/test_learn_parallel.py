@@ -44,6 +44,7 @@ def environment():
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(here), *sys.path]), "GLOO_SOCKET_IFNAME": "lo"}
 
 
+@pytest.mark.slow
 def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     common = {"batch_frames": 8, "log_every": 1, "checkpoint_every": 100, "steps": 6}
     learn.run(tiny(clips, **common), tmp_path / "whole")

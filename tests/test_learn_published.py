@@ -57,6 +57,7 @@ def corner(clip):
     return replace(clip, condition=condition, **cut(clip, "rgb", "depth", "depth_valid", "semantics"))
 
 
+@pytest.mark.slow
 def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the result."""
     one = learn.run(published_settings(converted, clips, steps=1, batch_frames=4), tmp_path / "one")
