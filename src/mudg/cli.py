@@ -115,7 +115,23 @@ def _fit(args: f.Fit) -> dict[str, Any]:
 def _render(args: f.RenderFlags) -> dict[str, Any]:
     from mudg.stages import render
 
-    return {"views": render.run(args.settings, args.scene, args.model, args.out, overwrite=args.overwrite)}
+    made = render.run(args.settings, args.scene, args.model, args.out, edits=args.edits, overwrite=args.overwrite)
+    return {"views": made}
+
+
+def _edit(args: f.EditFlags) -> dict[str, Any]:
+    from mudg.stages import edit
+
+    made = edit.run(
+        args.settings, args.run, args.edits, args.out, scene=args.scene, fused=args.fused, overwrite=args.overwrite
+    )
+    return {"edited": made}
+
+
+def _asset(args: f.AssetFlags) -> dict[str, Any]:
+    from mudg.stages.editing import assets
+
+    return {"asset": assets.run_export(args.run, args.id, args.out, args.scene, args.overwrite)}
 
 
 def _score(args: f.Score) -> dict[str, Any]:
@@ -237,6 +253,17 @@ VERBS: dict[str, Verb] = {
         ("mudg render scenes/city --model runs/mudg_s --shifts-m 0 3 -3 --out runs/render",),
         _render,
     ),
+    "edit": Verb(
+        "Change a drive as an edit script says: remove, move, insert, replace, change lanes.",
+        ("mudg edit runs/kitti edits.yaml --out runs/edited",
+         "mudg edit runs/mudg_s edits.yaml --scene scenes/city --fused runs/fused --out runs/edited"),
+        _edit,
+    ),
+    "asset": Verb(
+        "Write an object of a fitted scene to a file, to be inserted into other drives.",
+        ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",),
+        _asset,
+    ),
     "score": Verb(
         "Compare views with ground truth: metrics, tables, error images.",
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
@@ -254,6 +281,7 @@ VERBS: dict[str, Verb] = {
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "fit", "adapt", "synthesize", "render", "score")),
+    ("change a drive", ("edit", "asset")),
     ("benchmarks", ("bench",)),
     ("published models", ("convert",)),
 )

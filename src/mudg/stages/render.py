@@ -19,39 +19,50 @@ from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
 from mudg.core.raster.rasterize import RasterConfig
+from mudg.data.edits import EditScript
 from mudg.data.exporters.video import write_mp4
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import RenderConfig
+from mudg.stages.editing.apply import scene_seen_by
+from mudg.stages.editing.carried import carry_out, read_and_digest
 from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.fitting.views import resized_view
 
 _OUTPUT = VerbOutput("render", 1, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
-def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite: bool = False) -> Path:
+def run(
+    config: RenderConfig, scene: Path, model: Path, out: Path, *, edits: Path | None = None, overwrite: bool = False
+) -> Path:
     """Render every camera and shift of the configuration.
 
     Args:
         scene: scene directory; gives cameras, times and the path of the vehicle.
         model: folder made by fit.
         out: one observation folder (and video) per trajectory.
+        edits: an edit script to carry out before.
 
     Returns:
         ``out``, finished; an interrupted run continues with the next missing view.
     """
-    refuse_overlap(out, {"scene": scene, "model": model})
+    refuse_overlap(out, {"scene": scene, "model": model, "edits": edits})
     inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
+    script = None
+    if edits is not None:
+        script, inputs["edits"] = read_and_digest(Path(edits))
     device = drawing_device(config.device, "render", config.raster)
+    edited = None if script is None else _scenes(scene, model, script)  # what cannot be done is told before anything is written
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    fitted = load_model(Path(model)).to(device)
+    loaded, fitted = edited or _scenes(scene, model, None)
+    fitted = fitted.to(device)
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)
     source = str(fitted.facts.get("method", "fit"))
-    paths = trajectories(read_scene(Path(scene)), config)
+    paths = trajectories(loaded, config)
     try:
         with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
             for path in paths:
@@ -63,6 +74,16 @@ def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite:
         raise
     folder.finish({"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)})
     return folder.path
+
+
+def _scenes(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene, SceneModel]:
+    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script."""
+    fitted = load_model(Path(model))
+    loaded = scene_seen_by(read_scene(Path(scene)), fitted.facts)
+    if script is None:
+        return loaded, fitted
+    drive = carry_out(script, fitted, loaded)
+    return drive.scene or loaded, drive.model(fitted)
 
 
 def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
