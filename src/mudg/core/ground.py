@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 CELL_M: Final = 0.5
 REACH_M: Final = 3.0
 """A cell without points takes the height of the nearest one within this distance; farther away nothing is known."""
+TILT_M: Final = 2.0
+"""The slope is that between places this far to either side: about what a vehicle stands on."""
 SMOOTHING_CELLS: Final = 1.5
 MOST_CELLS: Final = 50_000_000
 
@@ -71,10 +73,10 @@ class GroundMap:
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def _slope(self, xy: Array, axis: int) -> Array:
-        """Rise per metre along an axis over two cells to either side, f64[N]; 0 where not known."""
+        """Rise per metre along an axis over `TILT_M` to either side, f64[N]; 0 where not known."""
         step = np.zeros(2)
-        step[axis] = 2 * self.cell_m
-        return np.nan_to_num((self.height(xy + step) - self.height(xy - step)) / (4 * self.cell_m))
+        step[axis] = TILT_M
+        return np.nan_to_num((self.height(xy + step) - self.height(xy - step)) / (2 * TILT_M))
 
     def _at(self, xy: Array) -> Array:
         return (np.asarray(xy, np.float64) - self.origin) / self.cell_m
