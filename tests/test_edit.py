@@ -18,7 +18,7 @@ from mudg.base.types import Camera, Track, View
 from mudg.core import boxes
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
-from mudg.core.ground import GroundMap
+from mudg.core.ground import HeightMap
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.data.edits import parse_edits
@@ -43,10 +43,10 @@ def straight(speed: float = 10.0, seconds: float = 4.0, rate: float = 10.0, y: f
     return Motion.recorded(times, np.stack([geometry.yaw_matrix(0.0, (start + speed * t, y, 0.75)) for t in times]))
 
 
-def slope(rise: float = 0.1) -> GroundMap:
+def slope(rise: float = 0.1) -> HeightMap:
     """Ground that rises to the left, z = rise * y."""
     x, y = np.meshgrid(np.arange(-10, 80, 0.25), np.arange(-12, 12, 0.25), indexing="ij")
-    return GroundMap.from_points(np.stack([x, y, rise * y], -1).reshape(-1, 3))
+    return HeightMap.from_points(np.stack([x, y, rise * y], -1).reshape(-1, 3))
 
 
 # -- paths ---------------------------------------------------------------------------------------------------------------
@@ -134,12 +134,12 @@ def test_the_ground_is_the_median_and_unknown_far_away() -> None:
     rng = np.random.default_rng(0)
     xy = rng.uniform(0, 20, (40_000, 2))
     z = 0.05 * xy[:, 0] + np.where(rng.random(len(xy)) < 0.1, 1.5, 0.0)  # a tenth of the points lies on cars
-    ground = GroundMap.from_points(np.column_stack([xy, z]))
+    ground = HeightMap.from_points(np.column_stack([xy, z]))
     inside = rng.uniform(2, 18, (200, 2))
     assert np.abs(ground.height(inside) - 0.05 * inside[:, 0]).max() < 0.05
     assert np.isnan(ground.height(np.array([[40.0, 5.0]]))).all()
     with pytest.raises(InputError, match="no ground"):
-        GroundMap.from_points(np.zeros((0, 3)))
+        HeightMap.from_points(np.zeros((0, 3)))
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(-3, 3), st.floats(-3, 3))

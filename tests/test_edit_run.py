@@ -51,7 +51,7 @@ def rendered(scene: Path, model: Path, out: Path, edits: Path | None = None) -> 
 
 
 def test_an_edited_fit_renders_as_render_with_edits_does(run: Path, tmp_path: Path) -> None:
-    text = "- move: {id: car, left_m: 1.5, along_m: 1}\n- lane_change: {id: ego, left_m: 0.4, start_s: 0.05, duration_s: 0.8, ground: false}"
+    text = "- move: {id: car, left_m: 1.5, along_m: 1}\n- lane_change: {id: ego, left_m: 0.4, start_s: 0, duration_s: 0.8, ground: false}"
     edits, model = script(tmp_path, text), run / "fit" / "street_gaussians"
     made = edit.run(EditConfig(), model, edits, tmp_path / "edited", scene=run / "scene")
     before = rendered(run / "scene", model, tmp_path / "a")

@@ -18,7 +18,7 @@ from scipy.interpolate import PchipInterpolator
 
 from mudg.base import geometry
 from mudg.base.errors import InputError
-from mudg.core.ground import GroundMap
+from mudg.core.ground import HeightMap
 
 Array = NDArray[np.float64]
 STEP_S: Final = 0.05
@@ -109,7 +109,7 @@ class Displacement:
         return geometry.yaw_matrix(self.yaw_rad, (self.ahead_m, self.left_m, self.up_m))
 
 
-def moved(motion: Motion, by: Displacement, ground: GroundMap | None = None) -> Motion:
+def moved(motion: Motion, by: Displacement, ground: HeightMap | None = None) -> Motion:
     """A path displaced in the object's own frame; on ``ground``, at the height above it that it had."""
     if by.from_s is None:
         changed = replace(motion, poses=motion.poses @ by.matrix)
@@ -122,7 +122,7 @@ def moved(motion: Motion, by: Displacement, ground: GroundMap | None = None) -> 
     return changed if ground is None else grounded(changed, keyed, ground)
 
 
-def lane_changed(motion: Motion, left_m: float, start_s: float, duration_s: float, ground: GroundMap | None = None) -> Motion:
+def lane_changed(motion: Motion, left_m: float, start_s: float, duration_s: float, ground: HeightMap | None = None) -> Motion:
     """A path that changes lanes: quintic offset to the left of the recorded path, heading along the new one.
 
     Raises:
@@ -150,7 +150,7 @@ def lane_changed(motion: Motion, left_m: float, start_s: float, duration_s: floa
     return changed if ground is None else grounded(changed, keyed, ground)
 
 
-def grounded(motion: Motion, before: Motion, ground: GroundMap) -> Motion:
+def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
     """Set a changed path on the ground: the height above it, and the tilt against it, are those that the path had before.
 
     Keys of both belong together. Where the ground is unknown at either place, a key stays as it is.
@@ -165,7 +165,7 @@ def grounded(motion: Motion, before: Motion, ground: GroundMap) -> Motion:
     return replace(motion, poses=poses)
 
 
-def along_points(points: Array, height_m: float, ground: GroundMap | None, floor_m: float = 0.0) -> Motion:
+def along_points(points: Array, height_m: float, ground: HeightMap | None, floor_m: float = 0.0) -> Motion:
     """A path through given places.
 
     Args:

@@ -22,7 +22,7 @@ MOST_CELLS: Final = 50_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GroundMap:
+class HeightMap:
     """Heights on a grid of the horizontal plane.
 
     Args:
@@ -35,7 +35,7 @@ class GroundMap:
     heights: Array
 
     @classmethod
-    def from_points(cls, xyz: NDArray[np.floating], cell_m: float = CELL_M) -> GroundMap:
+    def from_points(cls, xyz: NDArray[np.floating], cell_m: float = CELL_M) -> HeightMap:
         """Median height per cell, gaps filled from the nearest cell, smoothed.
 
         Args:
@@ -85,9 +85,10 @@ class GroundMap:
 def _smoothed(heights: Array, cell_m: float) -> Array:
     """Gaps filled as far as `REACH_M`, then a Gaussian blur that only known cells enter."""
     empty = np.isnan(heights)
-    distance, nearest = ndimage.distance_transform_edt(empty, return_indices=True)
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     filled = heights[tuple(nearest)]
-    far = distance * cell_m > REACH_M
+    here = np.indices(heights.shape)
+    far = np.linalg.norm(nearest - here, axis=0) * cell_m > REACH_M
     weight = ndimage.gaussian_filter((~far).astype(np.float64), SMOOTHING_CELLS)
     blurred = ndimage.gaussian_filter(np.where(far, 0.0, filled), SMOOTHING_CELLS) / np.maximum(weight, 1e-12)
     return np.where(far, np.nan, blurred)

@@ -300,4 +300,4 @@ def with_shadow(model: SceneModel, name: str, strength: float) -> SceneModel:
 def _centres(side_m: float) -> NDArray[np.float64]:
     """Places along one side of a box, `SHADOW_STEP_M` apart, centred."""
     count = max(2, int(np.ceil(side_m / SHADOW_STEP_M)) + 1)
-    return (np.arange(count) - (count - 1) / 2) * SHADOW_STEP_M
+    return (np.arange(count, dtype=np.float64) - (count - 1) / 2) * SHADOW_STEP_M

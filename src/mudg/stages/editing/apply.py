@@ -16,7 +16,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError
 from mudg.base.types import EgoPath, FusedCloud, PointCloud, Scene, Track, View
 from mudg.core.edit import Motion
-from mudg.core.ground import GroundMap
+from mudg.core.ground import HeightMap
 from mudg.data.scene import decode_image
 from mudg.models.scene import edited
 from mudg.models.scene.edited import Asset
@@ -108,13 +108,13 @@ def asset_points(asset: Asset) -> PointCloud:
     return PointCloud(asset.columns["means"].numpy()[solid], (rgb[solid] * 255 + 0.5).astype(np.uint8), "object", ids[solid])
 
 
-def ground_of(cloud: FusedCloud | None, model: SceneModel) -> GroundMap | None:
+def ground_of(cloud: FusedCloud | None, model: SceneModel) -> HeightMap | None:
     """Height map of the ground: of the fused points of ground classes, else of the fitted Gaussians; None where there are neither."""
     xyz = np.zeros((0, 3), np.float32)
     if cloud is not None and cloud.static.semantics is not None:
         xyz = cloud.static.xyz[np.isin(cloud.static.semantics, edited.GROUND_CLASSES)]
     xyz = edited.ground_points(model) if not len(xyz) else xyz
-    return GroundMap.from_points(xyz) if len(xyz) else None
+    return HeightMap.from_points(xyz) if len(xyz) else None
 
 
 # -- what a scene says ---------------------------------------------------------------------------------------------------

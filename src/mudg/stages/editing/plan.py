@@ -20,7 +20,7 @@ from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.types import Scene
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
-from mudg.core.ground import GroundMap
+from mudg.core.ground import HeightMap
 from mudg.data.edits import EGO, EditScript, ScriptEdit
 from mudg.data.edits.records import AssetSource
 from mudg.models.scene.edited import Asset, motion_of
@@ -60,10 +60,10 @@ class EditWorld:
 
     actors: Mapping[str, Actor]
     ego: Motion | None = None
-    ground: GroundMap | None = None
+    ground: HeightMap | None = None
 
     @classmethod
-    def of_scene(cls, scene: Scene, ground: GroundMap | None) -> EditWorld:
+    def of_scene(cls, scene: Scene, ground: HeightMap | None) -> EditWorld:
         """All boxes of a scene and its vehicle."""
         actors = {
             track.id: Actor(track.label, _three(track.size_m), Motion.recorded(track.times_s, track.world_from_object))
@@ -72,7 +72,7 @@ class EditWorld:
         return cls(actors, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
 
     @classmethod
-    def of_model(cls, model: SceneModel, ground: GroundMap | None) -> EditWorld:
+    def of_model(cls, model: SceneModel, ground: HeightMap | None) -> EditWorld:
         """The objects of a fitted scene."""
         nodes = [node for node in model.nodes if isinstance(node, RigidNode)]
         return cls({node.name: Actor(node.label, _three(node.size_m), motion_of(node)) for node in nodes}, None, ground)
@@ -215,7 +215,7 @@ def _path(plan: EditPlan, given: Any, _: OpenAsset) -> None:
     _change(plan, given.id, functools.partial(_other_path, points=_points(given.points), ground=ground))
 
 
-def _other_path(motion: Motion, points: np.ndarray, ground: GroundMap | None) -> Motion:
+def _other_path(motion: Motion, points: np.ndarray, ground: HeightMap | None) -> Motion:
     """A path through points, at the height above the ground that the object had at first."""
     first = motion.poses[0, :3, 3]
     under = float("nan") if ground is None else float(ground.height(first[None, :2])[0])
@@ -285,7 +285,7 @@ def _floor(world: EditWorld) -> float:
     return 0.0 if world.ego is None else float(np.median(world.ego.poses[:, 2, 3]))
 
 
-def _near(world: EditWorld, given: Any, height: float, ground: GroundMap | None) -> Motion:
+def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None) -> Motion:
     """A place relative to somebody, standing still or going with them, wheels on the ground."""
     leader = _motion(world, given.id)
     by = Displacement(given.ahead_m, given.left_m, 0.0, math.radians(given.yaw_deg))

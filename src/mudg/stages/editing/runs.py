@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.stages.run import WITH_DIFFUSION, WITHOUT_DIFFUSION
+
+BEST_FIRST: Final = ("mudg_s", "street_gaussians")
+"""Fits that ``mudg run`` makes; where one has to speak for all, the first that is there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +42,7 @@ def find_run(folder: Path) -> RunParts:
     folder = Path(folder)
     if (folder / "model.json").is_file():
         return RunParts({"": folder}, None, None, False)
-    methods = (WITH_DIFFUSION, WITHOUT_DIFFUSION)
-    fits = {name: folder / "fit" / name for name in methods if (folder / "fit" / name / "model.json").is_file()}
+    fits = {name: folder / "fit" / name for name in BEST_FIRST if (folder / "fit" / name / "model.json").is_file()}
     scene, fused = _scene_of(folder), folder / "fuse"
     if not fits or scene is None or not (fused / "fuse.json").is_file():
         there = {"fit": bool(fits), "scene": scene is not None, "fuse": (fused / "fuse.json").is_file()}

@@ -53,7 +53,7 @@ class EditedImages:
         usual = render_view(self.before, frame.view, raster)
         changed = ((made.rgb - usual.rgb).abs().amax(0) > self.config.changed_above).numpy()
         if self.config.grow_px and changed.any():
-            changed = ndimage.binary_dilation(changed, iterations=self.config.grow_px)
+            changed = np.asarray(ndimage.binary_dilation(changed, iterations=self.config.grow_px), bool)
         return np.where(changed[..., None], to_bytes(made.rgb), recorded), changed, made
 
 
