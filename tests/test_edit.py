@@ -11,22 +11,26 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mudg import native
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
+from mudg.bench.edit import city_keys
 from mudg.core import boxes
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
 from mudg.core.ground import HeightMap
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.edits import parse_edits
+from mudg.data.city import CityConfig, CityWorld
+from mudg.data.edits import parse_edits, read_edits
 from mudg.models.scene import edited
 from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import CERTAINTY, SceneModel, compose
 from mudg.models.scene.nodes import DeformableNode, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
+from mudg.stages.config import DEMO_CITY
 from mudg.stages.editing import assets
 from mudg.stages.editing.apply import edited_model
 from mudg.stages.editing.carried import carry_out
@@ -293,6 +297,7 @@ def test_an_asset_goes_through_its_file_and_renders_as_the_object_did(tmp_path: 
     read = assets.read_asset(tmp_path / "car.safetensors")
     assert (read.label, read.size_m, len(read), read.origin) == ("car", SIZE, 50, "toy")
     assert read.seen_rad == pytest.approx((0.5, 3.0), abs=1e-3)
+    assert read.certainty is not None
     assert np.allclose(read.certainty, 0.5)
     bare = model.without_nodes(["car-1"])
     again = edited.with_asset(bare, read, "car-1", edited.motion_of(model.dynamic_object("car-1")))
@@ -394,6 +399,40 @@ def test_the_least_duration_of_a_lane_change_is_told_and_enough() -> None:
         carried(toy(), sharp % 1)
     least = refused.value.remedy.split("duration_s of ")[1].split()[0]
     carried(toy(), sharp % least)
+
+
+@pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
+def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
+    """All that they name is in the city of ``mudg demo``, and possible there; the vehicle hits nothing."""
+    scripts = sorted((repository / "docs" / "examples" / "edits").glob("*.yaml"))
+    assert len(scripts) == 3
+    city = CityWorld(CityConfig(seed=DEMO_CITY, n_frames=24))
+    actors = {t.id: Actor(t.label, tuple(t.size_m), Motion.recorded(t.times_s, t.world_from_object)) for t in city.tracks()}
+    ego = city.ego_path()
+    world = EditWorld(actors, Motion.recorded(ego.times_s, ego.world_from_ego))
+    asset = edited.asset_of(toy(), "car-1")
+    for path in scripts:
+        plan = plan_edits(read_edits(path), world, lambda source: asset)
+        assert plan.removed or plan.changes
+        assert not [found for found in collisions(plan) if "ego" in found["ids"]]
+
+
+def test_the_city_is_drawn_again_with_an_object_elsewhere() -> None:
+    city = CityWorld(CityConfig(seed=DEMO_CITY, n_frames=4, width=64, height=40))
+    frame = city.frame_views("front")[1]
+    truth = city.render(frame)
+    seen = np.bincount(truth.instance.ravel())[1:]
+    track = city.tracks()[int(seen.argmax())]
+    number = city.instance_of(track.id)
+    assert not (city.rearranged({track.id: None}).render(frame).instance == number).any()
+    keys = city_keys(Motion.recorded(track.times_s, track.world_from_object), track.size_m[2])
+    same = city.rearranged({track.id: keys}).render(frame)
+    assert np.array_equal(same.rgb, truth.rgb)
+    away = city.rearranged({track.id: keys + np.array([0, 0.5, 0, 0])}).render(frame)
+    assert 0 < ((away.instance == number) ^ (truth.instance == number)).sum()
+    assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
+    with pytest.raises(UsageError, match="no such object"):
+        city.rearranged({"car-999": None})
 
 
 def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:

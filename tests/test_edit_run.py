@@ -15,11 +15,12 @@ from mudg import cli, verbs
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
+from mudg.bench import run as bench
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import read_observations
 from mudg.data.scene import check_scene, read_image, read_label, read_points, read_scene
 from mudg.stages import edit, fit, fuse, render
-from mudg.stages.config import EditConfig, FuseConfig, RenderConfig
+from mudg.stages.config import BenchConfig, EditConfig, FuseConfig, RenderConfig
 
 FRAMES = 4
 LAST_S = 0.3 * (FRAMES - 1)
@@ -185,3 +186,16 @@ def test_from_python(run: Path, tmp_path: Path) -> None:
     pictures = [s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))]
     assert np.array_equal(*pictures)
     assert fitted.export_asset("car", tmp_path / "car.safetensors", scene).is_file()
+
+
+@pytest.mark.slow
+def test_the_benchmark_finds_edits_as_good_as_the_fit(tmp_path: Path) -> None:
+    config = BenchConfig(cities="development", count=1, pose_iterations=60)
+    out = bench.run("edit", config, tmp_path / "out")
+    rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
+    assert rows["remove"]["vehicle"] is None
+    for row in rows.values():
+        assert row["outside"] < 0.03
+        if row["overlap"] is not None:
+            assert row["overlap"] > row["overlap_before"] - 0.05
+            assert row["vehicle"] > row["vehicle_before"] - 3

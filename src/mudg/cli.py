@@ -270,8 +270,8 @@ VERBS: dict[str, Verb] = {
         _score,
     ),
     "bench": Verb(
-        "Run a benchmark: mdm, poses or shift against exact ground truth, real on real logs.",
-        ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses",
+        "Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs.",
+        ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses", "mudg bench edit --out runs/edits",
          "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
          "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real"),
         _bench,

@@ -281,7 +281,8 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Annotated[str, tyro.conf.Positional, arg(metavar="BENCHMARK")]
-    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), shift (complete methods off the recorded path) or
+    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits
+    of fitted scenes), shift (complete methods off the recorded path) or
     real (complete methods on real logs)."""
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, arg(metavar="[LOG ...]")] = ()
     """real: folders of dataset logs, or scenes made by ingest."""

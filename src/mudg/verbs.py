@@ -208,7 +208,7 @@ def bench(
     """Run a benchmark; returns the folder of ``bench.json``.
 
     Args:
-        name: ``mdm``, ``poses`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``.
+        name: ``mdm``, ``poses``, ``edit`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``.
     """
     from mudg.bench import run as stage
 

@@ -92,7 +92,11 @@ def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequ
             seen = np.array(plan.inserted[name].asset.seen_rad)
         else:
             seen = sides_seen(plan.before.actors[name], views_before)
-        if not len(asked) or (name in plan.inserted and not len(seen)):
+        if not len(asked):
+            continue
+        if name in plan.inserted and not len(seen):
+            text = f"{name}: from which sides its own recording saw it is not known; export it with its scene"
+            found.append({"kind": "unknown sides", "ids": [name], "text": text})
             continue
         apart = boxes.angle_to_nearest(asked, seen)
         share = float((apart > SELDOM_RAD).mean())
