@@ -1,7 +1,6 @@
 """``mudg bench real``: what is hidden stays unused, measures with known answers, and the command end to end on a tiny log."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +15,10 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
-from mudg.bench import real, real_measure, real_points, real_protocols, real_tables, real_truth
+from mudg.bench import real, real_measure, real_protocols, real_tables, real_truth
 from mudg.bench.real_protocols import SPLITS
 from mudg.bench.shift import write_fill
-from mudg.core import color_match
+from mudg.core import color_match, points_seen
 from mudg.core.fusion import STATIC
 from mudg.data.city import CityWorld
 from mudg.data.importers.pandaset.pandas_frame import read_frame
@@ -240,17 +239,17 @@ VIEW = View(CAMERA, np.eye(4), 0.0)
 
 
 def test_a_point_is_seen_if_it_is_not_behind_the_surface():
-    shown = [real_points.ShownFrame(VIEW, np.full((30, 40), 10.0, np.float32), np.full((30, 40, 3), 77, np.uint8))]
+    shown = [points_seen.ShownFrame(VIEW, np.full((30, 40), 10.0, np.float32), np.full((30, 40, 3), 77, np.uint8))]
     xyz = np.array([[0, 0, 9.9], [0, 0, 10.5], [0, 0, 14.0], [100, 0, 5.0], [0, 0, -5.0]], np.float32)
-    points = real_points.OwnedPoints(xyz, np.full(5, STATIC, np.int32), np.zeros(5, np.uint8), 0.4)
-    log = SimpleNamespace(placed=lambda points, _: points.xyz)
-    seen, colors = real_points.seen_by(log, points, shown, 0.0)
+    points = points_seen.OwnedPoints(xyz, np.full(5, STATIC, np.int32), np.zeros(5, np.uint8), 0.4)
+    place = lambda points, _: points.xyz  # noqa: E731
+    seen, colors = points_seen.seen_by(place, points, shown, 0.0)
     assert seen.tolist() == [True, True, False, False, False]
     assert colors[0].tolist() == [77, 77, 77] and not colors[2].any()
 
 
 def test_the_mask_takes_the_answer_of_the_nearest_point_nearby():
-    mask = real_points.spread(np.array([True, False]), np.array([5, 5]), np.array([10, 20]), (11, 100))
+    mask = points_seen.spread(np.array([True, False]), np.array([5, 5]), np.array([10, 20]), (11, 100))
     assert mask[5, 8:14].all() and not mask[5, 16:24].any()
     assert not mask[5, 40:].any()  # no point is near
 

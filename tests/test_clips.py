@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from mudg.base.errors import InputError
-from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, Track, View
+from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core import visible
+from mudg.core.fusion import SweepShots
 from mudg.data.clips import condition as clips
+from mudg.data.clips import from_city, near_points
 from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.ablated import ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
@@ -110,6 +113,25 @@ def test_backdrop_of_the_recorded_view_is_the_image():
     recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
     condition = build_conditions(cloud, [], [view_at()], recorded, RULES)[0]
     assert torch.allclose(condition.backdrop[0], clips.image_tensor(recorded[0].rgb), atol=1e-5)
+
+
+@pytest.mark.parametrize("fine", [0, 2])
+def test_parts_of_a_condition_are_switched_off(fine):
+    cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
+    recorded = [Photo(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
+    rules = replace(RULES, fine_width=48 * fine, fine_height=32 * fine)
+    views = [view_at(y=2.0, time_s=0.1)]
+    given = ConditionSources(cloud, (), recorded, rules)
+    full, points, reference, concat = (conditions_of(given, parts, views, {}) for parts in ("full", "points", "reference", "concat"))
+    for grid in (0, 1):
+        whole, bare, image, both = full[grid], points[grid], reference[grid], concat[grid]
+        assert bool(whole.warped.any()) and not any(bool(c.warped.any()) for c in (bare, image, both))
+        assert torch.equal(bare.valid, whole.valid) and torch.equal(bare.depth, whole.depth)
+        assert torch.equal(bare.backdrop, bare.color)
+        assert torch.equal(both.color, bare.color) and torch.equal(both.depth, bare.depth)
+        assert torch.equal(both.backdrop, whole.backdrop) and torch.equal(image.color, whole.backdrop)
+        assert not bool(image.valid.any()) and bool((image.depth == rules.far_m).all())
+    assert torch.equal(full[0].color, build_conditions(cloud, [], views, recorded, rules)[0].color)
 
 
 def test_moving_things_take_no_colour_from_another_time():
@@ -272,3 +294,49 @@ def test_held_out_cities_have_the_stated_shifts():
         assert min(shifts) < 0 < max(shifts)
         assert shifts[-1] == 0.0
         assert all(0.5 <= abs(s) <= 4.2 for s in shifts[:-1])
+
+
+# ---- the condition of FreeVS -------------------------------------------------------------------------------------------
+
+
+def one_wall_per_sweep(times, track=None):
+    """Sweeps of a 5 m wide piece of a wall at x = 12, each further to the left by 1 m, coloured by an image of one colour."""
+    sweeps = []
+    for number, time_s in enumerate(times):
+        y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-2.5, 2.5, 0.05) + number, np.arange(-2, 2, 0.05)))
+        xyz = np.stack([np.full(y.size, 12.0), y, z], 1).astype(np.float32)
+        points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.zeros(len(xyz), np.float32))
+        image = np.full((32, 48, 3), 40 * number + 20, np.uint8)
+        sweeps.append(SweepShots(time_s, np.eye(4), points, [Photo(view_at(time_s=time_s), image)]))
+    return near_points.NearSweeps(tuple(times), sweeps.__getitem__, (), 0.1)
+
+
+def test_points_of_two_frames_before_and_after_are_shown():
+    near = one_wall_per_sweep([0.1 * n for n in range(6)])
+    assert near.numbers_at(0.3) == (1, 2, 3, 4, 5)
+    assert near.numbers_at(0.0) == (0, 1, 2) and near.numbers_at(9.0) == (3, 4, 5)
+    condition = near_points.near_condition(near, [view_at(time_s=0.0), view_at(time_s=0.5)], RULES)
+    shades = [set((condition.color[t][:, condition.valid[t, 0]] * 255).round().int().flatten().tolist()) for t in (0, 1)]
+    assert shades[0] <= {20, 60, 100} and shades[1] <= {140, 180, 220} and all(shades)
+    assert not bool(condition.color[:, :, ~condition.valid[0, 0] & ~condition.valid[1, 0]].any())
+    assert bool((condition.depth == RULES.far_m).all()) and not bool(condition.warped.any())
+    assert bool((condition.semantics == 255).all()) and not bool(condition.reference.any())
+    late = near_points.near_condition(near, [view_at(time_s=0.0)], RULES, 0.5)
+    assert torch.equal(late.color[0], condition.color[1]) and late.views[0].time_s == 0.0
+
+
+def test_half_of_the_clips_on_the_path_have_points_of_other_frames():
+    near = one_wall_per_sweep([0.0, 0.1])
+    drawn = [near_points.simulated_lateness_s(near, np.random.default_rng(seed)) for seed in range(400)]
+    assert {round(value, 6) for value in drawn} == {0.0, 0.4, -0.4}
+    assert 0.4 < np.mean(np.array(drawn) == 0.0) < 0.6
+
+
+def test_city_clips_with_the_condition_of_freevs():
+    rules = from_city.CityClipRules(48, 32, window=3, clips=2, near_points=True)
+    clips_of = from_city.make_clips(rules, 7)
+    full = from_city.make_clips(replace(rules, near_points=False), 7)
+    for near, whole in zip(clips_of, full, strict=True):
+        assert torch.equal(near.rgb, whole.rgb)
+        assert not bool(near.condition.warped.any()) and near.condition.renders is None
+        assert 0 < float(near.condition.valid.float().mean()) < 0.9

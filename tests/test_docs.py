@@ -37,7 +37,7 @@ FILE_ENDINGS = tuple(".py .json .jsonl .yaml .txt .md .png .jpg .mp4 .html .pt .
 FOREIGN_NAMES = ("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud")
 
 
-SLOW = ("docs/bench_shift.md", "docs/results.md", "docs/training.md")
+SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/training.md")
 """Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats."""
 
 

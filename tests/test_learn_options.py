@@ -190,3 +190,14 @@ def test_a_step_has_clips_of_one_size() -> None:
                 assert sizes[chosen % 5] == sizes[first % 5]
     assert learn_clips.sizes_of_cities(LearnConfig()) == [(192, 128)]
     assert len(learn_clips.sizes_of_cities(learn_clips.of_one_size(config))) == 1
+
+
+def test_the_condition_of_freevs_is_made_of_cities_without_renders():
+    from mudg.stages.learning import clips as learn_clips
+
+    config = learn._checked_condition(LearnConfig(data=LearnData(condition="freevs")))
+    rules = learn_clips.clip_rules(config)
+    assert rules.near_points and not rules.fitted
+    assert not learn_clips.clip_rules(LearnConfig()).near_points
+    with pytest.raises(UsageError, match="generated cities only"):
+        learn._checked_condition(LearnConfig(data=LearnData(condition="freevs", scenes=("a",))))

@@ -179,7 +179,7 @@ def test_without_weights_the_tables_name_the_flag(tmp_path: Path) -> None:
     }
     assert "distributions" not in document
     assert not (out / "features").exists()
-    assert "not computed (--fvd-weights)" in (out / "metrics.md").read_text()
+    assert "FVD (--fvd-weights)" in (out / "metrics.md").read_text()
     shown = page._score_values(document)
     assert "FID (Inception weights: mudg score --fid-weights FILE)" in shown["not_computed"]
     assert "not computed (--fid-weights)" in {

@@ -18,7 +18,7 @@ from mudg.base.types import Camera, View
 from mudg.core import metrics, perceptual
 from mudg.core.metrics import Pair
 from mudg.data.city import CityConfig, CityWorld
-from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance
+from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
 from mudg.models.mdm import files
 from mudg.report import score_tables
 from mudg.stages import score
@@ -154,14 +154,13 @@ def test_places_without_features_pass_a_finite_gradient():
         assert float(x.grad[:, 1:].abs().max()) == 0
 
 
-def lpips_state():
+def lpips_state(trunk="alex"):
     generator = torch.Generator().manual_seed(0)
     state = {}
-    for stage, (place, out, into, size, _, _) in enumerate(LpipsFeatures.LAYERS):
-        kernel = torch.randn(out, into, size, size, generator=generator) / (into * size * size) ** 0.5
-        state[f"net.slice{stage + 1}.{place}.weight"] = kernel
-        state[f"net.slice{stage + 1}.{place}.bias"] = torch.randn(out, generator=generator) * 0.1
-        state[f"lin{stage}.model.1.weight"] = torch.rand(1, out, 1, 1, generator=generator)
+    for name, shape in lpips_shapes(trunk).items():
+        draw = torch.randn(shape, generator=generator)
+        fan_in = draw[0].numel() if name.startswith("net.") and name.endswith("weight") else 100
+        state[name] = draw.abs() if name.startswith("lin") else draw / fan_in**0.5
     return state
 
 
@@ -299,3 +298,59 @@ def test_evenly_spread_views():
     assert score.evenly(range(24), 3) == [4, 12, 20]
     assert score.evenly([3, 7, 11], 1) == [7]
     assert score.evenly([], 4) == score.evenly(range(4), 0) == []
+
+
+# ---- the other networks of LPIPS ------------------------------------------------------------------------------------------
+
+
+class Fire(torch.nn.Module):
+    """SqueezeNet's block from torch's layers."""
+
+    def __init__(self, into, between, each):
+        super().__init__()
+        conv = torch.nn.Conv2d
+        self.squeeze, self.expand1x1, self.expand3x3 = conv(into, between, 1), conv(between, each, 1), conv(between, each, 3, padding=1)
+
+    def forward(self, x):
+        x = functional.relu(self.squeeze(x))
+        return torch.cat([functional.relu(self.expand1x1(x)), functional.relu(self.expand3x3(x))], 1)
+
+
+def torchvision_trunk(name):
+    """Layers in torchvision's numbering, and after which of them features are read."""
+    conv, relu, pool = torch.nn.Conv2d, torch.nn.ReLU, torch.nn.MaxPool2d
+    if name == "vgg":
+        layers, into = [], 3
+        for out in (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512):
+            layers += [pool(2, 2)] if out == "M" else [conv(into, out, 3, padding=1), relu()]
+            into = into if out == "M" else out
+        return torch.nn.Sequential(*layers), (3, 8, 15, 22, 29)
+    squeeze = pool(3, 2, ceil_mode=True)
+    layers = [
+        conv(3, 64, 3, 2), relu(), squeeze, Fire(64, 16, 64), Fire(128, 16, 64), squeeze, Fire(128, 32, 128), Fire(256, 32, 128), squeeze,
+        Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256),
+    ]  # fmt: skip
+    return torch.nn.Sequential(*layers), (1, 4, 7, 9, 10, 11, 12)
+
+
+@pytest.mark.parametrize("name", ["vgg", "squeeze"])
+@pytest.mark.parametrize("given", ["correct", "unscaled"])
+def test_lpips_with_vgg_and_squeeze_equals_its_float64_twin(pictures, name, given):
+    state, truth = lpips_state(name), pictures[0][:, :70, :75]
+    trunk, taps = torchvision_trunk(name)
+    trunk.double().load_state_dict({key.split(".", 2)[2]: v.double() for key, v in state.items() if key.startswith("net.")})
+    made = blurred(truth, 1.0)
+    x = torch.stack([made, truth]).double()
+    x = x * 2 - 1 if given == "correct" else x
+    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor([0.458, 0.448, 0.450]).double().view(3, 1, 1)
+    total, stage = 0.0, 0
+    with torch.no_grad():
+        for number, layer in enumerate(trunk):
+            x = layer(x)
+            if number in taps:
+                a, b = functional.normalize(x, dim=1)
+                total += float(((a - b) ** 2 * state[f"lin{stage}.model.1.weight"][0].double()).sum(0).mean())
+                stage += 1
+    network = LpipsFeatures(state, "file", name, given)
+    assert stage == len(network.channel_weights)
+    assert PerceptualDistance(network, network.channel_weights)(pair(rgb=made, truth_rgb=truth)) == pytest.approx(total, rel=1e-4)

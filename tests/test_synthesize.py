@@ -173,6 +173,30 @@ def test_bad_requests(world, tmp_path):
         made(world, tmp_path / "d", shifts_m=(1.0, 1.01))
 
 
+def test_further_paths_are_made_and_parts_of_the_condition_switched_off(world, tmp_path):
+    out = made(world, tmp_path / "lane", shifts_m=(), paths=("lane+0.2",))
+    lane = read_observations(out / "front_lane+0.2")
+    start = trajectory.recorded(read_scene(world[0] / "scene"), "front").views
+    assert len(lane) == FRAMES
+    assert [round(float(torch.tensor(a.center_world - b.center_world).norm()), 3) for a, b in zip(lane.views, start)][:3] == [0.0, 0.2, 0.4]
+    seen = {
+        parts: frames_of(made(world, tmp_path / parts, condition=parts) / "front_shift+1.0")[2].rgb
+        for parts in ("full", "reference", "points", "concat")
+    }
+    names = list(seen)
+    assert all(not torch.equal(seen[a], seen[b]) for a in names for b in names if a < b)
+
+
+def test_the_condition_of_freevs_gives_colour_alone(world, tmp_path):
+    out = made(world, tmp_path / "freevs", condition="freevs") / "front_shift+1.0"
+    seen, usual = frames_of(out), frames_of(made(world, tmp_path / "full") / "front_shift+1.0")
+    assert len(seen) == FRAMES
+    assert all(o.depth is None and o.semantics is None and o.source == "freevs" for o in seen)
+    assert all(not torch.equal(a.rgb, b.rgb) for a, b in zip(seen, usual))
+    large = frames_of(made(world, tmp_path / "large", condition="freevs", full_size=True) / "front_shift+1.0")
+    assert large[0].rgb.shape == (3, 64, 96)
+
+
 def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, capsys):
     """Before any work: neither scene nor cloud is there, and nothing is written."""
     words = ["synthesize", str(tmp_path / "scene"), "--fused", str(tmp_path / "fused"), "--out", str(tmp_path / "out")]
@@ -243,3 +267,10 @@ def test_a_model_without_renders_takes_no_fitted_scene(world, fitted, tmp_path):
     with pytest.raises(UsageError, match="not trained with renders"):
         synthesize.run(config, root / "scene", root / "fused", tmp_path / "out", fitted=fitted[0])
     assert not (tmp_path / "out").exists()
+
+
+def test_a_condition_with_parts_switched_off_has_no_renders(world, fitted, tmp_path):
+    root, config = world
+    settings = replace(config, model=str(fitted[1]), condition="points")
+    with pytest.raises(UsageError, match="switched off"):
+        synthesize.run(settings, root / "scene", root / "fused", tmp_path / "out", fitted=fitted[0])

@@ -164,3 +164,29 @@ def test_a_rolling_shutter_turns_with_the_vehicle():
     first, last = trajectory.readout_poses(scene.ego, rolling)
     turn = last[:3, :3] @ first[:3, :3].T
     assert math.degrees(math.atan2(turn[1, 0], turn[0, 0])) == pytest.approx(math.degrees(1.2 / 4), abs=1e-9)
+
+
+def test_a_lane_change_and_a_faster_drive_follow_the_axes_of_the_first_frame():
+    """On a circle that begins along x: left is y and ahead is x at the first frame, whatever the heading later."""
+    scene = circle()
+    before = trajectory.recorded(scene, "left").views
+    moves = {"lane+0.1": (0, 0.1, 0), "lane-0.1": (0, -0.1, 0), "speed+0.1": (0.1, 0, 0), "speed-0.25": (-0.25, 0, 0)}
+    for name, direction in moves.items():
+        path = trajectory.named(scene, "left", name)
+        assert (path.name, path.origin) == (f"left_{name}", "shifted")
+        for number, (old, new) in enumerate(zip(before, path.views, strict=True)):
+            assert np.allclose(new.center_world - old.center_world, np.multiply(number, direction), atol=1e-12)
+            assert np.array_equal(new.world_from_cam[:3, :3], old.world_from_cam[:3, :3]) and new.time_s == old.time_s
+
+
+def test_a_raised_drive_is_that_of_a_vertical_shift():
+    scene = circle()
+    raised, shifted = trajectory.named(scene, "front", "up+1.5"), trajectory.shifted(scene, "front", 0.0, height_m=1.5)
+    for a, b in zip(raised.views, shifted.views, strict=True):
+        assert np.allclose(a.world_from_cam, b.world_from_cam)
+
+
+@pytest.mark.parametrize("name", ["", "up", "up1", "lane+", "lane+1e3", "shift+2", "up+1.", "up+1 "])
+def test_a_malformed_path_is_refused(name):
+    with pytest.raises(UsageError, match="malformed name of a path"):
+        trajectory.named(circle(), "front", name)

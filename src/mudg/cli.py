@@ -224,10 +224,11 @@ VERBS: dict[str, Verb] = {
         _learn,
     ),
     "convert": Verb(
-        "Convert a published checkpoint to a model folder for synthesize or annotate.",
+        "Convert a published checkpoint to a folder for synthesize, annotate or score.",
         ("mudg convert 1024-mdm-checkpoint.ckpt --to models/mudg_1024",
          "mudg convert model.ckpt --to models/dc_512 --resolution 320x512 --dtype bfloat16",
-         "mudg convert checkpoints --to weights/depthlab"),
+         "mudg convert checkpoints --to weights/depthlab",
+         "mudg convert i3d_torchscript.pt --to weights/i3d --network i3d"),
         _convert,
     ),
     "adapt": Verb(
@@ -270,10 +271,11 @@ VERBS: dict[str, Verb] = {
         _score,
     ),
     "bench": Verb(
-        "Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs.",
+        "Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers.",
         ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses", "mudg bench edit --out runs/edits",
          "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
-         "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real"),
+         "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
+         "mudg bench paper city:reported --table mudg1 --out runs/mudg1"),
         _bench,
     ),
 }  # fmt: skip

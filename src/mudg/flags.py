@@ -112,7 +112,8 @@ class Convert(Common):
 
     checkpoint: Annotated[Path, tyro.conf.Positional, arg(metavar="CKPT")]
     """Checkpoint file of MuDG, DynamiCrafter-512 or DynamiCrafter-1024 (.ckpt, .pt or .safetensors); or, for DepthLab, the folder
-    that contains DepthLab's files, Marigold's folder and the image encoder's folder."""
+    that contains DepthLab's files, Marigold's folder and the image encoder's folder; or, with --network, weights of a
+    network of the scores."""
     to: Annotated[Path, arg(metavar="FOLDER")]
     """Model folder to write."""
     overwrite: FlagCreatePairsOff[bool] = False
@@ -154,8 +155,8 @@ class Fit(Output):
 
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory written by ingest or annotate."""
-    fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Point clouds written by fuse."""
+    fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Point clouds written by fuse; required by every method but emernerf."""
     observations: Annotated[tuple[Path, ...], arg(metavar="FOLDER")] = ()
     """Virtual views written by synthesize, in one folder or several; required by method mudg_s."""
     start_from: Annotated[Path | None, arg(metavar="FOLDER")] = None
@@ -281,11 +282,11 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Annotated[str, tyro.conf.Positional, arg(metavar="BENCHMARK")]
-    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits
-    of fitted scenes), shift (complete methods off the recorded path) or
-    real (complete methods on real logs)."""
+    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off
+    the recorded path), real (complete methods on real logs) or paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, arg(metavar="[LOG ...]")] = ()
-    """real: folders of dataset logs, or scenes made by ingest."""
+    """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
+    generated cities."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")]
 
 

@@ -19,12 +19,14 @@ class Method:
         made_by: the verb that produces its views (``render`` after ``fit``, or ``synthesize``).
         nodes: what its scene consists of (objects: one rigid or deformable node per dynamic track); empty for a method without a scene.
         supervision: what its scene learns from; virtual: the views of mudg_r.
+        scene: what its scene is made of: Gaussians, or a radiance field that is marched along rays.
     """
 
     title: str
     made_by: Literal["render", "synthesize"]
     nodes: tuple[Literal["static", "objects", "sky"], ...] = ()
     supervision: tuple[Literal["color", "semantics", "lidar", "sky", "virtual"], ...] = ()
+    scene: Literal["gaussians", "radiance"] = "gaussians"
 
 
 _STREET: Final = ("color", "semantics", "lidar", "sky")
@@ -32,6 +34,8 @@ _STREET: Final = ("color", "semantics", "lidar", "sky")
 METHODS: Final[dict[str, Method]] = {
     "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics")),
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
+    "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance"),
     "mudg_r": Method("Diffusion output", "synthesize"),
+    "freevs": Method("FreeVS condition, our network", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }

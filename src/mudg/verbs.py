@@ -94,20 +94,21 @@ def synthesize(
 
 
 def fit(
-    scene: Location, fused: Location, out: Location, *,
+    scene: Location, fused: Location | None, out: Location, *,
     observations: Location | Sequence[Location] = (), start_from: Location | None = None, overwrite: bool = False,
     config: Location | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Fit a dynamic Gaussian scene to recorded and, with ``observations``, generated views; returns the model's folder.
 
     Args:
+        fused: point clouds of fuse; None for method emernerf, which does not read them.
         start_from: a finished fit of ``street_gaussians`` to the same scene, to go on with for ``iterations`` more steps.
     """
     from mudg.stages import fit as stage
 
     made = _settings(stage_config.FitConfig, config, settings)
     return stage.run(
-        made, Path(scene), Path(fused), Path(out),
+        made, Path(scene), _optional(fused), Path(out),
         observations=_several(observations), start=_optional(start_from), overwrite=overwrite,
     )  # fmt: skip
 

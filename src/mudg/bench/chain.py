@@ -1,21 +1,73 @@
-"""The fits of benchmarks, made as ``mudg run`` makes them: one on recorded views, and those under virtual views go on with it.
+"""What benchmarks of complete methods share: logs that are worked on side by side, folders that are reused, and the fits, made as
+``mudg run`` makes them: one on recorded views, and those under virtual views go on with it.
 
 OUT/fit/<method>   every fit      OUT/start/<method>   what a variant with other settings of the first fit goes on with
 """
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Final
 
-from mudg.base.errors import UsageError
+from mudg import native
+from mudg.base import log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.processes import run_in_processes
+from mudg.base.run_folder import is_temporary
 from mudg.core.raster.place import drawing_device
 from mudg.methods import METHODS
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, FitConfig
 from mudg.stages.run import WITHOUT_DIFFUSION, fits_of
+
+_NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
+_NO_CLASSES: Final = {"semantic_weight": 0.0}
+VIRTUAL_TERMS: Final[dict[str, tuple[str, str, Mapping[str, float]]]] = {
+    "only_I": ("+ I", "virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
+    "only_I_D": ("+ I + D", "virtual colour and depth", _NO_CLASSES),
+    "only_I_S": ("+ I + S", "virtual colour and classes", _NO_DEPTH),
+}
+"""Ablation of supervision by virtual views, as in table 3 of the paper: row -> (title there, what is learned from, settings ``virtual``
+of the fit). Beside them stand street_gaussians (no virtual views) and mudg_s (all terms)."""
+
+
+def each_log(make: Callable[[Any], Any], jobs: Sequence[Any], names: Sequence[str], processes: int) -> list[Any]:
+    """What ``make`` returns for every job, several at a time with one thread each, in their order."""
+    found: dict[int, Any] = {}
+    with log.task("logs", len(jobs)) as bar, native.one_thread():
+        for index, facts in run_in_processes(make, [(job,) for job in jobs], min(processes, len(jobs))):
+            found[index] = facts
+            bar.update(names[index])
+            bar.advance()
+    return [found[index] for index in range(len(jobs))]
+
+
+def refuse_foreign(
+    out: Path, pages: Sequence[str], is_own: Callable[[Any], bool], may_be: Callable[[Path], bool] = Path.is_dir
+) -> None:
+    """UsageError if a folder holds anything that a benchmark does not write.
+
+    Args:
+        out: it need not exist. pages: names of its files at the top; the first is its result, in JSON.
+        is_own: whether that result is this benchmark's. may_be: whether an entry may belong to it, if it is no page.
+    """
+    if not out.exists():
+        return
+    entries = [entry for entry in out.iterdir() if not is_temporary(entry.name)] if out.is_dir() else [out]
+    names = [entry.name for entry in entries]
+    foreign = [entry.name for entry in entries if entry.name not in pages and not may_be(entry)]
+    if not foreign and any(name in pages for name in names):
+        try:
+            foreign = [] if is_own(store.read_json(out / pages[0])) else [pages[0]]
+        except (InputError, KeyError, TypeError):
+            foreign = [name for name in names if name in pages]
+    if foreign:
+        raise UsageError("the output folder holds files that do not belong to this run", where=str(out), got=", ".join(sorted(foreign)[:8]),
+                         remedy="choose an empty --out")  # fmt: skip
 
 
 def made(make: Callable[[bool], Path], overwrite: bool) -> Path:
@@ -30,6 +82,16 @@ def made(make: Callable[[bool], Path], overwrite: bool) -> Path:
         if not overwrite:
             raise
         return make(True)
+
+
+def seconds_of(out: Path) -> dict[str, float]:
+    """Seconds of each finished step, by folder."""
+    steps = sorted(path.relative_to(out) for path in out.glob("**/run.json"))
+    return {
+        path.parent.as_posix(): float(store.read_json(out / path).get("seconds", math.nan))
+        for path in steps
+        if len(path.parts) <= 3 and ".part" not in str(path)
+    }
 
 
 def at_once(config: BenchConfig) -> int:

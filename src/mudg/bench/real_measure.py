@@ -22,11 +22,11 @@ from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Observation, Scene, View
-from mudg.bench.real_points import DEPTH_LIMIT_M
 from mudg.bench.real_protocols import Protocol
 from mudg.bench.real_truth import Target, Targets, read_targets
 from mudg.core import metrics
 from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
+from mudg.core.points_seen import DEPTH_LIMIT_M
 from mudg.data.exporters.video import jpeg_bytes
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.data.scene import read_scene

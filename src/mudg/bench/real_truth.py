@@ -24,15 +24,16 @@ from mudg.base import log, palette, store
 from mudg.base.camera_colors import ColorMap
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Scene, View
-from mudg.bench import real_points
-from mudg.bench.real_points import LogPoints, OwnedPoints, ShownFrame
 from mudg.bench.real_protocols import Protocol
-from mudg.core import color_match, trajectory
+from mudg.core import color_match, points_seen, trajectory
 from mudg.core.fusion import STATIC
 from mudg.core.pictures import class_colors, depth_colors
+from mudg.core.points_seen import OwnedPoints, ShownFrame
 from mudg.data.exporters.video import jpeg_bytes
 from mudg.data.scene import read_image, read_scene
 from mudg.models.labels.inputs import box_outline
+from mudg.stages.scoring import log_points
+from mudg.stages.scoring.log_points import LogPoints
 
 LEAST_SEEN: Final = 0.05
 """Cameras of whose pixels the shown cameras saw less than this share are left out."""
@@ -190,7 +191,7 @@ class _Maker:
         self.shown: list[ShownFrame] = []
         if "seen" in protocol.maps:
             labelled = read_scene(seen)
-            found = (real_points.shown_frame(labelled, f, read_image(labelled, f)) for f in labelled.frames_in("train"))
+            found = (log_points.shown_frame(labelled, f, read_image(labelled, f)) for f in labelled.frames_in("train"))
             self.shown = [frame for frame in found if frame is not None]
 
     def unsuitable(self, frames: Sequence[Frame]) -> str:
@@ -219,7 +220,7 @@ class _Maker:
                 return None
             points = OwnedPoints(np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.uint8), 0.4)
         world = self.points.placed(points, view.time_s)
-        depth, index = real_points.visible(view, world, points.gap_deg)
+        depth, index = points_seen.visible(view, world, points.gap_deg)
         found: dict[str, NDArray[Any]] = {"depth": depth}
         owner = np.append(points.owner, STATIC)[index]
         if "dynamic" in wanted:
@@ -228,7 +229,8 @@ class _Maker:
         if "classes" in wanted:
             found["classes"] = np.append(points.ids, np.uint8(palette.UNLABELLED))[index]
         if "color" in wanted:
-            found["color"], found["colored"] = self._colors(frame, points, world, index)
+            color, colored = self.points.colors(frame, points, world)
+            found["color"], found["colored"] = color[index], colored[index].astype(np.uint8)
         if "seen" in wanted:
             found["seen"] = self._seen(frame)[0].astype(np.uint8)
         return found if "photo" in wanted or depth.any() else None
@@ -243,18 +245,6 @@ class _Maker:
             mask = mask if outline is None else mask | outline
         return mask
 
-    def _colors(
-        self, frame: Frame, points: OwnedPoints, world: NDArray[np.float32], index: NDArray[np.int32]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """The colour u8[H, W, 3] that each pixel's point has in the recorded image, and u8[H, W] where it is visible there."""
-        _, recorded = real_points.visible(frame.view, world, points.gap_deg)
-        rows, columns = np.nonzero(recorded >= 0)
-        rgb = np.zeros((len(points.xyz) + 1, 3), np.uint8)
-        known = np.zeros(len(points.xyz) + 1, np.uint8)
-        numbers = recorded[rows, columns]
-        rgb[numbers], known[numbers] = read_image(self.scene, frame)[rows, columns], 1
-        return rgb[index], known[index]
-
     def _seen(self, frame: Frame) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8]]:
         """Pixels bool[H, W] that the shown cameras saw, and the colours u8[N, 3] of the same points there and in this image."""
         view = frame.view
@@ -262,11 +252,11 @@ class _Maker:
         points = self.points.around(view.time_s)
         if points is None:
             return np.zeros(shape, bool), nothing, nothing
-        _, index = real_points.visible(view, self.points.placed(points, view.time_s), points.gap_deg)
+        _, index = points_seen.visible(view, self.points.placed(points, view.time_s), points.gap_deg)
         rows, columns = np.nonzero(index >= 0)
-        seen, there = real_points.seen_by(self.points, points.taken(index[rows, columns]), self.shown, view.time_s)
-        here = real_points.blurred(read_image(self.scene, frame))[rows, columns]
-        return real_points.spread(seen, rows, columns, shape), there[seen], here[seen]
+        seen, there = points_seen.seen_by(self.points.placed, points.taken(index[rows, columns]), self.shown, view.time_s)
+        here = points_seen.blurred(read_image(self.scene, frame))[rows, columns]
+        return points_seen.spread(seen, rows, columns, shape), there[seen], here[seen]
 
     def color_map(self, frames: Sequence[Frame]) -> ColorMap:
         """The colour map of a camera, from the points that its training frames share with the shown cameras."""

@@ -6,6 +6,7 @@ poses          how much of the error of tracked boxes a fit takes out (see `benc
 edit           edits of a fitted scene against the city regenerated with them (see `bench_edit`); needs no diffusion model
 shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
 real           whole methods on real logs, against what the methods did not see of them (see `bench_real`; own folders, too)
+paper          a table of a paper, on generated cities or real logs (see `bench_paper`; own folders, too)
 
 OUT/clips/ the generated clips   OUT/bench.json   OUT/bench.md   OUT/*.png pictures
 """
@@ -27,6 +28,7 @@ from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.bench import edit as bench_edit
+from mudg.bench import paper as bench_paper
 from mudg.bench import poses as bench_poses
 from mudg.bench import real as bench_real
 from mudg.bench import shift as bench_shift
@@ -44,19 +46,21 @@ from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "fits/", "rows/*.json")
-SHIFT, REAL = "shift", "real"
+SHIFT, REAL, PAPER = "shift", "real", "paper"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
 
 def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = (), overwrite: bool = False) -> Path:
-    """Run one of `BENCHES`, shift or real; returns the folder with `bench.json` and `bench.md`.
+    """Run one of `BENCHES`, shift, real or paper; returns the folder with `bench.json` and `bench.md`.
 
     Args:
-        sources: logs, for real alone.
+        sources: logs, for real; logs or a list of cities, for paper.
 
     Raises:
         UsageError: there is no such benchmark, or logs were given to one that makes its own.
     """
+    if name == PAPER:
+        return bench_paper.run(config, sources, out, overwrite=overwrite)
     if name == REAL:
         return bench_real.run(config, sources, out, overwrite=overwrite)
     if sources:
@@ -64,7 +68,7 @@ def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = 
     if name == SHIFT:  # made of verbs that each keep their own folder
         return bench_shift.run(config, out, overwrite=overwrite)
     if name not in BENCHES:
-        raise UsageError("no such benchmark", expected=", ".join((*BENCHES, SHIFT, REAL)), got=name)
+        raise UsageError("no such benchmark", expected=", ".join((*BENCHES, SHIFT, REAL, PAPER)), got=name)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
     choose_device(config.device, "benchmark", NETWORK_KINDS)  # refused before anything is written

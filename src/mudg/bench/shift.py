@@ -11,7 +11,6 @@ one thread.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,15 +19,22 @@ from typing import Any, Final
 
 import yaml
 
-from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
-from mudg.base.processes import run_in_processes
-from mudg.base.run_folder import RunDir, VerbOutput, below, is_temporary, refuse_overlap
+from mudg.base.errors import UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
-from mudg.bench.chain import FitChain, at_once, learns_virtual, made
+from mudg.bench.chain import (
+    VIRTUAL_TERMS,
+    FitChain,
+    at_once,
+    each_log,
+    learns_virtual,
+    made,
+    refuse_foreign,
+    seconds_of,
+)
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.cloudfile import read_fused
@@ -54,12 +60,8 @@ PERCEPTUAL_VIEWS: Final = 12
 WITHOUT, WITH, DIFFUSION, FILL = "street_gaussians", "mudg_s", "mudg_r", score.BASELINE
 GENERATED: Final = (FILL, DIFFUSION)
 """Methods without a fit."""
-_NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
-_NO_CLASSES: Final = {"semantic_weight": 0.0}
 ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
-    "only_I": ("virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
-    "only_I_D": ("virtual colour and depth", _NO_CLASSES),
-    "only_I_S": ("virtual colour and classes", _NO_DEPTH),
+    **{name: (description, weights) for name, (_, description, weights) in VIRTUAL_TERMS.items()},
     "exact": ("the truth in place of generated views", {}),
 }
 """Rows beside street_gaussians (no virtual views) and mudg_s (all terms): three as in table 3 of the paper, and the most that
@@ -118,7 +120,7 @@ def run(
     """
     rows = rows_of(config)
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
-    _refuse_foreign(Path(out))
+    refuse_foreign(Path(out), _PAGES, _is_own, lambda entry: entry.name.isdigit())
     seeds = city_logs.LISTS[config.list][: config.logs]
     shifts = tuple(sign * d for d in distances_m for sign in (1.0, -1.0))
     painted = SynthesizeConfig(
@@ -135,7 +137,7 @@ def run(
         LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, usual, painted, renders, config.videos, overwrite)
         for seed in seeds
     ]  # fmt: skip
-    logs = _run_jobs(jobs, at_once(config))
+    logs = each_log(make_log, jobs, [str(seed) for seed in seeds], at_once(config))
     document = shift_tables.document(logs, rows_as_values(rows), list(distances_m), settings_of(config, rules))
     store.write_json(Path(out) / "bench.json", document)
     store.write_text(Path(out) / "bench.md", shift_tables.markdown(document))
@@ -143,21 +145,8 @@ def run(
     return Path(out)
 
 
-def _refuse_foreign(out: Path) -> None:
-    """UsageError if a folder holds anything that this measurement does not write."""
-    if not out.exists():
-        return
-    names = [entry.name for entry in out.iterdir() if not is_temporary(entry.name)] if out.is_dir() else [out.name]
-    foreign = [name for name in names if name not in _PAGES and not name.isdigit()]
-    if not foreign and any(name in _PAGES for name in names):
-        try:
-            document = store.read_json(out / _PAGES[0])
-            foreign = [] if document["schema"] == 1 and "methods" in document else [_PAGES[0]]
-        except (InputError, KeyError, TypeError):
-            foreign = [name for name in names if name in _PAGES]
-    if foreign:
-        raise UsageError("the output folder holds files that do not belong to this run", where=str(out), got=", ".join(sorted(foreign)[:8]),
-                         remedy="choose an empty --out")  # fmt: skip
+def _is_own(document: Mapping[str, Any]) -> bool:
+    return document["schema"] == 1 and "bench" not in document and "methods" in document
 
 
 # ---- what is compared ----
@@ -233,17 +222,6 @@ def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
 # ---- the logs ----
 
 
-def _run_jobs(jobs: Sequence[LogJob], processes: int) -> list[dict[str, Any]]:
-    """All logs, several at a time with one thread each, in the order of the list."""
-    found: dict[int, dict[str, Any]] = {}
-    with log.task("logs", len(jobs)) as bar, native.one_thread():
-        for index, facts in run_in_processes(make_log, [(job,) for job in jobs], min(processes, len(jobs))):
-            found[index] = facts
-            bar.update(str(jobs[index].seed))
-            bar.advance()
-    return [found[index] for index in range(len(jobs))]
-
-
 def make_log(job: LogJob) -> dict[str, Any]:
     """Everything of one log; returns its facts, the scores of each method by distance, and the seconds of each step."""
     out = job.out
@@ -274,7 +252,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
     return {
         "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
         "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": found,
-        "seconds": _seconds(out),
+        "seconds": seconds_of(out),
     }  # fmt: skip
 
 
@@ -337,13 +315,3 @@ def write_exact(truth: Path, paths: Sequence[Trajectory], out: Path, *, overwrit
                 writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
     folder.finish({"trajectories": shifted})
     return folder.path
-
-
-def _seconds(out: Path) -> dict[str, float]:
-    """Seconds of each finished step, by folder."""
-    steps = sorted(path.relative_to(out) for path in out.glob("**/run.json"))
-    return {
-        path.parent.as_posix(): float(store.read_json(out / path).get("seconds", math.nan))
-        for path in steps
-        if len(path.parts) <= 3 and ".part" not in str(path)
-    }

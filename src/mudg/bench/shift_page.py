@@ -37,40 +37,52 @@ _OUTPUT: Final = VerbOutput("film", 1, ("*.mp4", "*.jpg"))
 # ---- videos ----
 
 
-def film(views: Mapping[str, Path], paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
+def film(
+    views: Mapping[str, Path | Sequence[Path]], paths: Sequence[Trajectory], out: Path, *, videos: bool = True, overwrite: bool = False
+) -> Path:  # fmt: skip
     """Write one video and one picture per trajectory: columns truth and methods, rows as ``ROWS``.
 
     Args:
-        views: column -> folder of observation folders; "truth" is needed, and has every trajectory.
+        views: column -> folder of observation folders, or several. Where "truth" is among them, it has every trajectory; else there is
+            no row of errors.
+        videos: off: only the pictures, of the middle view and in full size.
     """
-    refuse_overlap(out, views)
-    inputs = {name: store.digest(folder) for name, folder in views.items()}
-    asked = {"columns": list(views), "trajectories": [path.name for path in paths], "panel_width_px": PANEL_WIDTH}
-    folder = RunDir.open(out, _OUTPUT, asked, inputs, overwrite)
+    folders = {name: (given,) if isinstance(given, Path) else tuple(given) for name, given in views.items()}
+    named = {f"{name} {n}" if n else name: folder for name, of in folders.items() for n, folder in enumerate(of)}
+    refuse_overlap(out, named)
+    inputs = {name: store.digest(folder) for name, folder in named.items()}
+    asked: dict[str, Any] = {"columns": list(views), "trajectories": [path.name for path in paths], "panel_width_px": PANEL_WIDTH}
+    folder = RunDir.open(out, _OUTPUT, asked if videos else {**asked, "videos": False}, inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    found = {name: list_observation_sets(path) for name, path in views.items()}
-    playable = bool(video_encoders())
+    found = {
+        name: {k: v for one in of for k, v in list_observation_sets(one).items()} for name, of in folders.items()
+    }
+    playable = videos and bool(video_encoders())
     for path in paths:
         sets = {name: read_observations(listed[path.name]) for name, listed in found.items() if path.name in listed}
-        if "truth" not in sets:
-            raise InputError("no ground truth to show", where=f"{views.get('truth')}: {path.name}")
-        pictures = list(_frames(sets, list(views), len(path)))
+        if "truth" in views and "truth" not in sets:
+            raise InputError("no ground truth to show", where=f"{views['truth']}: {path.name}")
+        if not sets:
+            continue
+        numbers = range(len(path)) if playable else [len(path) // 2]
+        pictures = list(_frames(sets, list(views), numbers))
         if playable:
             store.atomic_write(folder.path / f"{path.name}.mp4", mp4_within(lambda made=pictures: made, ENCODING, VIDEO_BYTES))
         middle = pictures[len(pictures) // 2]
-        poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2)
+        poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2) if videos else middle
         store.atomic_write(folder.path / f"{path.name}.jpg", jpeg_bytes(poster, quality=75))
     folder.finish({"columns": list(views), "videos": playable})
     return folder.path
 
 
-def _frames(sets: Mapping[str, ObservationSet], order: Sequence[str], frames: int) -> Iterator[NDArray[np.uint8]]:
-    camera = sets["truth"].views[0].camera
+def _frames(sets: Mapping[str, ObservationSet], order: Sequence[str], frames: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+    camera = next(iter(sets.values())).views[0].camera
     size = panel_size(camera.width, camera.height, PANEL_WIDTH)
-    for frame in range(frames):
+    rows = [row for row in ROWS if row != "error" or "truth" in sets]
+    for frame in frames:
         seen = {column: sets[column][frame] if column in sets else None for column in order}
-        yield panel_grid(seen, list(ROWS), size, seen["truth"])
+        yield panel_grid(seen, rows, size, seen.get("truth"))
 
 
 # ---- the page ----

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -64,8 +64,15 @@ class PixelMotion:
     same: Tensor
 
 
-def pixel_motion(frame: TrueFrame, following: TrueFrame) -> PixelMotion:
-    """Carry every pixel of a frame by its depth into the following one."""
+def pixel_motion(
+    frame: TrueFrame, following: TrueFrame, moved: Mapping[int, Tensor] | None = None, instance: Tensor | None = None
+) -> PixelMotion:
+    """Carry every pixel of a frame by its depth into the following one.
+
+    Args:
+        moved: how rigid objects move in the world between the two, f64[4, 4] by their number in ``instance`` i64[H, W] of the first
+            frame; their pixels are carried with them and count as static ones do.
+    """
     height, width = frame.ids.shape
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     static = ~torch.isin(frame.ids, torch.tensor(MOVABLE)) & (frame.depth[0] < 90.0)
@@ -73,7 +80,15 @@ def pixel_motion(frame: TrueFrame, following: TrueFrame) -> PixelMotion:
     ray_x, ray_y = geometry.pinhole_ray(frame.intrinsics.float(), columns, rows)
     points = torch.stack([ray_x * z, ray_y * z, z, torch.ones_like(z)])
     pose = (torch.linalg.inv(following.world_from_cam) @ frame.world_from_cam).float()
-    x, y, ahead, _ = torch.einsum("ij,jhw->ihw", pose, points)
+    carried = torch.einsum("ij,jhw->ihw", pose, points)
+    if moved and instance is not None:
+        for number in instance.unique().tolist():
+            if number in moved:
+                own = instance == number
+                with_it = (torch.linalg.inv(following.world_from_cam) @ moved[number] @ frame.world_from_cam).float()
+                carried[:, own] = with_it @ points[:, own]
+                static = static | (own & (frame.depth[0] < 90.0))
+    x, y, ahead, _ = carried
     u, v = geometry.pinhole(following.intrinsics.float(), x, y, ahead)
     there = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], -1)[None]
     within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)

@@ -21,6 +21,7 @@ from mudg.base.palette import CLASSES
 from mudg.base.types import View
 from mudg.core import flicker, native_ops
 from mudg.core.losses import ssim_map
+from mudg.core.view_facts import ViewFacts
 
 CLASS_COUNT: Final = len(CLASSES)
 SMALLEST_SHARE: Final = 1e-3
@@ -132,7 +133,7 @@ class Pair:
 
     rgb ``[3, H, W]`` in [0, 1]; depth ``[1, H, W]`` m; semantics i64 ``[H, W]``; truth_depth_valid bool ``[1, H, W]``;
     mask bool ``[1, H, W]``: pixels that count at all (outside the ego vehicle); moving bool ``[1, H, W]``: true pixels of
-    dynamic objects, where they are known; view: camera and pose of both.
+    dynamic objects, where they are known; view: camera and pose of both; facts: what is known beside the true image.
     """
 
     rgb: Tensor | None
@@ -145,6 +146,7 @@ class Pair:
     mask: Tensor | None = None
     moving: Tensor | None = None
     view: View | None = None
+    facts: ViewFacts | None = None
 
 
 class Metric(Protocol):
@@ -354,29 +356,54 @@ METRICS: Final[dict[str, MetricRow]] = {
     ),
     "perceptual": MetricRow("perceptual", "", ("rgb", "features of the shipped codec"), "lower", None),
     "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "lower", Flicker),
+    "warp_error": MetricRow("warp error", "", ("every frame", "rgb"), "lower", None),
+    "temporal_flickering": MetricRow("temporal flickering", "", ("views",), "higher", None),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
+    "lpips_vgg": MetricRow("LPIPS (VGG)", "", ("rgb", "LPIPS weights"), "lower", None),
+    "lpips_squeeze": MetricRow("LPIPS (Squeeze)", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
     "kid": MetricRow("KID", "", ("rgb", "Inception weights"), "lower", None),
+    "fd_dinov2": MetricRow("FD-DINOv2", "", ("rgb", "DINOv2 weights"), "lower", None),
+    "cmmd": MetricRow("CMMD", "", ("rgb", "CLIP weights"), "lower", None),
+    "clip_f": MetricRow("CLIP-F", "", ("rgb", "CLIP weights"), "higher", None),
+    "clip_v": MetricRow("CLIP-V", "", ("rgb", "CLIP weights"), "higher", None),
+    "subject_consistency": MetricRow("consistency (DINOv2)", "", ("rgb", "DINOv2 weights"), "higher", None),
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
+    "video_frechet": MetricRow("video Frechet", "", ("rgb", "video features"), "lower", None),
+    "video_mmd": MetricRow("video MMD", "", ("rgb", "video features"), "lower", None),
     "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: DepthError("abs_rel")),
     "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: DepthError("rmse_m")),
     "delta1": MetricRow("delta < 1.25", "", ("depth",), "higher", lambda: DepthError("delta1")),
+    "lidar_abs_rel": MetricRow("AbsRel at points", "", ("LiDAR points",), "lower", None),
+    "lidar_rmse_m": MetricRow("RMSE at points", "m", ("LiDAR points",), "lower", None),
+    "lidar_delta1": MetricRow("delta < 1.25 at points", "", ("LiDAR points",), "higher", None),
+    "lidar_psnr": MetricRow("PSNR at points", "dB", ("LiDAR points",), "higher", None),
     "miou": MetricRow("mIoU", "", ("semantics",), "higher", lambda: Segmentation("miou")),
     "accuracy": MetricRow("pixel accuracy", "", ("semantics",), "higher", lambda: Segmentation("accuracy")),
+    "agreement": MetricRow("agreement of classes", "", ("classes of points",), "higher", None),
+    "agent_iou": MetricRow("agent IoU", "", ("exact vehicles",), "higher", None),
+    "lane_iou": MetricRow("lane IoU", "", ("exact markings",), "higher", None),
+    "lane_correlation": MetricRow("lane gradients", "", ("markings",), "higher", None),
+    "lane_psnr": MetricRow("PSNR of lanes", "dB", ("markings",), "higher", None),
+    "nta_iou": MetricRow("NTA-IoU", "", ("boxes", "detected boxes"), "higher", None),
+    "ntl_iou": MetricRow("NTL-IoU", "", ("lane lines", "detected lanes"), "higher", None),
 }
 
 
 def build_all(
-    distances: Mapping[str, Callable[[Pair], float | None]] | None = None, motion: StaticMotion | None = None
-) -> dict[str, Metric]:
+    distances: Mapping[str, Callable[[Pair], float | None]] | None = None, motion: StaticMotion | None = None,
+    more: Mapping[str, Metric] | None = None,
+) -> dict[str, Metric]:  # fmt: skip
     """A fresh accumulator for every metric that can be computed.
 
     Args:
         distances: what computes a row that needs weights.
         motion: shared by several methods on one trajectory (see ``Flicker``).
+        more: further accumulators, such as those of ``core/view_metrics.py``.
     """
     own = {name: row.build() for name, row in METRICS.items() if row.build is not None}
-    return {**own, "flicker": Flicker(motion), **{name: FrameMean(of) for name, of in (distances or {}).items()}}
+    compared = {name: FrameMean(of) for name, of in (distances or {}).items()}
+    return {**own, "flicker": Flicker(motion), **(more or {}), **compared}
 
 
 def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:

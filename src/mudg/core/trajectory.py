@@ -1,4 +1,4 @@
-"""Camera paths: the recorded one, and the same drive shifted sideways, raised or turned.
+"""Camera paths: the recorded one, the same drive shifted sideways, raised or turned, and drives that leave it bit by bit.
 
 Which left is used
 ------------------
@@ -12,6 +12,9 @@ rear axle in a tight turn), the heading wins.
 
 from __future__ import annotations
 
+import re
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +23,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import EgoPath, Scene, Trajectory, View
 
 WORLD_UP = np.array([0.0, 0.0, 1.0])
+_NAMED: Final = re.compile(r"(?P<kind>up|lane|speed)(?P<metres>[+-]\d+(?:\.\d+)?)")
 
 
 def trajectory_name(camera: str, shift_m: float | None = None) -> str:
@@ -95,6 +99,36 @@ def at_shift(
     if not shift_m and not height_m and not yaw_rad:
         return recorded(scene, camera)
     return shifted(scene, camera, shift_m, height_m=height_m, yaw_rad=yaw_rad)
+
+
+def named(scene: Scene, camera: str, name: str) -> Trajectory:
+    """A path by its name; tables of papers use them.
+
+    ``up+1``: the drive raised by 1 m. ``lane+0.1``: a lane change, with every frame 0.1 m further to the left of where the recorded
+    vehicle is, along the left axis of the first frame. ``speed+0.1``: a faster drive, with every frame 0.1 m further ahead, along the
+    forward axis of the first frame. A minus means down, right, slower.
+
+    Args:
+        scene: the log. camera: camera name. name: kind, sign and metres.
+
+    Returns:
+        Trajectory ``<camera>_<name>`` with one view per recorded frame, at its time and with its orientation.
+
+    Raises:
+        UsageError: a malformed name, or an unknown camera. InputError: no ego pose at the first frame's time.
+    """
+    found = _NAMED.fullmatch(name)
+    if found is None:
+        raise UsageError("malformed name of a path", expected="up+1, lane+0.1 or speed-0.1 (kind, sign, metres)", got=name)
+    views = recorded(scene, camera).views
+    left = ego_left_world(_ego_pose(scene.ego, views[0]))
+    direction = {"up": WORLD_UP, "lane": left, "speed": np.cross(left, WORLD_UP)}[found["kind"]]
+    moved = []
+    for number, view in enumerate(views):
+        world_from_cam = np.array(view.world_from_cam, np.float64)
+        world_from_cam[:3, 3] += float(found["metres"]) * (1 if found["kind"] == "up" else number) * direction
+        moved.append(View(view.camera, world_from_cam, view.time_s))
+    return Trajectory(f"{camera}_{name}", tuple(moved), "shifted")
 
 
 def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from mudg.base import shards
 from mudg.base.errors import InputError
+from mudg.data.torchscript import is_torchscript, read_torchscript
 
 # names ----------------------------------------------------------------------------------------------------------------
 
@@ -244,8 +245,8 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     """All named tensors of a published checkpoint, under the names in the file, without wrapper prefixes.
 
     Understood: a training-framework file (`state_dict` inside), a DeepSpeed file (`module` inside, names that start with
-    `_forward_module.`), a plain mapping of names to tensors, and safetensors. Tensors are mapped from the file where its format
-    allows, so that memory is taken as they are used.
+    `_forward_module.`), a plain mapping of names to tensors, safetensors, and a TorchScript archive, of which only the tensors are read.
+    Tensors are mapped from the file where its format allows, so that memory is taken as they are used.
 
     Raises:
         InputError: missing, truncated, or holds objects that are not on the list of harmless ones, or no tensors.
@@ -255,6 +256,8 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
         raise InputError("no such checkpoint", where=str(path))
     if path.suffix == ".safetensors":
         return _without_prefix(shards.read_tensors(path))
+    if is_torchscript(path):
+        return _without_prefix(read_torchscript(path))
     content = _unpickle(path)
     found = _named_tensors(content)
     if not found:

@@ -17,8 +17,8 @@ The bank is differentiable, deterministic, and costs about as much as SSIM.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Iterator, Mapping
+from typing import Final, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -111,55 +111,153 @@ class CodecFeatures(nn.Module):
         return features
 
 
+LpipsTrunk = Literal["alex", "vgg", "squeeze"]
+LpipsInput = Literal["correct", "unscaled"]
+
+
+class _Layer(NamedTuple):
+    """A convolution with ReLU: place in the trunk, channels out and in, kernel, stride, padding."""
+
+    place: str
+    out: int
+    into: int
+    size: int = 3
+    stride: int = 1
+    padding: int = 1
+
+
+class _Fire(NamedTuple):
+    """SqueezeNet's block: place in the trunk, channels in, between, and out of each of its two branches."""
+
+    place: str
+    into: int
+    between: int
+    each: int
+
+    def layers(self) -> tuple[_Layer, _Layer, _Layer]:
+        """What squeezes, and both branches."""
+        return (
+            _Layer(f"{self.place}.squeeze", self.between, self.into, 1, 1, 0),
+            _Layer(f"{self.place}.expand1x1", self.each, self.between, 1, 1, 0),
+            _Layer(f"{self.place}.expand3x3", self.each, self.between),
+        )
+
+
+class _Maximum(NamedTuple):
+    """Maxima over squares at every second place; ``whole``: squares that reach over the edge count, too."""
+
+    size: int
+    whole: bool = False
+
+
+_Stage = tuple[_Layer | _Fire | _Maximum, ...]
+_POOL, _SQUEEZE_POOL = _Maximum(3), _Maximum(3, whole=True)
+
+
+def _vgg(first: int, channels: tuple[int, ...]) -> tuple[_Layer, ...]:
+    """Convolutions from a place of VGG-16 on; ``channels``: in, then out of each."""
+    pairs = zip(channels[:-1], channels[1:], strict=True)
+    return tuple(_Layer(str(first + 2 * number), out, into) for number, (into, out) in enumerate(pairs))
+
+
+TRUNKS: Final[dict[LpipsTrunk, tuple[_Stage, ...]]] = {
+    "alex": (
+        (_Layer("0", 64, 3, 11, 4, 2),), (_POOL, _Layer("3", 192, 64, 5, 1, 2)), (_POOL, _Layer("6", 384, 192)), (_Layer("8", 256, 384),),
+        (_Layer("10", 256, 256),),
+    ),
+    "vgg": (
+        _vgg(0, (3, 64, 64)), (_Maximum(2), *_vgg(5, (64, 128, 128))), (_Maximum(2), *_vgg(10, (128, 256, 256, 256))),
+        (_Maximum(2), *_vgg(17, (256, 512, 512, 512))), (_Maximum(2), *_vgg(24, (512, 512, 512, 512))),
+    ),
+    "squeeze": (
+        (_Layer("0", 64, 3, 3, 2, 0),), (_SQUEEZE_POOL, _Fire("3", 64, 16, 64), _Fire("4", 128, 16, 64)),
+        (_SQUEEZE_POOL, _Fire("6", 128, 32, 128), _Fire("7", 256, 32, 128)), (_SQUEEZE_POOL, _Fire("9", 256, 48, 192)),
+        (_Fire("10", 384, 48, 192),), (_Fire("11", 384, 64, 256),), (_Fire("12", 512, 64, 256),),
+    ),
+}  # fmt: skip
+"""Stages of each network; features are read after each. Places are those of torchvision's networks."""
+WIDTHS: Final[dict[LpipsTrunk, tuple[int, ...]]] = {
+    "alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512), "squeeze": (64, 128, 256, 384, 384, 512, 512),
+}  # fmt: skip
+
+
+def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
+    """Name -> shape of the tensors of a network of LPIPS, as the lpips package names them."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for number, stage in enumerate(TRUNKS[trunk]):
+        for layer in _layers(stage):
+            named = f"net.slice{number + 1}.{layer.place}"
+            shapes |= {f"{named}.weight": (layer.out, layer.into, layer.size, layer.size), f"{named}.bias": (layer.out,)}
+        shapes[f"lin{number}.model.1.weight"] = (1, WIDTHS[trunk][number], 1, 1)
+    return shapes
+
+
+def _layers(stage: _Stage) -> Iterator[_Layer]:
+    for step in stage:
+        if isinstance(step, _Layer):
+            yield step
+        elif isinstance(step, _Fire):
+            yield from step.layers()
+
+
 class LpipsFeatures(nn.Module):
-    """The AlexNet trunk of LPIPS 0.1 (Zhang et al. 2018) and its weights per channel, from tensors under the usual names.
+    """A trunk of LPIPS 0.1 (Zhang et al. 2018) and its weights per channel, from tensors under the usual names.
 
     Args:
-        state: ``net.slice{1..5}.{0,3,6,8,10}.{weight,bias}`` and ``lin{0..4}.model.1.weight``, as the lpips package names
-            them; other entries are left alone.
+        state: ``net.slice1.0.weight``, ..., ``lin0.model.1.weight``, ..., as the lpips package names them; other entries are left alone.
         where: file name for errors.
+        trunk: AlexNet, VGG-16 or SqueezeNet 1.1.
+        given: correct: colours are brought to [-1, 1] first. unscaled: they stay in [0, 1], as in much published code of Gaussian scenes.
 
     Raises:
         InputError: a tensor is missing or has another shape.
     """
 
-    LAYERS: Final = ((0, 64, 3, 11, 4, 2), (3, 192, 64, 5, 1, 2), (6, 384, 192, 3, 1, 1), (8, 256, 384, 3, 1, 1), (10, 256, 256, 3, 1, 1))
-    """Place in the trunk, channels out and in, kernel, stride, padding."""
-    POOLED: Final = (1, 2)
-    """Layers before which 3x3 maxima are taken at every second place."""
     SHIFT: Final = (-0.030, -0.088, -0.188)
     SCALE: Final = (0.458, 0.448, 0.450)
     SMALLEST_PX: Final = 31
 
-    def __init__(self, state: Mapping[str, Tensor], where: str = "LPIPS weights") -> None:
+    def __init__(
+        self, state: Mapping[str, Tensor], where: str = "LPIPS weights", trunk: LpipsTrunk = "alex", given: LpipsInput = "correct"
+    ) -> None:
         super().__init__()
+        self.trunk: LpipsTrunk = trunk
+        self.given: LpipsInput = given
         self.register_buffer("shift", torch.tensor(self.SHIFT).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(self.SCALE).view(1, 3, 1, 1))
-        for stage, (place, out, into, size, _, _) in enumerate(self.LAYERS):
-            named = f"net.slice{stage + 1}.{place}"
-            self.register_buffer(f"kernel{stage}", _tensor(state, f"{named}.weight", (out, into, size, size), where))
-            self.register_buffer(f"bias{stage}", _tensor(state, f"{named}.bias", (out,), where))
-            weights = _tensor(state, f"lin{stage}.model.1.weight", (1, out, 1, 1), where).flatten()
-            self.register_buffer(f"weights{stage}", weights)
+        for name, shape in lpips_shapes(trunk).items():
+            self.register_buffer(name.replace(".", "/"), _tensor(state, name, shape, where))
 
     @property
     def channel_weights(self) -> list[Tensor]:
         """Weights per channel, by stage."""
-        return [self.get_buffer(f"weights{stage}") for stage in range(len(self.LAYERS))]
+        return [self.get_buffer(f"lin{stage}/model/1/weight").flatten() for stage in range(len(TRUNKS[self.trunk]))]
 
     def forward(self, rgb: Tensor) -> list[Tensor]:
-        """Features ``[C, h, w]`` of the five stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
+        """Features ``[C, h, w]`` of the stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
         if min(rgb.shape[-2:]) < self.SMALLEST_PX:
             size = f"{rgb.shape[-1]}x{rgb.shape[-2]}"
             raise InputError("an image is too small for LPIPS", expected=f"{self.SMALLEST_PX} pixels a side", got=size)
-        x = (rgb[None].clamp(0, 1) * 2 - 1 - self.shift) / self.scale
+        x = rgb[None].clamp(0, 1)
+        x = ((x * 2 - 1 if self.given == "correct" else x) - self.shift) / self.scale
         features = []
-        for stage, (_, _, _, _, stride, padding) in enumerate(self.LAYERS):
-            x = F.max_pool2d(x, 3, 2) if stage in self.POOLED else x
-            kernel, bias = self.get_buffer(f"kernel{stage}"), self.get_buffer(f"bias{stage}")
-            x = F.relu(F.conv2d(x, kernel, bias, stride, padding))
+        for number, stage in enumerate(TRUNKS[self.trunk]):
+            for step in stage:
+                if isinstance(step, _Maximum):
+                    x = F.max_pool2d(x, step.size, 2, ceil_mode=step.whole)
+                elif isinstance(step, _Fire):
+                    squeeze, *branches = step.layers()
+                    x = self._convolved(number, squeeze, x)
+                    x = torch.cat([self._convolved(number, branch, x) for branch in branches], 1)
+                else:
+                    x = self._convolved(number, step, x)
             features.append(x[0])
         return features
+
+    def _convolved(self, stage: int, layer: _Layer, x: Tensor) -> Tensor:
+        path = f"net/slice{stage + 1}/{layer.place.replace('.', '/')}"
+        kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
+        return F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
 
 
 def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], where: str) -> Tensor:

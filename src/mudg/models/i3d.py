@@ -180,12 +180,30 @@ def _maxima(x: Tensor, pool: _Pool) -> Tensor:
     return F.max_pool3d(same_padded(x, pool.size, pool.stride), pool.size, pool.stride)
 
 
+def with_known_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors under the names of ``tensor_shapes``, from either layout; counts of batches are left out.
+
+    Names in neither layout are matched by their order, if shapes agree one by one; else they are left as they are.
+    """
+    given = {name: value for name, value in state.items() if not name.endswith("num_batches_tracked")}
+    found = {_renamed(name): value for name, value in given.items()}
+    wanted = tensor_shapes()
+    if found.keys() & wanted.keys() or [tuple(v.shape) for v in given.values()] != list(wanted.values()):
+        return found
+    return dict(zip(wanted, given.values(), strict=True))
+
+
+def _renamed(name: str) -> str:
+    """A name of the first layout in the second."""
+    for old, new in _OTHER_NAMES:
+        name = name.replace(old, new)
+    return name
+
+
 def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
     wanted, found, given = tensor_shapes(), {}, {}
     for name, value in state.items():
-        clean = name
-        for old, new in _OTHER_NAMES:
-            clean = clean.replace(old, new)
+        clean = _renamed(name)
         found[clean], given[clean] = value, name
     for name, shape in wanted.items():
         value = found.get(name)

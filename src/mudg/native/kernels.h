@@ -84,6 +84,24 @@ struct BoxJob {
   int workers;
 };
 
+// Features of points in a multi-resolution hash grid (hash_grid.h), and gradients; what is null is not computed.
+struct HashGridLevel {
+  std::int64_t offset, entries;  // in the table, in entries
+  std::int32_t resolution;       // cells along an axis
+  std::uint32_t mask;            // entries - 1 where hashed: they are a power of two
+  bool hashed;                   // else the entries are the corners in their order, the first axis fastest
+};
+struct HashGridJob {
+  const float* x;  // [points][dimensions] in 0..1; outside: the value at the border
+  const float* table;  // [entries of all levels][features]
+  const HashGridLevel* levels;
+  int dimensions, level_count, features;  // 3 or 4; any; 1, 2, 4 or 8
+  std::int64_t points;
+  float* out;             // [points][level_count * features]
+  const float* gradient;  // like out
+  float *of_table, *of_x;  // like table and x
+};
+
 struct Kernels {
   void (*project_forward)(RasterState&, RasterImage&);
   void (*blend_forward)(RasterState&, RasterImage&);
@@ -94,6 +112,7 @@ struct Kernels {
   double (*class_loss)(const ClassLossJob&);
   void (*over)(const OverJob&);
   void (*box_mean)(const BoxJob&);
+  void (*hash_grid)(const HashGridJob&);
   double (*peak_multiply_add)(std::int64_t rounds, float* sink);
 };
 

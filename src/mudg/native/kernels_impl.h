@@ -4,6 +4,7 @@
 #include "adam.h"
 #include "box.h"
 #include "classes.h"
+#include "hash_grid.h"
 #include "kernels.h"
 #include "loss.h"
 #include "over.h"
@@ -73,7 +74,7 @@ void blend_backward(RasterState& state, const RasterImageGradient& image) {
 }
 
 constexpr Kernels kTable = {project_forward, blend_forward, blend_backward, project_backward, photometric, adam,
-                            class_loss, over, box_mean, peak_multiply_add};
+                            class_loss, over, box_mean, hash_grid, peak_multiply_add};
 
 }  // namespace
 }  // namespace mudg::MUDG_ISA_NAMESPACE

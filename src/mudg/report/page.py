@@ -29,7 +29,14 @@ GROUPS: Final = (
     ("Motion", ("psnr_movers", "flicker")),
     ("Depth", ("abs_rel", "rmse_m", "delta1")),
     ("Classes", ("miou", "accuracy")),
+    ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
+    ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
+    ("Steadiness", ("warp_error", "temporal_flickering", "subject_consistency", "clip_f")),
 )
+OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
+"""Groups that are left out, and distances of them, where no method has a number."""
+ABSENT: Final = ("lpips", "fid", "kid", "fvd")
+"""Metrics whose columns are shown although they were not computed; the others are named below the tables."""
 CHARTED: Final = ("psnr", "abs_rel", "miou")
 NEAR_M: Final = 2.0
 FAR_M: Final = 80.0
@@ -200,21 +207,30 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
     distances = sorted({d for m, d in values if any(isinstance(v, float) for v in values[m, d].values())})
     metrics = {m["name"]: m for m in scores["metrics"]}
     absent = [m for m in metrics.values() if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in scores["results"])]
-    groups = [
-        _score_group(scores, title, [metrics[n] for n in names if n in metrics], distances) for title, names in GROUPS
-    ]
+    main = [n for title, names in GROUPS if title not in OPTIONAL for n in names]
+    sets = [name for name, entry in SET_METRICS.items() if entry in scores]
+    distances = [d for d in distances if _shown(values, [*main, *sets], d)]
+    groups = []
+    for title, names in GROUPS:
+        there = distances
+        if title in OPTIONAL:
+            names = [n for n in names if any(isinstance(of.get(n), float) for of in values.values())]
+            there = [d for d in sorted({d for _, d in values}) if _shown(values, names, d)]
+        if there:
+            groups.append(_score_group(scores, title, [metrics[n] for n in names if n in metrics], there))
     made_of_sets = [metrics[name] for name, entry in SET_METRICS.items() if entry in scores]
     if made_of_sets:
         groups.append(_with_floor(scores, _score_group(scores, "Distribution", made_of_sets, distances), distances))
-    if absent:
-        cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in absent]
+    shown = [m for m in absent if m["name"] in ABSENT]
+    if shown:
+        cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in shown]
         rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]
-        groups.append({"title": "Perceptual", "distances": [], "metrics": absent, "rows": rows})
+        groups.append({"title": "Perceptual", "distances": [], "metrics": shown, "rows": rows})
     numeric = [
         m for m in metrics.values() if any(isinstance(r["values"].get(m["name"]), float) for r in scores["results"])
     ]
     return {
-        "score_groups": groups if distances else [],
+        "score_groups": groups if distances or any(group["title"] in OPTIONAL for group in groups) else [],
         "not_computed": ", ".join(f"{m['title']} ({_remedy_of(m)})" for m in absent),
         "charts": [c for c in (_chart(scores, metrics[n]) for n in CHARTED if n in metrics) if c],
         "result_metrics": numeric,
@@ -223,6 +239,11 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
             for t in scores["trajectories"] for r in scores["results"] if r["trajectory"] == t["name"]
         ],
     }  # fmt: skip
+
+
+def _shown(values: Mapping[tuple[str, float], Mapping[str, Any]], names: Sequence[str], distance: float) -> bool:
+    """Whether some method has a number in one of these metrics at a distance."""
+    return any(isinstance(of.get(name), float) for (_, d), of in values.items() if d == distance for name in names)
 
 
 def _score_group(

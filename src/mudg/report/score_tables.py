@@ -13,10 +13,26 @@ NOT_REQUESTED: Final = "not requested"
 NOT_COMPUTED: Final = "not computed"
 TOO_FEW: Final = "too few views"
 UNEQUAL: Final = "unequal n"
-WEIGHT_FLAGS: Final = {"lpips": "--lpips-weights", "fid": "--fid-weights", "kid": "--fid-weights", "fvd": "--fvd-weights"}
-"""Metric -> the flag of ``mudg score`` that names the weights it needs."""
-SET_METRICS: Final = {"fid": "distributions", "kid": "distributions", "fvd": "videos"}
+NO_DETECTIONS: Final = "no detections"
+NO_FEATURES: Final = "no features"
+WEIGHT_FLAGS: Final = {
+    "lpips": "--lpips-weights", "lpips_vgg": "--lpips-vgg-weights", "lpips_squeeze": "--lpips-squeeze-weights",
+    "fid": "--fid-weights", "kid": "--fid-weights", "fvd": "--fvd-weights",
+    "fd_dinov2": "--dino-weights", "subject_consistency": "--dino-weights",
+    "cmmd": "--clip-weights", "clip_f": "--clip-weights", "clip_v": "--clip-weights",
+    "video_frechet": "--video-features", "video_mmd": "--video-features", "nta_iou": "--detections", "ntl_iou": "--lanes",
+}  # fmt: skip
+"""Metric -> the flag of ``mudg score`` that names the weights or files it needs."""
+SET_METRICS: Final = {
+    "fid": "distributions", "kid": "distributions", "fvd": "videos", "fd_dinov2": "dinov2", "cmmd": "clip",
+    "video_frechet": "video_features", "video_mmd": "video_features",
+}  # fmt: skip
 """Metric of sets of images or clips -> the entry of metrics.json that says how it was made."""
+SET_SIZES: Final = {
+    "distribution": ("fid", "kid"), "video": ("fvd",), "dinov2": ("fd_dinov2",), "clip": ("cmmd",),
+    "video_features": ("video_frechet", "video_mmd"),
+}  # fmt: skip
+"""Entry of a result with the sizes of its sets -> their metrics."""
 FLOOR: Final = "Floor: the truth itself"
 TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
@@ -24,7 +40,13 @@ TITLES: Final[dict[str, str]] = {
     **{name: method.title for name, method in METHODS.items()},
 }
 TERMINAL_METRICS: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "delta1", "miou")
-_DIGITS: Final = {"psnr": 2, "psnr_movers": 2, "flicker": 2, "rmse_m": 2, "fid": 1, "kid": 4, "fvd": 1}
+WITHOUT_TRUTH: Final = ("lidar_abs_rel", "lidar_rmse_m", "lidar_psnr", "agreement", "lane_correlation")
+"""Shown in a terminal where no true image exists."""
+_DIGITS: Final = {
+    "psnr": 2, "psnr_movers": 2, "flicker": 2, "rmse_m": 2, "fid": 1, "kid": 4, "fvd": 1, "lidar_rmse_m": 2, "lidar_psnr": 2,
+    "lane_psnr": 2,
+    "warp_error": 4, "temporal_flickering": 4, "ntl_iou": 2, "fd_dinov2": 1, "clip_f": 4, "clip_v": 4, "subject_consistency": 4,
+}  # fmt: skip
 
 
 def title_of(method: str) -> str:
@@ -49,10 +71,10 @@ def document(
         scene: what was scored. exact: whether truth exists at any view.
         trajectories: as JSON values. methods: in the order of the tables.
         results: one entry per method and trajectory. rows: title, unit, better and needs of each metric.
-        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count, and ``distributions`` and ``videos``, what is
-            known of FID and KID and of FVD, or None where they are not computed.
+        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the entries of
+            ``SET_METRICS``, ``detections`` and ``lpips`` what is known of their metrics; entries that are missing were not computed.
     """
-    depth_limit_m, distributions, videos = made["depth_limit_m"], made["distributions"], made["videos"]
+    depth_limit_m, distributions, videos = made["depth_limit_m"], made.get("distributions"), made.get("videos")
     held_out = len(scene.frames_in("test"))
     rules = [
         "All methods are scored at one size, that of the scene's camera unless another was requested; "
@@ -68,6 +90,7 @@ def document(
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
         *([_rule_of_sets(distributions)] if distributions else []),
         *([_rule_of_videos(videos)] if videos else []),
+        *_further_rules(made),
     ]
     return {
         "schema": 1,
@@ -83,8 +106,7 @@ def document(
         "trajectories": list(trajectories),
         "results": list(results),
         "by_distance": by_distance(trajectories, methods, results, list(rows)),
-        **({"distributions": distributions} if distributions else {}),
-        **({"videos": videos} if videos else {}),
+        **{name: value for name, value in made.items() if name != "depth_limit_m" and value},
     }  # fmt: skip
 
 
@@ -106,6 +128,27 @@ def _rule_of_videos(made: Mapping[str, Any]) -> str:
     )
 
 
+def _further_rules(made: Mapping[str, Any]) -> list[str]:
+    """One sentence for each other metric whose definition has variants."""
+    rules = []
+    if made.get("lpips"):
+        rules.append(f"LPIPS gets its colours {'in -1..1' if made['lpips']['input'] == 'correct' else 'unscaled, in 0..1'}.")
+    if made.get("dinov2"):
+        rules.append(f"FD-DINOv2 is made with {made['dinov2']['network']}; read it beside the floor.")
+    if made.get("clip"):
+        pairs = "CLIP-F (neighbouring views) and CLIP-V (recorded frame of the same time)"
+        rules.append(f"CMMD, {pairs} are made with {made['clip']['network']}.")
+    detections = made.get("detections", {})
+    if "nta_iou" in detections:
+        of = detections["nta_iou"]
+        rules.append(
+            f"NTA-IoU: true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}. What hides a box is not asked."
+        )
+    if "ntl_iou" in detections:
+        rules.append(f"NTL-IoU: {detections['ntl_iou']['lines']}. An image without any lane scores 47 to 50.")
+    return rules
+
+
 def by_distance(
     trajectories: Sequence[Mapping[str, Any]],
     methods: Sequence[str],
@@ -120,7 +163,7 @@ def by_distance(
         signs = {float(c["shift_m"]) > 0 for c in trajectories if c["name"] in here}
         sides = "recorded" if distance == 0 else "both" if len(signs) == 2 else "left" if signs == {True} else "right"
         uneven = {}
-        for kind, own in (("distribution", ("fid", "kid")), ("video", ("fvd",))):
+        for kind, own in SET_SIZES.items():
             if len({r[kind]["n"] for r in results if r["trajectory"] in here and kind in r}) > 1:
                 uneven |= dict.fromkeys(own, UNEQUAL)
         for method in methods:
@@ -181,46 +224,58 @@ def plain(document: Mapping[str, Any]) -> str:
     values_of = values_by_distance(document)
     distances = sorted({d for _, d in values_of})
     names = (*TERMINAL_METRICS, *(name for name, entry in SET_METRICS.items() if entry in document))
-    columns = [m for m in document["metrics"] if m["name"] in names]
     floors = floors_by_distance(document)
     lines = []
     for distance in distances:
-        if not any(
-            isinstance(v, float) for m in document["methods"] for v in values_of.get((m["name"], distance), {}).values()
-        ):
+        here = [values_of.get((m["name"], distance), {}) for m in document["methods"]]
+        columns = [m for m in document["metrics"] if m["name"] in names]
+        if not _has_numbers(here, columns):
+            columns = [m for m in document["metrics"] if m["name"] in WITHOUT_TRUTH]
+        if not _has_numbers(here, columns):
             lines += [f"{distance_title(document, distance)}: nothing to score against (no truth)", ""]
             continue
         lines.append(distance_title(document, distance))
         heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
-        lines.append("  " + " " * 28 + "".join(f"{head:>14}" for head in heads))
+        widths = [max(14, len(head) + 2) for head in heads]
+        lines.append("  " + " " * 28 + "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True)))
         for method in document["methods"]:
             values = values_of.get((method["name"], distance), {})
             cells = []
-            for metric in columns:
+            for metric, width in zip(columns, widths, strict=True):
                 across = {
                     m["name"]: values_of.get((m["name"], distance), {}).get(metric["name"]) for m in document["methods"]
                 }
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
-                cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>14}")
+                cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>{width}}")
             lines.append(f"  {method['title']:<28}" + "".join(cells))
         if distance in floors:
-            cells = [f"{number_text(c['name'], floors[distance].get(c['name'])) + ' ':>14}" for c in columns]
+            found = [number_text(c["name"], floors[distance].get(c["name"])) + " " for c in columns]
+            cells = [f"{text:>{width}}" for text, width in zip(found, widths, strict=True)]
             lines.append(f"  {FLOOR:<28}" + "".join(cells))
         lines.append("")
     return "\n".join(lines).rstrip()
 
 
+def _has_numbers(values: Sequence[Mapping[str, Any]], metrics: Sequence[Mapping[str, Any]]) -> bool:
+    return any(isinstance(of.get(metric["name"]), float) for of in values for metric in metrics)
+
+
 def markdown(document: Mapping[str, Any]) -> str:
     """All trajectories and metrics as Markdown, with the rules."""
     lines = [f"# Scores of {document['scene']['id']}", "", *(f"* {rule}" for rule in document["rules"])]
-    names = [m["name"] for m in document["metrics"]]
+    absent = [m for m in document["metrics"] if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in document["results"])]
+    names = [m["name"] for m in document["metrics"] if m not in absent]
+    if absent and document["results"]:
+        flags = dict.fromkeys(WEIGHT_FLAGS.get(m["name"], "") for m in absent)
+        of_flag = {f: ", ".join(m["title"] for m in absent if WEIGHT_FLAGS.get(m["name"], "") == f) for f in flags}
+        lines.append(f"* Not computed: {'; '.join(f'{titles} ({flag})' if flag else titles for flag, titles in of_flag.items())}.")
     for trajectory in document["trajectories"]:
         rows = [
             [title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in names)]
             for r in document["results"] if r["trajectory"] == trajectory["name"]
         ]  # fmt: skip
         lines += ["", f"## {trajectory['name']}", "", *markdown_table(["method", "views", *names], rows)]
-        lines += _lines_of_sets(document, trajectory["name"])
+        lines += [*_lines_of_sets(document, trajectory["name"]), *_lines_of_anchors(document, trajectory["name"])]
     return "\n".join(lines) + "\n"
 
 
@@ -237,12 +292,25 @@ def _lines_of_sets(document: Mapping[str, Any], trajectory: str) -> list[str]:
     for row in [r for r in document["results"] if r["trajectory"] == trajectory and "video" in r][:1]:
         of = row["video"]
         lines += [*([] if lines else [""]), f"* FVD: {of['n']} clips of every method against {of['n_reference']} recorded clips."]
-    floors = [floor for entry in ("distributions", "videos") for floor in document.get(entry, {}).get("floors", [])]
+    titles = {m["name"]: m["title"] for m in document["metrics"]}
+    floors = [floor for entry in dict.fromkeys(SET_METRICS.values()) for floor in document.get(entry, {}).get("floors", [])]
     for floor in floors:
         if floor["trajectory"] == trajectory:
-            values = ", ".join(f"{name.upper()} {number_text(name, floor[name])}" for name in SET_METRICS if name in floor)
+            values = ", ".join(f"{titles[name]} {number_text(name, floor[name])}" for name in SET_METRICS if name in floor)
             lines.append(f"* {FLOOR}: {values} ({floor['how']}, {floor['n']} against {floor['n_reference']}).")
     return lines
+
+
+def _lines_of_anchors(document: Mapping[str, Any], trajectory: str) -> list[str]:
+    """What true and recorded images and the baseline score on a trajectory."""
+    titles = {m["name"]: m["title"] for m in document["metrics"]}
+    places = {"truth": "true images", "recorded": "recorded images at their own views", "nearest_fill": title_of("nearest_fill").lower()}
+    lines = []
+    for anchor in document.get("anchors", []):
+        found = [f"{title} {number_text(anchor['metric'], anchor[key])}" for key, title in places.items() if key in anchor]
+        if anchor["trajectory"] == trajectory and found:
+            lines.append(f"* {titles[anchor['metric']]}: {', '.join(found)}.")
+    return ["", *lines] if lines else []
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -1,4 +1,5 @@
-"""convert: a published checkpoint -> a model folder that `synthesize` and training read; or DepthLab's (`converting/depthlab.py`).
+"""convert: a published checkpoint -> a model folder that `synthesize` and training read; or DepthLab's (`converting/depthlab.py`),
+or a network of the scores (`scoring/converted.py`).
 
 The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's restricted
 unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so that the
@@ -29,6 +30,7 @@ from mudg.models.published.clip import TextTower
 from mudg.models.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
 from mudg.stages.config import ConvertConfig
 from mudg.stages.converting import depthlab
+from mudg.stages.scoring.converted import convert_weights
 
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
@@ -64,7 +66,9 @@ def run(
     if replaces and not _holds_model(to):
         raise UsageError("the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to")
     place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
-    if checkpoint.is_dir():
+    if config.network != "diffusion":
+        work, limit = _of_scores(config, checkpoint, place)
+    elif checkpoint.is_dir():
         work, limit = _from_folder(config, checkpoint, place)
     else:
         work, limit = _from_file(config, checkpoint, place, network)
@@ -112,6 +116,16 @@ def _from_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Publi
     network = replace(network or PublishedConfig(), height=height, width=width)
     towers = [Path(config.towers)] if config.towers and Path(config.towers).is_file() else []
     return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint, *towers)
+
+
+def _of_scores(config: ConvertConfig, checkpoint: Path, to: Path) -> tuple[Work, int]:
+    """The conversion of a network of the scores, and the address space it may take."""
+    if config.resolution != "auto" or config.towers or config.dtype != "keep":
+        raise UsageError("--resolution, --towers and --dtype apply to diffusion models only", where=f"--network {config.network}")
+    if not checkpoint.is_file():
+        raise InputError("no such checkpoint", where=str(checkpoint))
+    limit = memory_limit(config, checkpoint, checkpoint)  # read, and converted to float32
+    return functools.partial(convert_weights, config.network, checkpoint, to), limit
 
 
 def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, int]:

@@ -7,6 +7,7 @@ loss), ``models.scene.densify``. Nothing else touches the parameters.
     OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``) and its certainty
     OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
     OUT/log.jsonl, preview/*.png                                how it went
+    OUT/field.safetensors                                       instead of the Gaussians, for method emernerf (``stages/radiance``)
     OUT/steps/                                                  checkpoints, while it runs
 
 With ``start`` it goes on with a finished fit (``fitting/continued.py``).
@@ -28,7 +29,7 @@ from torch import Tensor
 
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import result_settings
-from mudg.base.devices import memory_of
+from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
 from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
@@ -80,10 +81,12 @@ from mudg.stages.fitting.views import (
     training_frames,
     virtual_sets,
 )
+from mudg.stages.radiance.loop import fit_radiance
 
 OUTPUT = VerbOutput(
     "fit", 3,
-    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "preview/*.png", "steps/"),
+    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "field.safetensors",
+     "preview/*.png", "steps/"),
 )  # fmt: skip
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
@@ -94,7 +97,7 @@ MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
 
 
 def run(
-    config: FitConfig, scene: Path, fused: Path, out: Path, *,
+    config: FitConfig, scene: Path, fused: Path | None, out: Path, *,
     observations: Path | Sequence[Path] | None = None, start: Path | None = None, overwrite: bool = False,
 ) -> Path:  # fmt: skip
     """Fit a scene.
@@ -102,7 +105,7 @@ def run(
     Args:
         config: method, iterations, weights.
         scene: scene directory (ingest).
-        fused: fused clouds (fuse).
+        fused: fused clouds (fuse); None: only for methods without Gaussians, which do not read them.
         out: folder for the model.
         observations: folder of virtual observation sets (synthesize), or several; needed by methods that use them, ignored by others.
         start: folder of a finished fit of street_gaussians to the same scene and clouds to go on with: ``config.iterations`` more
@@ -115,6 +118,10 @@ def run(
         UsageError: a method with virtual views without ``observations``. NumericsError: a loss or gradient is not
         finite. InputError: damaged inputs, recorded views among ``observations``, or a ``start`` that does not fit.
     """
+    if METHODS[config.method].scene == "radiance":
+        return _run_radiance(config, Path(scene), out, start, overwrite)
+    if fused is None:
+        raise UsageError(f"{config.method} needs fused clouds", remedy="run `mudg fuse` and give its folder as --fused")
     learns_virtual = "virtual" in METHODS[config.method].supervision
     folders = (observations,) if isinstance(observations, Path) else tuple(map(Path, observations or ()))
     named = {"observations" + f" {n}" * (n > 0): folder for n, folder in enumerate(folders)}
@@ -150,6 +157,19 @@ def run(
     save_appearance(state.appearance, folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
     folder.finish(state.summary())
+    return folder.path
+
+
+def _run_radiance(config: FitConfig, scene: Path, out: Path, start: Path | None, overwrite: bool) -> Path:
+    """Fit a radiance field: it reads the scene alone (``stages/radiance/loop.py``)."""
+    if start is not None:
+        raise UsageError(f"{config.method} cannot go on with a finished fit", remedy="leave --start-from out")
+    refuse_overlap(out, {"scene": scene})
+    device = choose_device(config.device, "fit")
+    folder = RunDir.open(out, OUTPUT, result_settings(config), {"scene": store.digest(scene)}, overwrite)
+    if folder.complete:
+        return folder.reused()
+    fit_radiance(config, read_scene(scene), folder, device)
     return folder.path
 
 

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from mudg.base import log, store
 from mudg.base.config import to_dict
-from mudg.base.errors import ResourceError
+from mudg.base.errors import ResourceError, UsageError
 from mudg.base.processes import Interruption
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.clips import from_log
@@ -65,6 +65,7 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     if config.compute.tensorboard and importlib.util.find_spec("tensorboard") is None:
         raise ResourceError("TensorBoard is not installed", where="--compute.tensorboard",
             remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
+    config = _checked_condition(config)
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
@@ -78,6 +79,16 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
                 directory.pause()
             raise
     return out / "model"
+
+
+def _checked_condition(config: LearnConfig) -> LearnConfig:
+    """The configuration; without renders where the condition has none. UsageError where the condition cannot be made."""
+    if config.data.condition == "full":
+        return config
+    if config.data.scenes:
+        raise UsageError("this condition is made of generated cities only", where="--data.condition", got="--data.scenes",
+                         remedy="leave one of them out")  # fmt: skip
+    return learn_clips.without_renders(config)
 
 
 def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunDir | None:

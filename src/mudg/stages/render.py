@@ -6,15 +6,19 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from pathlib import Path
+
+import torch
 
 from mudg.base import log, store
 from mudg.base.config import result_settings
-from mudg.base.devices import memory_of
+from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
-from mudg.base.types import Scene, Trajectory
+from mudg.base.types import Observation, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
@@ -28,7 +32,10 @@ from mudg.stages.config import RenderConfig
 from mudg.stages.editing.apply import scene_seen_by
 from mudg.stages.editing.carried import carry_out, read_and_digest
 from mudg.stages.fit import NEAR_M, load_model, render_view
+from mudg.stages.fitting.storage import RADIANCE, kind_of
 from mudg.stages.fitting.views import resized_view
+from mudg.stages.radiance.pictures import observe
+from mudg.stages.radiance.storage import load_field
 
 _OUTPUT = VerbOutput("render", 1, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
@@ -52,21 +59,25 @@ def run(
     script = None
     if edits is not None:
         script, inputs["edits"] = read_and_digest(Path(edits))
-    device = drawing_device(config.device, "render", config.raster)
-    edited = None if script is None else _scenes(scene, model, script)  # what cannot be done is told before anything is written
+    radiance = kind_of(Path(model)) == RADIANCE
+    if radiance and (config.remove_tracks or script is not None):
+        raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),
+            remedy="leave --remove-tracks and --edits out")  # fmt: skip
+    device = choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
+    edited = None if script is None else _edited(scene, model, script)  # what cannot be done is told before anything is written
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    loaded, fitted = edited or _scenes(scene, model, None)
-    fitted = fitted.to(device)
-    if config.remove_tracks:
-        fitted = fitted.without_nodes(config.remove_tracks)
-    source = str(fitted.facts.get("method", "fit"))
+    if radiance:
+        loaded, (draw, source) = read_scene(Path(scene)), _field_drawer(config, Path(model), device)
+    else:
+        loaded, fitted = edited or _edited(scene, model, None)
+        draw, source = _scene_drawer(config, fitted.to(device))
     paths = trajectories(loaded, config)
     try:
         with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
             for path in paths:
-                _render_trajectory(fitted, path, config, folder.path / path.name, source, bar)
+                _render_trajectory(draw, path, folder.path / path.name, source, bar)
                 if config.video:
                     _write_video(folder.path / path.name, folder.path / f"{path.name}.mp4", config.fps)
     except KeyboardInterrupt:
@@ -76,7 +87,7 @@ def run(
     return folder.path
 
 
-def _scenes(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene, SceneModel]:
+def _edited(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene, SceneModel]:
     """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script."""
     fitted = load_model(Path(model))
     loaded = scene_seen_by(read_scene(Path(scene)), fitted.facts)
@@ -86,39 +97,55 @@ def _scenes(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene,
     return drive.scene or loaded, drive.model(fitted)
 
 
+Drawer = Callable[[View], Observation]
+
+
+def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:
+    """What draws the views of a scene of Gaussians, and its name."""
+    if config.remove_tracks:
+        fitted = fitted.without_nodes(config.remove_tracks)
+    source, raster = str(fitted.facts.get("method", "fit")), RasterConfig(backend=config.raster, near_m=NEAR_M)
+    return lambda view: render_view(fitted, view, raster, config.sky_below_alpha, source), source
+
+
+def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tuple[Drawer, str]:
+    """What draws the views of a radiance field, and its name."""
+    field, budget = load_field(model)
+    source = str(field.facts.get("method", "fit"))
+    return functools.partial(
+        observe, field.to(device), budget=budget, sky_below_alpha=config.sky_below_alpha, source=source
+    ), source
+
+
 def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
-    """The trajectories a configuration names: every camera at every shift (0 = recorded).
+    """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path.
 
     Raises:
         UsageError: an unknown camera, or nothing to render.
     """
     cameras = config.cameras or tuple(scene.cameras)[:1]
-    if not config.shifts_m:
+    if not config.shifts_m and not config.paths:
         raise UsageError("nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path")
+    moved = {"height_m": config.height_m, "yaw_rad": math.radians(config.yaw_deg)}
     paths = []
     for camera in cameras:
-        for shift_m in config.shifts_m:
-            path = trajectory.at_shift(
-                scene, camera, shift_m, height_m=config.height_m, yaw_rad=math.radians(config.yaw_deg)
-            )
+        found = [trajectory.at_shift(scene, camera, shift_m, **moved) for shift_m in config.shifts_m]
+        for path in (*found, *(trajectory.named(scene, camera, name) for name in config.paths)):
             paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
     return tuple(paths)
 
 
-def _render_trajectory(
-    model: SceneModel, path: Trajectory, config: RenderConfig, out: Path, source: str, bar: log.ProgressTask
-) -> None:
+def _render_trajectory(draw: Drawer, path: Trajectory, out: Path, source: str, bar: log.ProgressTask) -> None:
     """One folder of observations; views that an earlier, interrupted run wrote are kept."""
     if (out / "observations.json").is_file():
         bar.advance(len(path))
         return
-    raster = RasterConfig(backend=config.raster, near_m=NEAR_M)
     with ObservationWriter(out, path.name, source) as writer:
         for index, view in enumerate(path.views):
             if index < writer.done:
                 writer.skip(view)
             else:
-                writer.add(render_view(model, view, raster, config.sky_below_alpha, source))
+                writer.add(draw(view))
             bar.advance()
 
 

@@ -8,7 +8,6 @@ errors/*.png and, where FID is computed, features/.
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,90 +23,45 @@ from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, palette, store
 from mudg.base.devices import choose_device
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.processes import computed_ahead
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
-from mudg.base.types import Frame, FusedCloud, Observation, Scene, View
-from mudg.core import metrics, project
+from mudg.base.types import FusedCloud, Observation, Scene, View
+from mudg.core import metrics, project, view_metrics
+from mudg.core.perceptual import LPIPS_EPSILON
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
+from mudg.core.view_facts import ViewFacts
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import (
-    OBSERVATION_FILES,
-    ObservationSet,
-    ObservationWriter,
-    list_observation_sets,
-    read_observations,
-)
+from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_scene
-from mudg.models.featnets import CodecFeatures, PerceptualDistance
+from mudg.models.featnets import CodecFeatures, LpipsTrunk, PerceptualDistance
 from mudg.models.mdm import files as mdm_files
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.fitting.perception import lpips_network
-from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, Truth, ViewTruth, apart_m, stored_truth, truth_of
-from mudg.stages.scoring.distributions import FEATURES_FOLDER, Distributions, ImageSet, TrajectorySets, distributions_of
-from mudg.stages.scoring.videos import VideoDistances, videos_of
+from mudg.stages.score_truth import ViewTruth, stored_truth, truth_of
+from mudg.stages.scoring.distributions import FEATURES_FOLDER
+from mudg.stages.scoring.facts import FactMaker, known_of, vehicles_of
+from mudg.stages.scoring.trajectories import Baseline, PairDistance, Reference, ScoredTrajectory, trajectories_of
+from mudg.stages.scoring.whole_sets import BASELINE, anchors_of, set_scores_of
 
-BASELINE: Final = "nearest_fill"
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
+TRUTH: Final = "=truth"
+"""Stands for the true images where they are held against what is known of them, as a method is."""
+LPIPS_FILES: Final[Mapping[str, tuple[str, LpipsTrunk]]] = {
+    "lpips_weights": ("lpips", "alex"),
+    "lpips_vgg_weights": ("lpips_vgg", "vgg"),
+    "lpips_squeeze_weights": ("lpips_squeeze", "squeeze"),
+}
+"""Setting that names a file -> row of the table and the network in the file."""
+FILES: Final = (*LPIPS_FILES, "fid_weights", "fvd_weights", "dino_weights", "clip_weights", "video_features", "detections", "lanes")
+"""Settings that name files and folders to read."""
 DEPTH_LIMIT_M: Final = 80.0
 _OUTPUT: Final = VerbOutput(
-    "score", 4,
+    "score", 5,
     ("metrics.json", "metrics.md", "errors/*.png", f"{FEATURES_FOLDER}/*.safetensors",
      *below("truth/*", OBSERVATION_FILES), *below(f"{BASELINE}/*", OBSERVATION_FILES)),
 )  # fmt: skip
-_NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
-
-Baseline = Callable[[View], Observation]
-PairDistance = Callable[[metrics.Pair], float | None]
-
-
-@dataclass(frozen=True)
-class ScoredTrajectory:
-    """One trajectory to score.
-
-    Args:
-        name: trajectory name. camera: its camera. shift_m: 0 = the recorded path, None = neither it nor a plain shift.
-        views: at the common size. frames: the recorded frame of each view on the recorded path, else None.
-        sets, indices: the methods that have it, and which of their views stand beside ``views``.
-    """
-
-    name: str
-    camera: str
-    shift_m: float | None
-    views: tuple[View, ...]
-    frames: tuple[Frame | None, ...]
-    sets: Mapping[str, ObservationSet]
-    indices: Mapping[str, tuple[int, ...]]
-
-    def counted(self, held_out: frozenset[str]) -> list[int]:
-        """The views that count. Recorded training frames were seen by the fit and do not; views off the path never were."""
-        return [n for n, frame in enumerate(self.frames) if frame is None or frame.id in held_out]
-
-    def record(self) -> dict[str, Any]:
-        """The trajectory as JSON values."""
-        camera = self.views[0].camera
-        return {
-            "name": self.name, "camera": self.camera, "shift_m": self.shift_m, "views": len(self.views), "width": camera.width,
-            "height": camera.height, "methods": list(self.sets), "indices": {m: list(i) for m, i in self.indices.items()},
-        }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Reference:
-    """What every method is compared with, and how.
-
-    Args:
-        truth, baseline: of any view. held_out: ids of the recorded frames that count.
-        distances: what computes the rows of the table that need weights, at ``distance_views`` views of a trajectory (0 = all).
-    """
-
-    truth: Truth
-    baseline: Baseline | None
-    held_out: frozenset[str]
-    error_pictures: bool
-    distances: Mapping[str, PairDistance]
-    distance_views: int
 
 
 def run(
@@ -130,12 +84,11 @@ def run(
     """
     if not methods:
         raise UsageError("nothing to score", expected="at least one method with its folder of rendered views")
-    weights = {"lpips_weights": config.lpips_weights, "fid_weights": config.fid_weights, "fvd_weights": config.fvd_weights}
-    named = {name.replace("_", "-"): path for name, path in weights.items()}
-    refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, **named})
+    files = {name: getattr(config, name) for name in FILES}
+    refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, **{n.replace("_", "-"): p for n, p in files.items()}})
     others = {
         "fused": fused if config.baseline else None,
-        **{name: Path(path) if path else None for name, path in weights.items()},
+        **{name: Path(path) if path else None for name, path in files.items()},
         "truth": truth,
     }
     given = {"scene": scene, **methods, **{name: path for name, path in others.items() if path is not None}}
@@ -145,124 +98,63 @@ def run(
     if work.complete:
         return work.reused()
     recorded = read_scene(scene)
-    trajectories = _trajectories(config, recorded, methods)
+    trajectories = trajectories_of(config, recorded, methods)
     reference = Reference(
         truth=truth_of(recorded) if truth is None else stored_truth(truth),
         baseline=baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None,
         held_out=frozenset(f.id for f in recorded.frames_in("test") or recorded.frames),
         error_pictures=config.error_pictures, distances=_distances(config), distance_views=config.perceptual_views,
+        facts=FactMaker(recorded), vehicles=vehicles_of(recorded),
     )  # fmt: skip
-    # Before the work: the weights may be unusable.
-    sets, videos = distributions_of(config, recorded, work.path), videos_of(config, recorded, work.path)
+    sets = set_scores_of(config, recorded, work.path)  # before the work: the weights may be unusable
     results: list[dict[str, Any]] = []
     with log.task("score", sum(len(trajectory.views) for trajectory in trajectories)) as bar:
         for trajectory in trajectories:
             bar.update(trajectory.name)
             results += _score(trajectory, reference, work.path, bar.advance)
-    if sets is not None or videos is not None:
-        _compare_sets(results, trajectories, reference, work.path, sets, videos)
+    sets.add_to(results, trajectories, reference, work.path)
     names = [*([BASELINE] if reference.baseline is not None else []), *methods]
     rows = {
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
         for name, row in metrics.METRICS.items()
     }
+    anchors = anchors_of(results, trajectories, reference)
     records = [trajectory.record() for trajectory in trajectories]
     document = score_tables.document(recorded, reference.truth.exact, records, names, results, rows,
-        {"depth_limit_m": DEPTH_LIMIT_M, "distributions": None if sets is None else sets.record(),
-         "videos": None if videos is None else videos.record()})  # fmt: skip
+        {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors, "lpips": _lpips_record(config), **sets.records()})  # fmt: skip
     store.write_json(work.path / "metrics.json", document)
     store.write_text(work.path / "metrics.md", score_tables.markdown(document))
     work.finish({"trajectories": len(trajectories), "methods": names})
     return work.path
 
 
-def _compare_sets(
-    results: Sequence[dict[str, Any]], trajectories: Sequence[ScoredTrajectory], reference: Reference, out: Path,
-    sets: Distributions | None, videos: VideoDistances | None,
-) -> None:  # fmt: skip
-    """Add to the results what compares whole sets of views: distances of images, and of clips, where their weights are given."""
-    with log.task("features", len(results)) as bar:
-        for trajectory in trajectories:
-            bar.update(trajectory.name)
-            rows_here = [row for row in results if row["trajectory"] == trajectory.name]
-            if sets is not None:
-                counted = trajectory.counted(reference.held_out)
-                _add_distributions(rows_here, sets, _sets_of(trajectory, reference, out, counted))
-            if videos is not None:
-                every = range(len(trajectory.views))
-                _add_videos(rows_here, videos, _sets_of(trajectory, reference, out, every))
-            for _ in rows_here:
-                bar.advance()
-
-
 def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     """The rows that need weights and have them."""
     found: dict[str, PairDistance] = {}
-    if not (config.perceptual_views or config.lpips_weights):
+    if not (config.perceptual_views or any(getattr(config, flag) for flag in LPIPS_FILES)):
         return found
     device = choose_device(config.device, "networks of the scores")
     if config.perceptual_views:
         found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=device)
-    if config.lpips_weights:
-        network = lpips_network(config.lpips_weights)
-        found["lpips"] = PerceptualDistance(network, network.channel_weights, device)
+    for flag, (row, trunk) in LPIPS_FILES.items():
+        if getattr(config, flag):
+            network = lpips_network(getattr(config, flag), trunk, config.lpips_input)
+            found[row] = PerceptualDistance(network, network.channel_weights, device)
     return found
+
+
+def _lpips_record(config: ScoreConfig) -> dict[str, Any]:
+    """How LPIPS was made: its input, epsilon and the digests of its weights by row."""
+    files = {row: Path(path) for flag, (row, _) in LPIPS_FILES.items() if (path := getattr(config, flag))}
+    if not files:
+        return {}
+    digests = {row: store.sha256_file(path) for row, path in files.items()}
+    return {"version": "0.1", "input": config.lpips_input, "epsilon": LPIPS_EPSILON, "weights_sha256": digests}
 
 
 def summary_table(out: Path) -> str:
     """The main numbers of a finished score folder as plain text for a terminal."""
     return score_tables.plain(store.read_json(Path(out) / "metrics.json"))
-
-
-# ---- what is compared with what ----
-
-
-def _trajectories(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[ScoredTrajectory]:
-    sets = {
-        method: {name: read_observations(path) for name, path in list_observation_sets(folder).items()}
-        for method, folder in methods.items()
-    }
-    names = sorted({name for found in sets.values() for name in found}, key=_order)
-    if not names:
-        raise InputError("none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
-            expected="output of mudg render or mudg synthesize")  # fmt: skip
-    return [_matched(config, scene, name, {m: found[name] for m, found in sets.items() if name in found}) for name in names]
-
-
-def _order(name: str) -> tuple[str, float, str]:
-    found = _NAME.fullmatch(name)
-    return (found["camera"], float(found["shift"] or 0), name) if found else (name, 1e9, name)
-
-
-def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, ObservationSet]) -> ScoredTrajectory:
-    """Match the methods' views by time; keep those that all have, so that all are scored on the same ones."""
-    times = {m: np.array([v.time_s for v in found.views]) for m, found in sets.items()}
-    indices: dict[str, list[int]] = {m: [] for m in sets}
-    views: list[View] = []
-    for view in next(iter(sets.values())).views:
-        nearest = {m: int(np.argmin(np.abs(t - view.time_s))) for m, t in times.items() if len(t)}
-        if len(nearest) < len(sets) or any(abs(times[m][i] - view.time_s) > SAME_TIME_S for m, i in nearest.items()):
-            continue
-        for method, index in nearest.items():
-            distance_m = apart_m(sets[method].views[index], view)
-            if distance_m > SAME_PLACE_M:
-                raise InputError("two methods rendered the same trajectory from different positions",
-                                 where=f"{name}: {method}, view {index}", got=f"{distance_m:.3f} m apart")  # fmt: skip
-            indices[method].append(index)
-        camera = scene.cameras.get(view.camera.name, view.camera)
-        width = config.width_px or camera.width
-        views.append(view.resized(width, max(1, round(camera.height * width / camera.width))))
-    if not views:
-        raise InputError("the methods have no view in common", where=name, got=", ".join(sets))
-    found = _NAME.fullmatch(name)
-    shift_m = float(found["shift"] or 0.0) if found is not None and not found["more"] else None
-    camera_name = views[0].camera.name
-    frames = tuple(_frame_of(scene, camera_name, view) if shift_m == 0.0 else None for view in views)
-    return ScoredTrajectory(name, camera_name, shift_m, tuple(views), frames, sets, {m: tuple(i) for m, i in indices.items()})
-
-
-def _frame_of(scene: Scene, camera: str, view: View) -> Frame | None:
-    return next((f for f in scene.frames_of(camera) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None)
 
 
 # ---- the baseline ----
@@ -310,9 +202,10 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """Truth and methods' views at one place, and by method what the wanted metrics measure there."""
+    """Truth, facts and methods' views at one place, and by method what the wanted metrics measure there."""
 
     truth: ViewTruth | None
+    facts: ViewFacts
     seen: Mapping[str, Observation]
     measured: Mapping[str, Mapping[str, Any]]
 
@@ -322,15 +215,16 @@ def _score(
 ) -> list[dict[str, Any]]:
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
-    motion = metrics.StaticMotion()
-    sums = {name: metrics.build_all(reference.distances, motion) for name in names}
+    motion, exact_motion = metrics.StaticMotion(), view_metrics.ExactMotion(reference.vehicles)
+    sums = {name: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion)) for name in names}
+    sums[TRUTH] = view_metrics.build_facts(exact_motion)
     counted = trajectory.counted(reference.held_out)
     wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
     scored = 0
 
     def measure(number: int) -> MeasuredView:
-        return _measured(trajectory, reference, number, {m: {k: sums[m][k] for k in wanted[number]} for m in names})
+        return _measured(trajectory, reference, number, {m: {k: of[k] for k in wanted[number] if k in of} for m, of in sums.items()})
 
     threads = native.threads()
     with native.one_thread(), contextlib.ExitStack() as stack:
@@ -345,77 +239,35 @@ def _score(
         for number, made in enumerate(computed_ahead(measure, len(trajectory.views), threads)):
             if fills is not None:
                 fills.add(made.seen[BASELINE])
+            if number in counted:
+                truth_has |= known_of(made.facts)
             if made.truth is not None:
                 if truths is not None:
                     truths.add(made.truth.seen)
                 if number in counted:
                     scored += 1
                     truth_has |= _contents(made.truth, exact)
-                for name, values in made.measured.items():
-                    for metric, value in values.items():
-                        sums[name][metric].add(value)
                 if reference.error_pictures and number == len(trajectory.views) // 2:
                     _write_error_picture(out / "errors" / f"{trajectory.name}.png", made.seen, made.truth.seen)
+            for name, values in made.measured.items():
+                for metric, value in values.items():
+                    sums[name][metric].add(value)
             advance()
+    anchors = _values(sums.pop(TRUTH), truth_has)
     return [
-        {"method": name, "trajectory": trajectory.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of)}
+        {"method": name, "trajectory": trajectory.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of),
+         "details": view_metrics.details(of), "truth": {k: v for k, v in anchors.items() if not isinstance(v, str)}}
         for name, of in sums.items()
-    ]
-
-
-def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, counted: Sequence[int]) -> TrajectorySets:
-    """The images at the counted views of a trajectory whose views have been scored and written."""
-
-    def chosen(found: ObservationSet, indices: Sequence[int]) -> ImageSet:
-        return ImageSet(len(counted), lambda number: found.rgb_u8(indices[counted[number]]))
-
-    def true_image(number: int) -> NDArray[np.uint8]:
-        place = counted[number]
-        true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
-        if true is None:
-            raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
-        return to_bytes(true.seen.rgb)
-
-    methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
-    every = range(len(trajectory.views))
-    if reference.baseline is not None:
-        methods = {BASELINE: chosen(read_observations(out / BASELINE / trajectory.name), every), **methods}
-    truth = None
-    if reference.truth.exact and trajectory.shift_m != 0.0:
-        drawn = out / "truth" / trajectory.name
-        truth = ImageSet(len(counted), true_image) if reference.truth.stored else chosen(read_observations(drawn), every)
-    camera = trajectory.views[0].camera
-    return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
-
-
-def _add_videos(rows: Sequence[dict[str, Any]], videos: VideoDistances, here: TrajectorySets) -> None:
-    """FVD into the results of one trajectory."""
-    found = videos.of(here)
-    for row in rows:
-        value = found[row["method"]]
-        row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
-        if not isinstance(value, str):
-            row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
-
-
-def _add_distributions(rows: Sequence[dict[str, Any]], sets: Distributions, here: TrajectorySets) -> None:
-    """FID and KID into the results of one trajectory."""
-    found = sets.of(here)
-    for row in rows:
-        value = found[row["method"]]
-        if isinstance(value, str):
-            row["values"] |= {"fid": value, "kid": value}
-        else:
-            row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
-            row["distribution"] = value.record()
+    ]  # fmt: skip
 
 
 def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequence[int]) -> list[set[str]]:
     """The metrics that each view of a trajectory enters."""
     sampled = set(evenly(counted, reference.distance_views or len(counted)))
-    every_frame = {"flicker"} if reference.truth.exact else set()  # wants all frames, in order
+    every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())  # wants all, in order
     needs_weights = reference.distances.keys()
-    usual = {name for name, row in metrics.METRICS.items() if row.build is not None} - needs_weights - {"flicker"}
+    usual = {name for name, row in metrics.METRICS.items() if row.build is not None} | {*view_metrics.FACTS, *view_metrics.PARTS}
+    usual -= {*needs_weights, "flicker", "temporal_flickering"}
     return [
         every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
         for n in range(len(trajectory.views))
@@ -431,9 +283,15 @@ def _measured(
     seen = {m: found[trajectory.indices[m][number]] for m, found in trajectory.sets.items()}
     if reference.baseline is not None:
         seen = {BASELINE: reference.baseline(view), **seen}
-    if truth is None:
-        return MeasuredView(None, seen, {})
-    return MeasuredView(truth, seen, {m: metrics.measure(pair_of(o, truth), wanted[m]) for m, o in seen.items()})
+    asked = {name for of in wanted.values() for name in of}
+    if asked <= {"flicker", *view_metrics.EVERY_VIEW}:  # a view that does not count: only its neighbours need it
+        facts = ViewFacts(instance=None if truth is None else truth.instance)
+    else:
+        facts = reference.facts.of(view, truth)
+    measured = {m: metrics.measure(pair_of(o, truth, view, facts), wanted[m]) for m, o in seen.items()}
+    if truth is not None:
+        measured[TRUTH] = metrics.measure(pair_of(truth.seen, truth, view, facts), wanted[TRUTH])
+    return MeasuredView(truth, facts, seen, measured)
 
 
 def evenly(items: Sequence[int], count: int) -> list[int]:
@@ -470,23 +328,32 @@ def _iou(sums: Mapping[str, metrics.Metric]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in metrics.iou_of(segmentation.counts).items()}
 
 
-def pair_of(seen: Observation, truth: ViewTruth) -> metrics.Pair:
-    """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m)."""
-    true = truth.seen
-    height, width = true.view.camera.height, true.view.camera.width
+def pair_of(
+    seen: Observation, truth: ViewTruth | None, view: View | None = None, facts: ViewFacts | None = None
+) -> metrics.Pair:
+    """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
+
+    Args:
+        view: of both; without it, the truth's. facts: what is known of the view beside the truth.
+    """
+    true = None if truth is None else truth.seen
+    view = view or (seen.view if true is None else true.view)
+    height, width = view.camera.height, view.camera.width
     depth: Tensor | None = None
     if seen.depth is not None:
         depth = resize_nearest(seen.depth, height, width)
         given = torch.isfinite(depth) & (depth > 0)
         depth = torch.where(given, depth, DEPTH_LIMIT_M).clamp(max=DEPTH_LIMIT_M)
+    rgb = resize_rgb(seen.rgb, height, width)
+    semantics = None if seen.semantics is None else resize_nearest(seen.semantics, height, width)
+    if true is None or truth is None:
+        return metrics.Pair(rgb, depth, semantics, None, None, None, None, view=view, facts=facts)
     valid = None
     if true.depth is not None:
         valid = torch.isfinite(true.depth) & (true.depth > 0) & (true.depth <= DEPTH_LIMIT_M)
     return metrics.Pair(
-        rgb=resize_rgb(seen.rgb, height, width), depth=depth,
-        semantics=None if seen.semantics is None else resize_nearest(seen.semantics, height, width),
-        truth_rgb=true.rgb, truth_depth=true.depth, truth_depth_valid=valid, truth_semantics=true.semantics,
-        mask=true.mask, moving=truth.moving, view=true.view,
+        rgb=rgb, depth=depth, semantics=semantics, truth_rgb=true.rgb, truth_depth=true.depth, truth_depth_valid=valid,
+        truth_semantics=true.semantics, mask=true.mask, moving=truth.moving, view=true.view, facts=facts,
     )  # fmt: skip
 
 

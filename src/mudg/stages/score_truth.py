@@ -1,7 +1,8 @@
 """What views are held against: the generated city drawn again, held-out recorded frames, or truth drawn by an earlier run.
 
 A folder of truth (``write_truth``) holds one observation folder per trajectory and, beside the observations,
-``moving.safetensors``: u8[T, H, W], 1 where a dynamic object is seen.
+``moving.safetensors``: ``moving`` u8[T, H, W], 1 where a dynamic object is seen, ``instance`` i32[T, H, W], and ``marking`` u8[T, H, W], 1
+where there is paint on the road.
 """
 
 from __future__ import annotations
@@ -34,15 +35,18 @@ SAME_SWEEP_S: Final = 0.05
 MAX_LIDAR_M: Final = 100.0
 SAME_TIME_S: Final = 1e-4
 SAME_PLACE_M: Final = 1e-3
-_OUTPUT: Final = VerbOutput("truth", 1, below("*", (*OBSERVATION_FILES, MOVING_FILE)))
+_OUTPUT: Final = VerbOutput("truth", 2, below("*", (*OBSERVATION_FILES, MOVING_FILE)))
 
 
 @dataclass(frozen=True)
 class ViewTruth:
-    """The truth at a view; ``moving`` bool[1, H, W], true pixels of dynamic objects, or None where they are not known."""
+    """The truth at a view, with what is known only of generated cities: ``moving`` bool[1, H, W], true pixels of dynamic objects;
+    ``instance`` i32[H, W], number of the object that is seen; ``marking`` bool[H, W], paint on the road."""
 
     seen: Observation
     moving: Tensor | None = None
+    instance: NDArray[np.int32] | None = None
+    marking: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,8 @@ def truth_of(scene: Scene) -> Truth:
 
 def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> ViewTruth:
     truth = world.render(view)
-    return ViewTruth(world.observation(view, truth), torch.from_numpy(np.isin(truth.instance, moving))[None])
+    dynamic = torch.from_numpy(np.isin(truth.instance, moving))[None]
+    return ViewTruth(world.observation(view, truth), dynamic, truth.instance, world.markings(view, truth))
 
 
 def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
@@ -96,19 +101,21 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
         raise InputError("only a generated city has ground truth at every view", where=str(scene))
     with log.task("truth", sum(map(len, trajectories))) as bar:
         for path in trajectories:
-            masks = []
+            maps: dict[str, list[NDArray[Any]]] = {"moving": [], "instance": [], "marking": []}
             with ObservationWriter(folder.path / path.name, path.name, "truth", "recorded") as writer:
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
-                    if true is None or true.moving is None:
+                    if true is None or true.moving is None or true.instance is None or true.marking is None:
                         raise InputError("the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s")
-                    masks.append(true.moving[0].numpy().astype(np.uint8))
-                    if len(masks) <= writer.done:
+                    own = (true.moving[0].numpy().astype(np.uint8), true.instance, true.marking.astype(np.uint8))
+                    for found, value in zip(maps.values(), own, strict=True):
+                        found.append(value)
+                    if len(maps["moving"]) <= writer.done:
                         writer.skip(view)  # an interrupted run wrote it
                     else:
                         writer.add(true.seen)
                     bar.advance()
-            store.write_safetensors(folder.path / path.name / MOVING_FILE, {"moving": np.stack(masks)})
+            store.write_safetensors(folder.path / path.name / MOVING_FILE, {k: np.stack(v) for k, v in maps.items()})
     folder.finish({"trajectories": [path.name for path in trajectories]})
     return folder.path
 
@@ -116,7 +123,7 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
 def stored_truth(folder: Path) -> Truth:
     """Truth that ``write_truth`` left in a folder. A view that it lacks is an InputError."""
     sets = {name: read_observations(path) for name, path in list_observation_sets(folder).items()}
-    masks = {name: store.read_safetensors(folder / name / MOVING_FILE)["moving"] for name in sets}
+    maps = {name: store.read_safetensors(folder / name / MOVING_FILE) for name in sets}
 
     def find(view: View, _frame: Frame | None, name: str) -> ViewTruth:
         stored = sets.get(name)
@@ -134,7 +141,9 @@ def stored_truth(folder: Path) -> Truth:
                 expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
                 got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
             )  # fmt: skip
-        return ViewTruth(stored[index], torch.from_numpy(masks[name][index].astype(bool))[None])
+        own = maps[name]
+        moving = torch.from_numpy(own["moving"][index].astype(bool))[None]
+        return ViewTruth(stored[index], moving, own["instance"][index], own["marking"][index].astype(bool))
 
     return Truth(True, find, stored=True)
 

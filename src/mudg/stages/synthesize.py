@@ -32,8 +32,11 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
+from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
-from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
+from mudg.data.clips.ablated import ConditionParts, ConditionSources, conditions_of
+from mudg.data.clips.condition import ConditionRules, WarpSource
+from mudg.data.clips.near_points import NearSweeps
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_scene, read_trusted_classes
@@ -41,12 +44,13 @@ from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, gener
 from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of
 from mudg.models.mdm.model import MDM
-from mudg.stages.config import SynthesizeConfig
+from mudg.stages import fuse
+from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.learning import loading
 
-SOURCE = "mudg_r"
+SOURCE, FREEVS = "mudg_r", "freevs"
 SKY = palette.ID["sky"]
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
@@ -81,9 +85,12 @@ def run(
     if directory.complete:
         return directory.reused()
     cameras = config.cameras or tuple(loaded.cameras)[:1]
-    if not cameras or not config.shifts_m:
+    if not cameras or not (config.shifts_m or config.paths):
         raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
-    paths = [trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m]
+    paths = [
+        *(trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m),
+        *(trajectory.named(loaded, camera, name) for camera in cameras for name in config.paths),
+    ]
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
@@ -139,6 +146,17 @@ def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     return [Photo(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
 
 
+def near_sweeps(scene: Scene, cloud: FusedCloud, path: Trajectory) -> NearSweeps:
+    """The sweeps of a scene for FreeVS' condition, each coloured by the images of its time that are not held out."""
+    times = [view.time_s for view in path.views]
+    period_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.1
+
+    def read(number: int) -> SweepShots:
+        return next(iter(fuse.scene_sweeps(replace(scene, sweeps=(scene.sweeps[number],)), FuseConfig())))
+
+    return NearSweeps(tuple(sweep.time_s for sweep in scene.sweeps), read, scene.tracks, period_s, cloud.colors)
+
+
 def without_classes(cloud: FusedCloud) -> FusedCloud:
     """The cloud without its points' classes."""
     bare = lambda points: replace(points, semantics=None)  # noqa: E731
@@ -164,14 +182,15 @@ def make_trajectory(
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     recorded = recorded_images(scene, config)
     render_at = None if fitted is None else functools.partial(render_planes, load_model(fitted))
-    maker = ViewMaker(model, scene, cloud, recorded, rules, config, render_at)
+    near = near_sweeps(scene, cloud, path) if config.condition == FREEVS else None
+    maker = ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at, near), config)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
     fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     sheet: list[np.ndarray] = []
     every = max(1, len(path) // 5)
-    with ObservationWriter(folder, path.name, SOURCE) as writer:
+    with ObservationWriter(folder, path.name, FREEVS if config.condition == FREEVS else SOURCE) as writer:
         done = spans[first - 1].stop if first else 0
         for view in path.views[:done]:
             writer.skip(maker.sized(view))
@@ -213,38 +232,36 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
 class ViewMaker:
     """Conditions, samples and observations of one scene at one size."""
 
-    def __init__(
-        self, model: loading.DiffusionModel, scene: Scene, cloud: FusedCloud, recorded: Sequence[Photo], rules: ConditionRules,
-        config: SynthesizeConfig, render_at: RenderAt | None,
-    ) -> None:  # fmt: skip
-        if not recorded:
+    def __init__(self, model: loading.DiffusionModel, given: ConditionSources, config: SynthesizeConfig) -> None:
+        if not given.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
-        self._model, self._scene, self._cloud, self._recorded = model, scene, cloud, recorded
-        self._rules, self._full_size = rules, config.full_size
-        self._render_at = render_at
+        self._model, self._given, self._full_size = model, given, config.full_size
+        self._parts: ConditionParts = config.condition
         self._sources: dict[int, WarpSource] = {}
         self._request = loading.request_of(config, loading.half_of(config) == torch.bfloat16)
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
-        return view if self._full_size else view.resized(self._rules.width, self._rules.height)
+        return view if self._full_size else view.resized(self._given.rules.width, self._given.rules.height)
 
     def make(
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
     ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
-        condition, fine = build_conditions(
-            self._cloud, self._scene.tracks, views, self._recorded, self._rules, self._sources, self._render_at
-        )
+        condition, fine = conditions_of(self._given, self._parts, views, self._sources)
         sample, made, made_views = self._generated(condition, fine, views, replace(self._request, index=number, known=known))
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
-        if self._model.points_alone and not recorded_at_pose(views[0], self._recorded):
+        if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
             usable[0] = False
         trust = made.confidence * usable
+        source, color_alone = (FREEVS, True) if self._parts == FREEVS else (SOURCE, False)
         observations = [
-            Observation(view, made.rgb[i], made.depth[i], made.semantics[i], trust[i], usable[i], "virtual", SOURCE)
+            Observation(
+                view, made.rgb[i], None if color_alone else made.depth[i], None if color_alone else made.semantics[i], trust[i],
+                usable[i], "virtual", source,
+            )
             for i, view in enumerate(made_views)
-        ]
+        ]  # fmt: skip
         return sample, condition, observations
 
     def _generated(
@@ -252,7 +269,7 @@ class ViewMaker:
     ) -> tuple[GeneratedClip, GeneratedClip, tuple[View, ...]]:
         """The clip at the size the model works at; it and its views at the size that is written, without depth in the sky."""
         model = self._model
-        if self._full_size and isinstance(model, MDM) and model.finisher is not None:
+        if self._full_size and isinstance(model, MDM) and model.finisher is not None and self._parts != FREEVS:
             sample, finished = generated_and_finished(model, condition, fine, request)
             return sample, without_sky_depth(finished, fine), tuple(views)
         sample = generated(model, condition, request)
@@ -260,7 +277,7 @@ class ViewMaker:
         if not self._full_size:
             return sample, made, condition.views
         size = views[0].camera.height, views[0].camera.width
-        conditions = None if model.points_alone else (condition, fine)
+        conditions = None if model.points_alone or self._parts == FREEVS else (condition, fine)
         return sample, enlarge(made, size, conditions), tuple(views)
 
 

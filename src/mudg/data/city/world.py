@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from mudg.base import geometry, seeds
 from mudg.base.config import build, to_dict
 from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
 from mudg.base.types import Camera, EgoPath, Observation, Source, SweepPoints, Track, View
+from mudg.data.city import paint, rig
 from mudg.data.city import records as rec
-from mudg.data.city import rig
 from mudg.data.city.config import CityConfig
 from mudg.data.city.furnish import furnish
 from mudg.data.city.layout import StreetPlan, plan_streets
@@ -238,6 +239,23 @@ class CityWorld:
 
     def _phases(self, time_s: float) -> NDArray[np.float64]:
         return self._gait_starts + self._gaits * time_s
+
+    def markings(self, view: View, truth: CityTruth) -> NDArray[np.bool_]:
+        """Pixels bool[H, W] whose centre shows paint on the road, exactly: without the blur of a pixel and without wear.
+
+        Args:
+            truth: what ``render`` gave for this view.
+        """
+        rows, columns = np.nonzero((truth.semantics == ID["road"]) & ~truth.sky)
+        xyz = geometry.unproject(view, np.stack([columns, rows], 1) + 0.5, truth.depth[rows, columns])
+        mask = np.zeros(truth.semantics.shape, bool)
+        if len(xyz):
+            mask[rows, columns] = paint.painted(self.plan, self._handle.street(xyz[:, :2]), xyz[:, :2])
+        return mask
+
+    def lane_lines(self) -> list[NDArray[np.float64]]:
+        """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
+        return paint.lane_lines(self.plan)
 
     # --- truth ------------------------------------------------------------------------------------------------------
 

@@ -31,6 +31,7 @@ from mudg.data.city.sensors import SensorFaults
 from mudg.data.clips import varied
 from mudg.data.clips.city_log import CityLog, record_with_faults
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
+from mudg.data.clips.near_points import NearSweeps, near_condition, simulated_lateness_s
 from mudg.data.clips.shards import pack_clips, shard_path, write_shard
 
 HELD_OUT = 1_000_000
@@ -71,6 +72,8 @@ class CityClipRules:
     published: bool = False
     """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at the time of
     the first view, from where it was recorded."""
+    near_points: bool = False
+    """FreeVS' condition (`near_points.py`): points of a few frames alone."""
     realism: Realism = "plain"
     """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of `size_of`."""
     fitted: bool = False
@@ -211,6 +214,7 @@ def make_clips(
     clips = []
     sources: dict[int, WarpSource] = {}
     known = _known(rules, city, log, rng)
+    near = near_sweeps(log)
     for number, shift_m in enumerate(shifts_of(rules, city)):
         views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
         given, cache = known, sources
@@ -218,7 +222,11 @@ def make_clips(
             given, cache = _split_moments(log.recorded, int(rng.integers(2, 5)), rng)[0], {}
         given = log.recorded if rules.published else given  # for the reference only
         claimed = [log.claimed(view) for view in views]
-        condition, fine = build_conditions(log.cloud, tracks, claimed, given, conditions, cache, render_at)
+        if rules.near_points:
+            late_s = simulated_lateness_s(near, rng) if shift_m == 0.0 and city < HELD_OUT else 0.0
+            condition = fine = near_condition(near, claimed, conditions, late_s)
+        else:
+            condition, fine = build_conditions(log.cloud, tracks, claimed, given, conditions, cache, render_at)
         truths = [log.truth(view.resized(*size)) for view in views]
         clip = replace(clip_from_truth(condition, truths), shift_m=shift_m)
         if rules.fitted:
@@ -227,6 +235,12 @@ def make_clips(
             clip = replace(clip, fine=cut_patch(full, scale, patch_side(size), place))
         clips.append(clip)
     return clips
+
+
+def near_sweeps(log: CityLog) -> NearSweeps:
+    """The sweeps of a city's log for FreeVS' condition."""
+    times = tuple(sweep.time_s for sweep in log.sweeps)
+    return NearSweeps(times, lambda number: log.sweeps[number], log.tracks(), 1 / log.world.config.rate_hz)
 
 
 def _split_moments(

@@ -28,6 +28,8 @@ MAX_OPCODES: Final = 20_000_000
 _MAX_DIMENSIONS: Final = 4
 _DTYPE: Final = re.compile(r"b1|[iu][1248]|f[248]|O8?|[US]\d{1,4}")
 _MARK: Final = object()
+PERSISTENT: Final = "persistent"
+"""Maker that allows a pickle to point to what lies beside it: the pointers become objects of this name."""
 _MALFORMED: Final = (
     ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, struct.error,
 )  # fmt: skip
@@ -213,6 +215,8 @@ class _Machine:
             self._object(opcode)
         elif opcode in ("POP", "POP_MARK"):
             self._since_mark() if opcode == "POP_MARK" else stack.pop()
+        elif opcode == "BINPERSID" and PERSISTENT in self._makers:
+            stack.append(PickledObject(PERSISTENT, (stack.pop(),)))
         elif opcode == "DUP":
             stack.append(stack[-1])
         else:

@@ -18,13 +18,14 @@ from mudg.data.scene.write import SceneWriter
 
 
 def write_part(
-    scene: Scene, root: Path, frames: Collection[str], sweeps: Collection[str], places: Sequence[Frame] = ()
-) -> Scene:
+    scene: Scene, root: Path, frames: Collection[str], sweeps: Collection[str], places: Sequence[Frame] = (),
+    held_out: Collection[str] = (),
+) -> Scene:  # fmt: skip
     """Write some frames and sweeps of a scene, with all tracks and the whole ego path, without classes of points.
 
     Args:
         scene: what is copied, byte by byte where its manifest allows.
-        frames, sweeps: ids of what is shown; these frames are for training.
+        frames, sweeps: ids of what is shown; these frames are for training, but for those of ``held_out``, which are for scoring.
         places: frames of which camera, pose and time are told, with a black image; they are held out. They may belong to a larger
             scene of the same log.
     """
@@ -41,5 +42,5 @@ def write_part(
         for frame in places:
             camera = frame.view.camera
             writer.add_frame(frame.id, frame.view, np.zeros((camera.height, camera.width, 3), np.uint8))
-        writer.set_split({frame.id: "test" for frame in places})
+        writer.set_split(dict.fromkeys((*(frame.id for frame in places), *held_out), "test"))
         return writer.finish()

@@ -10,12 +10,13 @@ from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
 from mudg.base.devices import DeviceName
+from mudg.stages.config.views import ScoreConfig
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class BenchConfig:
     """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on generated cities
-    against exact ground truth; or complete methods on real logs."""
+    against exact ground truth; complete methods on real logs; or fill a table of a paper."""
 
     MOVED: ClassVar[Mapping[str, str | None]] = {"ablation_steps": None, "ablation_cities": None}
 
@@ -43,12 +44,13 @@ class BenchConfig:
     list: Literal["development", "reported"] = "development"
     """shift: list of logs. Choose settings on development; report results on reported, on which nothing was chosen."""
     logs: int = Field(default=8, ge=1, le=8)
-    """shift: number of logs taken from the list, 1 to 8 (the development list has 4)."""
+    """shift; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
     """shift, real: methods to compare, out of the five of the default. real also has mudg_r-no-adapt, mudg_r-no-renders,
-    mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone in its input."""
+    mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone in its input. paper:
+    any method of `mudg fit`, and mudg_r; with the default, all of them."""
     iterations: int = Field(default=1000, ge=1)
-    """shift, real: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more."""
+    """shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more."""
     ablation: bool = False
     """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact
     views instead of generated ones. real: add the rows without adaptation and without renders."""
@@ -56,19 +58,29 @@ class BenchConfig:
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such
     as virtual.color_weight. Both of its fits have them."""
     processes: int = Field(default=0, ge=0)
-    """shift, real: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per
+    """shift, real, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per
     core). Results do not depend on it."""
     videos: bool = True
-    """shift: also write videos of all methods side by side."""
+    """shift, paper: also write videos of all methods side by side."""
+    table: Literal[
+        "mudg1", "mudg2", "mudg3", "recondreamer", "drivedreamer4d", "streetcrafter", "freesim", "recam", "spvc", "panda", "dist"
+    ] = "mudg1"
+    """paper: the table to fill (docs/paper_tables.md)."""
+    freevs_model: str = ""
+    """paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no numbers)."""
+    score: ScoreConfig = Field(default_factory=ScoreConfig)
+    """paper: how every row is scored; files of weights are given here."""
     protocols: tuple[str, ...] = ("gap", "camera", "lidar", "classes")
     """real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone."""
     shown: tuple[str, ...] = ()
     """real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front,
     or the first camera)."""
     resolution: str = ""
-    """real: image size of logs that are imported, as for ingest (empty = as recorded)."""
+    """real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list
+    of cities: WIDTHxHEIGHT (empty = 384x256)."""
     frames: str = ""
-    """real: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all)."""
+    """real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says).
+    paper with a list of cities: 0:END (empty = 0:24)."""
     pose_iterations: int = Field(default=300, ge=1)
     """poses, edit: optimisation steps of every fit."""
     device: DeviceName = "auto"

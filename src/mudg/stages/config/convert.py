@@ -14,6 +14,9 @@ from mudg.base.config import STRICT
 class ConvertConfig:
     """Convert a published checkpoint to a model folder."""
 
+    network: Literal["diffusion", "inception", "i3d", "dinov2", "clip", "lpips", "lpips-vgg", "lpips-squeeze"] = "diffusion"
+    """What the checkpoint holds: a diffusion model, or a network of the scores (docs/scores.md). The other settings apply to diffusion
+    models only."""
     resolution: Literal["auto", "320x512", "576x1024"] = "auto"
     """Image height x width that the checkpoint was trained at. auto: from 512 or 1024 in the file's name."""
     dtype: Literal["keep", "float32", "float16", "bfloat16"] = "keep"

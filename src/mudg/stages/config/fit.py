@@ -10,6 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
 from mudg.base.devices import DeviceName
+from mudg.stages.config.radiance import RadianceConfig
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -163,9 +164,9 @@ class FitConfig:
                          "virtual_seen_weight")),
     }  # fmt: skip
 
-    method: Literal["gs3d", "street_gaussians", "mudg_s"] = "mudg_s"
-    """gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, also supervised by
-    virtual views."""
+    method: Literal["gs3d", "street_gaussians", "emernerf", "mudg_s"] = "mudg_s"
+    """gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. emernerf: a radiance field of static,
+    dynamic and flow parts, without boxes. mudg_s: as street_gaussians, also supervised by virtual views."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
     """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
     to this number. With `--start-from`: further steps, the second half of a schedule of twice as many."""
@@ -196,3 +197,4 @@ class FitConfig:
     appearance: AppearanceConfig = Field(default_factory=AppearanceConfig)
     loss: RecordedLossConfig = Field(default_factory=RecordedLossConfig)
     virtual: VirtualConfig = Field(default_factory=VirtualConfig)
+    radiance: RadianceConfig = Field(default_factory=RadianceConfig)

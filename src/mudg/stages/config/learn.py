@@ -46,6 +46,9 @@ class LearnData:
     """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the condition, with patches
     at the camera's resolution. Takes about half a minute per city. Not done for models that use no renders. Without it, or on recorded
     logs, no model learns to use renders or gets a finisher."""
+    condition: Literal["full", "freevs"] = "full"
+    """Generated cities: what the model is given. freevs: as FreeVS, coloured LiDAR points of two frames before and after each view, without
+    depth, recorded images, classes and renders; use the model with `mudg synthesize --condition freevs`."""
     textures: str = ""
     """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use (empty =
     none)."""

@@ -22,6 +22,8 @@ class SynthesizeConfig:
     """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""
     shifts_m: tuple[float, ...] = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
     """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path."""
+    paths: tuple[str, ...] = ()
+    """Further paths by name: up+1, lane+0.1, speed-0.1, ..., as for render."""
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or
     convert."""
@@ -35,6 +37,10 @@ class SynthesizeConfig:
     1)."""
     samples: int = Field(default=1, ge=1)
     """Samples per clip. The first one is kept; the spread of all of them lowers the confidence. Time grows with this number."""
+    condition: Literal["full", "reference", "points", "concat", "freevs"] = "full"
+    """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points:
+    LiDAR points alone. concat: both, without images warped by depth. The shipped models were trained on whole conditions; published-type
+    models take no other. freevs: the condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone."""
     given_classes: bool = True
     """Use the classes of labelled points and recorded images in the model's condition, if the scene has labels."""
     label_confidence: float = Field(default=0.5, ge=0, le=1)

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.core import losses
 from mudg.core.perceptual import lpips_distance, unit_features
-from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures
+from mudg.data.weights import read_checkpoint
+from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures, LpipsInput, LpipsTrunk
 from mudg.models.mdm import files as mdm_files
 from mudg.stages.config.fit import VirtualConfig
 
@@ -37,9 +37,9 @@ def perception_of(config: VirtualConfig, device: torch.device | None = None) -> 
     return _compared(trunk, _lpips(trunk.channel_weights))
 
 
-def lpips_network(weights: str) -> LpipsFeatures:
-    """The network of LPIPS with the weights of a file; InputError if that holds something else."""
-    return LpipsFeatures(store.read_tensors(Path(weights)), weights)
+def lpips_network(weights: str, trunk: LpipsTrunk = "alex", given: LpipsInput = "correct") -> LpipsFeatures:
+    """A network of LPIPS with the weights of a file; InputError if that holds something else."""
+    return LpipsFeatures(read_checkpoint(Path(weights)), weights, trunk, given)
 
 
 def _lpips(channel_weights: Sequence[Tensor] | None = None) -> Callable[[list[Tensor], list[Tensor], Tensor], Tensor]:

@@ -10,6 +10,8 @@ from mudg.base.types import Scene
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.model import SceneModel
 
+GAUSSIANS, RADIANCE = "gaussians", "radiance"
+
 
 def save_model(model: SceneModel, folder: Path) -> None:
     """The fitted scene without optimiser moments."""
@@ -51,15 +53,28 @@ def model_of_scene(folder: Path, scene: Scene) -> SceneModel:
     return model
 
 
-def load_model(folder: Path) -> SceneModel:
-    """Read a fitted scene.
+def kind_of(folder: Path) -> str:
+    """What a fit has written to this folder: ``gaussians`` or ``radiance``.
 
     Raises:
-        InputError: not the folder of a finished fit, or of another schema. IntegrityError: a file was altered.
+        InputError: not the folder of a finished fit.
+    """
+    if not (Path(folder) / "model.json").is_file():
+        raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
+    return str(store.read_json(Path(folder) / "model.json").get("kind", GAUSSIANS))
+
+
+def load_model(folder: Path) -> SceneModel:
+    """Read a fitted scene of Gaussians.
+
+    Raises:
+        InputError: not the folder of a finished fit, a radiance field, or of another schema. IntegrityError: a file was altered.
     """
     folder = Path(folder)
-    if not (folder / "model.json").is_file():
-        raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
+    if kind_of(folder) != GAUSSIANS:
+        raise InputError("this fit is a radiance field, which has no Gaussians and no objects", where=str(folder),
+                         expected="a scene fitted by a method with Gaussians",
+                         remedy="`mudg render` shows it; for everything else fit with --method street_gaussians")  # fmt: skip
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
     values = store.read_json(folder / "model.json")

@@ -50,7 +50,7 @@ def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.Cit
     return from_city.CityClipRules(
         data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone,
         realism=data.realism, textures=data.textures,
-        fitted=data.renders and not points_alone,
+        fitted=data.renders and not points_alone, near_points=data.condition == "freevs",
     )
 
 

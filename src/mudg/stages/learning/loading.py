@@ -43,6 +43,10 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
     (PublishedMDM if published else MDM).check_request(request_of(config))
     if published and fitted:
         raise UsageError("a published-type model does not use a fitted scene", where="--fitted", remedy="leave it out")
+    if config.condition != "full" and (published or fitted):
+        got = "a published-type model" if published else "--fitted: renders are left out of such a condition"
+        raise UsageError("parts of the condition cannot be switched off here", where="--condition", expected="full", got=got,
+                         remedy="leave out --condition" + ("" if published else " or --fitted"))  # fmt: skip
     if published and config.offload and device.type == "cpu":
         raise UsageError("the image tower is on the CPU already", where="--offload", got="--device cpu", remedy="leave one of them out")
     if published:

@@ -31,6 +31,7 @@ from mudg.data.weights import read_checkpoint
 from mudg.models import inception
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
+from mudg.stages.scoring.converted import source_sha256
 
 FEATURES_FOLDER: Final = "features"
 FEWEST: Final = 2
@@ -118,7 +119,7 @@ class FeatureFiles:
     def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
         self.rule: inception.ResizeRule = rule
         state = read_checkpoint(weights)
-        self.sha256 = store.sha256_file(weights)
+        self.sha256, self.source_sha256 = store.sha256_file(weights), source_sha256(weights)
         self._folder, self._device = folder, device
         self._network = inception.InceptionFeatures(state, str(weights)).to(device)
 
@@ -202,7 +203,7 @@ class Distributions:
         """How the numbers were made, and the floors, for metrics.json."""
         return {
             "network": "Inception-v3 of 2015, global average, 2048 values", "weights_sha256": self._features.sha256,
-            "published_weights": self._features.sha256 == inception.KNOWN_SHA256, "resize": self._features.rule,
+            "published_weights": self._features.source_sha256 == inception.KNOWN_SHA256, "resize": self._features.rule,
             "reference": "recorded frames of the same camera", "covariance": "n - 1", "floors": self._floors,
         }  # fmt: skip
 

@@ -1,11 +1,11 @@
-"""LiDAR points as the truth of ``mudg bench real``: where they are at a moment, which a view shows, and which other cameras saw them.
+"""LiDAR points as sparse truth at any view: where they are at a moment, which a view shows, and which other images saw them.
 
-Points in the boxes of dynamic objects travel with their box; all others stand still.
+Points in the boxes of dynamic objects travel with their box; all others stand still. What hides a point is decided by ``core/visible.py``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,19 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mudg.base import geometry, palette
-from mudg.base.types import Frame, Scene, Sweep, Track, View
-from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, largest_beam_gap, separate
+from mudg.base import geometry
+from mudg.base.types import Track, View
+from mudg.core.fusion import STATIC
 from mudg.core.visible import RULES, hidden_pixels
 from mudg.core.zbuffer import DrawLimits, PointLayer, draw_points
-from mudg.data.scene import read_label, read_points
-from mudg.stages.labelling.points import nearest_sweeps
-from mudg.stages.score_truth import SAME_SWEEP_S
 
 NEAR_M: Final = 0.5
 DEPTH_LIMIT_M: Final = 80.0
-MERGED_SWEEPS: Final = 6
-"""Sweeps of each LiDAR whose points tell what the shown cameras saw."""
 SPREAD_SHARE: Final = 0.03
 """A pixel takes the answer of the nearest point within this share of the image's width."""
 
@@ -51,56 +46,32 @@ class OwnedPoints:
         return OwnedPoints(self.xyz[chosen], self.owner[chosen], self.ids[chosen], self.gap_deg)
 
 
-class LogPoints:
-    """The LiDAR points of a log; sweeps are read once."""
+@dataclass(frozen=True, slots=True, eq=False)
+class PointTruth:
+    """What LiDAR points say about a view.
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self._rules = FusionRules()
-        self.dynamic: tuple[Track, ...] = tuple(t for t in scene.tracks if judge_track(t, self._rules).moving)
-        self._sensors: dict[str, list[Sweep]] = {}
-        for sweep in scene.sweeps:
-            self._sensors.setdefault(sweep.sensor, []).append(sweep)
-        self._kept: dict[str, OwnedPoints] = {}
+    Args:
+        depth: f32[H, W] metres of the point that a pixel shows, 0 = none.
+        dynamic: bool[H, W]: it belongs to a dynamic object.
+        color: u8[H, W, 3], its colour in the recorded image of that time, where ``colored`` bool[H, W]: that image shows it, too.
+        classes: u8[H, W], its class in the recorded image's labels, 255 = none or not shown there.
+    """
 
-    def of_moment(self, time_s: float) -> OwnedPoints | None:
-        """Points of the sweep of each LiDAR that was taken with an image, or None without one."""
-        near = [nearest_sweeps(sweeps, time_s, 1) for sweeps in self._sensors.values()]
-        return self._merged([s for found in near for s in found if abs(s.time_s - time_s) <= SAME_SWEEP_S])
+    depth: NDArray[np.float32]
+    dynamic: NDArray[np.bool_]
+    color: NDArray[np.uint8]
+    colored: NDArray[np.bool_]
+    classes: NDArray[np.uint8]
 
-    def around(self, time_s: float, count: int = MERGED_SWEEPS) -> OwnedPoints | None:
-        """Points of the ``count`` sweeps of each LiDAR that are nearest in time, or None where none is near."""
-        return self._merged([s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, count)])
 
-    def placed(self, points: OwnedPoints, time_s: float) -> NDArray[np.float32]:
-        """Where points are at a moment, f32[N, 3] in the world; NaN where their object has no box then."""
-        world = points.xyz.copy()
-        for number in np.unique(points.owner[points.owner != STATIC]):
-            rows = points.owner == number
-            pose = self.dynamic[number].pose_at(time_s)
-            world[rows] = np.nan if pose is None else geometry.transform_points(pose, points.xyz[rows])
-        return world
-
-    def _merged(self, sweeps: Sequence[Sweep]) -> OwnedPoints | None:
-        if not sweeps:
-            return None
-        parts = [self._read(sweep) for sweep in sweeps]
-        joined = [np.concatenate([getattr(part, name) for part in parts]) for name in ("xyz", "owner", "ids")]
-        return OwnedPoints(*joined, gap_deg=min(part.gap_deg for part in parts))
-
-    def _read(self, sweep: Sweep) -> OwnedPoints:
-        if sweep.id not in self._kept:
-            points = read_points(self.scene, sweep)
-            owner, owned = separate(
-                SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), self.dynamic, self._rules
-            )
-            xyz = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
-            for number, local in owned.items():
-                xyz[owner == number] = local
-            ids = points.classes
-            known = np.full(len(xyz), palette.UNLABELLED, np.uint8) if ids is None else ids
-            self._kept[sweep.id] = OwnedPoints(xyz, owner, known, largest_beam_gap(points.xyz))
-        return self._kept[sweep.id]
+def placed(points: OwnedPoints, dynamic: Sequence[Track], time_s: float) -> NDArray[np.float32]:
+    """Where points are at a moment, f32[N, 3] in the world; NaN where their object (of ``dynamic``) has no box then."""
+    world = points.xyz.copy()
+    for number in np.unique(points.owner[points.owner != STATIC]):
+        rows = points.owner == number
+        pose = dynamic[number].pose_at(time_s)
+        world[rows] = np.nan if pose is None else geometry.transform_points(pose, points.xyz[rows])
+    return world
 
 
 def visible(view: View, world: NDArray[np.float32], gap_deg: float) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -124,6 +95,25 @@ def pixels_of(
     return inside, row, column, z[inside].astype(np.float32)
 
 
+def carried(
+    recorded: View, image: NDArray[np.uint8], world: NDArray[np.float32], gap_deg: float
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """What an image shows at points: its pixels' values u8[N + 1, ...] for N points, and which of them it shows, bool[N + 1].
+
+    The last entry is that of no point, as the index -1 of ``visible`` asks for it.
+
+    Args:
+        recorded: the image's view. image: u8[H, W, ...], colours or classes. world: f32[N, 3].
+    """
+    _, index = visible(recorded, world, gap_deg)
+    rows, columns = np.nonzero(index >= 0)
+    values = np.zeros((len(world) + 1, *image.shape[2:]), np.uint8)
+    known = np.zeros(len(world) + 1, bool)
+    numbers = index[rows, columns]
+    values[numbers], known[numbers] = image[rows, columns], True
+    return values, known
+
+
 # ---- what other cameras saw --------------------------------------------------------------------------------------------
 
 
@@ -136,14 +126,6 @@ class ShownFrame:
     rgb: NDArray[np.uint8]
 
 
-def shown_frame(scene: Scene, frame: Frame, rgb: NDArray[np.uint8]) -> ShownFrame | None:
-    """A frame with its dense depth, or None if it has no label of that kind."""
-    if "depth" not in frame.labels:
-        return None
-    depth = read_label(scene, frame, "depth")
-    return ShownFrame(frame.view, np.where(np.isfinite(depth), depth, np.inf).astype(np.float32), blurred(rgb))
-
-
 def blurred(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """A photograph u8[H, W, 3] averaged over 5x5 pixels, so that a point that is a pixel off has about its colour."""
     for axis in (0, 1):
@@ -152,19 +134,23 @@ def blurred(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def seen_by(
-    log_points: LogPoints, points: OwnedPoints, shown: Sequence[ShownFrame], time_s: float
+    place: Callable[[OwnedPoints, float], NDArray[np.float32]],
+    points: OwnedPoints,
+    shown: Sequence[ShownFrame],
+    time_s: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
     """Which points bool[N] some shown frame of any time saw, and the colour u8[N, 3] that they had there.
 
     A point is seen if it falls into the image and its depth there is not behind the frame's dense depth (rule ``drawn`` of
-    ``core/visible.py``). Frames near ``time_s`` are asked first; the first that saw a point gives its colour.
+    ``core/visible.py``). Frames near ``time_s`` are asked first; the first that saw a point gives its colour. ``place(points, time)`` says
+    where points are.
     """
     seen, colors = np.zeros(len(points.xyz), bool), np.zeros((len(points.xyz), 3), np.uint8)
     for frame in sorted(shown, key=lambda frame: abs(frame.view.time_s - time_s)):
         left = np.flatnonzero(~seen)
         if not len(left):
             break
-        inside, row, column, z = pixels_of(frame.view, log_points.placed(points.taken(left), frame.view.time_s))
+        inside, row, column, z = pixels_of(frame.view, place(points.taken(left), frame.view.time_s))
         clear = ~RULES["drawn"].hides(frame.depth[row, column], z)
         found = left[inside][clear]
         seen[found], colors[found] = True, frame.rgb[row[clear], column[clear]]

@@ -1,0 +1,1 @@
+"""Parts of ``fit`` and ``render`` for radiance fields (method emernerf)."""

@@ -1,0 +1,98 @@
+"""Weights of the networks of the scores, converted: names, origin, use in the scorer, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import toy_inception
+import toy_views
+import toy_vit
+from test_i3d import made_up, renamed
+from test_score_metrics import lpips_state
+
+from mudg import cli
+from mudg.base import store
+from mudg.base.errors import InputError, UsageError
+from mudg.models import i3d, inception
+from mudg.stages import convert, score
+from mudg.stages.config import ConvertConfig, ScoreConfig
+from mudg.stages.scoring import converted
+
+STATES = {
+    "inception": lambda: {**toy_inception.state(), "Conv2d_1a_3x3.bn.num_batches_tracked": torch.tensor(3)},
+    "i3d": lambda: {renamed(name): value for name, value in made_up().items()},
+    "dinov2": toy_vit.dino_state,
+    "clip": lambda: toy_vit.transformers_names(toy_vit.clip_state()),
+    "lpips": lpips_state,
+    "lpips-squeeze": lambda: {**lpips_state("squeeze"), "scaling_layer.shift": torch.zeros(3)},
+}
+
+
+def saved(tmp_path: Path, network: str) -> Path:
+    torch.save({"state_dict": STATES[network]()}, tmp_path / "published.pth")
+    return tmp_path / "published.pth"
+
+
+@pytest.mark.parametrize("network", STATES)
+def test_converted_weights_are_the_published_ones_under_known_names(tmp_path: Path, network: str) -> None:
+    checkpoint = saved(tmp_path, network)
+    converted.convert_weights(network, checkpoint, tmp_path / "out")
+    found = store.read_tensors(tmp_path / "out" / "weights.safetensors")
+    converted.NETWORKS[network].check(found, "converted")
+    description = store.read_json(tmp_path / "out" / "model.json")
+    assert description["source"]["sha256"] == store.sha256_file(checkpoint)
+    assert description["source"]["published_as"] is None
+    assert description["files"] == {"weights.safetensors": store.sha256_file(tmp_path / "out" / "weights.safetensors")}
+    if network == "i3d":
+        assert set(found) == set(i3d.tensor_shapes())
+        assert torch.equal(found["logits.conv3d.bias"], made_up()["logits.conv3d.bias"])
+    if network == "clip":
+        assert all(torch.equal(found[name], value) for name, value in toy_vit.clip_state().items())
+    if network == "inception":
+        assert set(found) == set(inception.tensor_shapes())
+
+
+def test_unknown_names_of_i3d_are_matched_by_order_and_shape() -> None:
+    state = made_up()
+    strange = {f"layer{number}": value for number, value in enumerate(state.values())}
+    found = i3d.with_known_names(strange)
+    assert all(torch.equal(found[name], value) for name, value in state.items())
+    assert set(i3d.with_known_names(dict(list(strange.items())[1:]))) == set(strange) - {"layer0"}  # one is missing: no guess
+
+
+def test_a_converted_file_keeps_its_origin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = saved(tmp_path, "inception")
+    converted.convert_weights("inception", checkpoint, tmp_path / "out")
+    weights = tmp_path / "out" / "weights.safetensors"
+    assert converted.source_sha256(weights) == store.sha256_file(checkpoint)
+    assert converted.source_sha256(checkpoint) == store.sha256_file(checkpoint)
+    monkeypatch.setattr(inception, "KNOWN_SHA256", store.sha256_file(checkpoint))
+    scene = toy_views.write_scene(tmp_path / "scene")
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
+    out = score.run(ScoreConfig(fid_weights=str(weights), perceptual_views=0), scene, {"a": views}, tmp_path / "score")
+    assert store.read_json(out / "metrics.json")["distributions"]["published_weights"] is True
+    store.write_safetensors(weights, {name: value + 1 for name, value in store.read_tensors(weights).items()})
+    assert converted.source_sha256(weights) == store.sha256_file(weights)  # altered since: no longer the published ones
+
+
+def test_other_networks_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="incomplete or of another network"):
+        converted.convert_weights("inception", saved(tmp_path, "i3d"), tmp_path / "out")
+    with pytest.raises(InputError, match="not the weights of a DINOv2"):
+        converted.convert_weights("dinov2", saved(tmp_path, "clip"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_verb_converts_replaces_and_refuses_foreign_settings(tmp_path: Path) -> None:
+    checkpoint = saved(tmp_path, "dinov2")
+    to = tmp_path / "weights" / "dino"
+    assert cli.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) == 0
+    assert (to / "weights.safetensors").is_file()
+    assert cli.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) != 0
+    assert cli.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2", "--overwrite"]) == 0
+    with pytest.raises(UsageError, match="diffusion models only"):
+        convert.run(ConvertConfig(network="dinov2", dtype="float16"), checkpoint, tmp_path / "other")
+    with pytest.raises(InputError, match="no such checkpoint"):
+        convert.run(ConvertConfig(network="dinov2"), tmp_path / "missing.pth", tmp_path / "other")

@@ -1,0 +1,372 @@
+"""The radiance field: space and rays, what is learnt, the fit and its renders."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_settings import fit_config
+from pretend_device import pretend_device
+from toy_world import fused_cloud, view_at, write_scene
+
+from mudg.base import config as configuration
+from mudg.base import seeds, store
+from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.data.cloudfile import write_fused
+from mudg.data.observations import read_observations
+from mudg.data.scene import read_scene
+from mudg.fitted import FittedScene
+from mudg.models.radiance import field as fields
+from mudg.models.radiance import march as marching
+from mudg.models.radiance import sampling
+from mudg.models.radiance.field import Extent, FieldSizes, RadianceField, aggregated
+from mudg.models.radiance.march import Budget, RayDraws, Rays
+from mudg.stages import fit, render, synthesize
+from mudg.stages.config import FitConfig, RenderConfig, SynthesizeConfig
+from mudg.stages.config.radiance import PUBLISHED_EMERNERF
+from mudg.stages.radiance import loop
+from mudg.stages.radiance.pictures import flow_colors
+from mudg.stages.radiance.rays import extent_of, lidar_rays, view_rays
+from mudg.stages.radiance.storage import load_field
+
+TINY = {
+    "method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4,
+    "radiance__rays": 48, "radiance__lidar_rays": 24, "radiance__proposal_samples": (16, 12), "radiance__samples": 8,
+    "radiance__static_grid": (3, 2, 4, 16, 10), "radiance__dynamic_grid": (3, 2, 4, 16, 10), "radiance__flow_grid": (2, 2, 4, 8, 9),
+    "radiance__first_proposal_grid": (2, 1, 4, 8, 9), "radiance__second_proposal_grid": (2, 1, 4, 16, 9),
+    "radiance__width": 8, "radiance__proposal_width": 8, "radiance__appearance": 4,
+}  # fmt: skip
+
+
+def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    return torch.rand(shape, generator=seeds.torch_generator(1, 0, name), dtype=dtype)
+
+
+def tiny_field() -> RadianceField:
+    sizes = loop.sizes_of(fit_config(**TINY).radiance)
+    return RadianceField(sizes, Extent((1.0, 2.0, 3.0), (10.0, 20.0, 5.0), 0.0, 2.0, 0.2), ("front",), {"method": "emernerf"})
+
+
+# ---- space and rays --------------------------------------------------------------------------------------------------
+
+
+def test_the_box_fills_the_inner_half_and_infinity_is_the_border():
+    center, half = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([10.0, 20.0, 5.0])
+    places = torch.tensor([[1.0, 2, 3], [11, 2, 3], [1, -18, 3], [21, 2, 3], [1, 2, 1e9], [21, 22, 3]])
+    wanted = torch.tensor([[0.5, 0.5, 0.5], [0.75, 0.5, 0.5], [0.5, 0.25, 0.5], [0.875, 0.5, 0.5], [0.5, 0.5, 1.0], [0.875, 0.6875, 0.5]])
+    assert torch.allclose(sampling.contract(places, center, half), wanted)
+
+
+def test_distances_are_even_to_the_middle_and_even_in_their_inverse_beyond():
+    along = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
+    found = sampling.distances(along, 0.1, 200.0, 1000.0)
+    assert torch.allclose(found, torch.tensor([0.1, 100.05, 200.0, 1 / (0.5 / 200 + 0.5 / 1000), 1000.0]))
+
+
+def test_weights_of_slabs_are_those_of_beer_and_lambert():
+    edges = torch.tensor([[0.0, 1.0, 3.0, 4.0, 10.0]])
+    density = torch.tensor([[0.5, 0.0, 2.0, 1e6]])
+    first, third = 1 - math.exp(-0.5), math.exp(-0.5) * (1 - math.exp(-2.0))
+    wanted = torch.tensor([[first, 0.0, third, math.exp(-2.5)]])
+    assert torch.allclose(sampling.rendering_weights(density, edges), wanted, atol=1e-6)
+
+
+def test_samples_gather_where_the_weights_are():
+    edges = torch.linspace(0, 1, 11)[None]
+    weights = torch.zeros(1, 10)
+    weights[0, 6] = 1.0
+    found = sampling.resampled_edges(edges, weights, 20, torch.full((1, 1), 0.5))
+    assert found.shape == (1, 21) and (found.diff() >= 0).all()
+    assert ((found >= 0.6) & (found <= 0.7)).float().mean() > 0.9
+    even = sampling.resampled_edges(edges, torch.ones(1, 10), 9, torch.full((1, 1), 0.5))
+    assert torch.allclose(even[0], (torch.arange(10) + 0.5) / 10, atol=1e-6)
+
+
+def test_even_edges_cover_the_ray_whatever_the_jitter():
+    for jitter in (0.0, 0.5, 0.99):
+        edges = sampling.even_edges(1, 8, torch.full((1, 1), jitter))
+        assert edges[0, 0] == 0 and edges[0, -1] == 1 and (edges.diff() >= 0).all()
+
+
+def test_a_blurred_histogram_keeps_its_mass_and_equals_a_fine_convolution():
+    edges = torch.tensor([[0.2, 0.3, 0.45, 0.7]], dtype=torch.float64)
+    weights = torch.tensor([[0.2, 0.5, 0.3]], dtype=torch.float64)
+    wanted = torch.linspace(0, 1, 11, dtype=torch.float64)[None]
+    radius, fine = 0.05, 20_000
+    x = (torch.arange(fine, dtype=torch.float64) + 0.5) / fine
+    height = torch.zeros(fine, dtype=torch.float64)
+    for low, high, weight in zip(edges[0, :-1], edges[0, 1:], weights[0]):
+        height[(x >= low) & (x < high)] = weight / (high - low)
+    box = int(2 * radius * fine)
+    blurred = torch.nn.functional.avg_pool1d(height[None, None], box + 1, 1, box // 2)[0, 0]
+    expected = blurred.view(10, -1).sum(1) / fine
+    found = sampling.blurred_mass(edges, weights, wanted, radius)[0]
+    assert torch.allclose(found, expected, atol=2e-4)
+    assert float(found.sum()) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_proposals_that_agree_cost_nothing_and_others_do():
+    edges = drawn(3, 9).sort(1).values
+    weights = drawn(3, 8, name="weights")
+    weights = weights / weights.sum(1, keepdim=True)
+    assert float(sampling.interlevel_loss(edges, weights, edges, weights, 0.0)) < 1e-6
+    even, flat = torch.linspace(0, 1, 9, dtype=torch.float64).expand(2, -1), torch.full((2, 8), 0.125, dtype=torch.float64)
+    assert float(sampling.interlevel_loss(even, flat, even, flat, 0.03)) == pytest.approx(0.0, abs=1e-12)
+    assert float(sampling.interlevel_loss(edges, weights, edges, weights.flip(1), 0.0)) > 1e-2
+
+
+def test_only_the_proposal_learns_from_the_interlevel_loss():
+    edges, weights = drawn(2, 5).sort(1).values, drawn(2, 4, name="w").requires_grad_()
+    proposal = drawn(2, 4, name="p").requires_grad_()
+    sampling.interlevel_loss(edges, weights, edges, proposal, 0.01).backward()
+    assert weights.grad is None and proposal.grad.abs().sum() > 0
+
+
+# ---- the field -------------------------------------------------------------------------------------------------------
+
+
+def test_flow_aggregation_equals_a_loop_and_moves_its_flow():
+    xyz, time, flow, share = drawn(6, 3), drawn(6, 1, name="t"), drawn(6, 6, name="f").requires_grad_(), drawn(6, 1, name="n")
+
+    def feature(places: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+        return torch.cat([places.square().sum(1, keepdim=True), times * places[:, :1]], 1)
+
+    found, step = aggregated(feature, xyz, time, flow, share, 0.1), 0.1
+    for i in range(6):
+        n = share[i]
+        terms = [feature(xyz[i : i + 1], time[i : i + 1]), 0.5 * feature((xyz[i] + n * flow[i, :3])[None], (time[i] + n * step)[None]),
+                 0.5 * feature((xyz[i] + n * flow[i, 3:])[None], (time[i] - n * step)[None])]  # fmt: skip
+        assert torch.allclose(found[i], sum(terms)[0] / 2)
+    found.sum().backward()
+    assert (flow.grad.abs() > 0).all()
+
+
+def test_each_proposal_round_asks_its_own_network(monkeypatch):
+    field, asked = tiny_field(), []
+    real = field.proposed_density
+    monkeypatch.setattr(field, "proposed_density", lambda level, xyz: (asked.append((level, len(xyz))), real(level, xyz))[1])
+    rays, _ = view_rays(view_at(0.0, _camera(4, 2)), field.extent, 0)
+    marching.march(field, rays, Budget((16, 12), 8, 0.1, 1000.0))
+    assert asked == [(0, 8 * 16), (1, 8 * 12)]
+
+
+def test_color_loss_reaches_every_field_and_proposals_learn_only_when_asked():
+    field = tiny_field()
+    rays, _ = view_rays(view_at(0.3, _camera(6, 4)), field.extent, 0)
+    budget = Budget((16, 12), 8, 0.1, 1000.0)
+    draws = RayDraws.of(len(rays), budget, seeds.torch_generator(0, 1, "draws"), torch.device("cpu"))
+    marched = marching.march(field, rays, budget, draws)
+    marching.colors(field, rays, marched)[0].square().mean().backward()
+    reached = {name for name, value in field.named_parameters() if value.grad is not None and value.grad.abs().sum() > 0}
+    for part in ("static.table", "dynamic.table", "flow.net.weights.0", "color.out", "shadow", "sky", "appearance"):
+        assert any(name.startswith(part) for name in reached), part
+    assert not any(name.startswith("proposals") for name in reached)
+    marching.proposal_loss(marching.march(field, rays, budget, draws, True)).backward()
+    for level in (0, 1):
+        assert field.proposals[level].table.grad.abs().sum() > 0
+
+
+def test_line_of_sight_wants_emptiness_before_the_surface_and_a_bell_at_it():
+    middles, measured = torch.tensor([[2.0, 9.5, 10.0, 15.0]]), torch.tensor([10.0])
+    bell = [math.exp(-0.5 * (off / 0.5) ** 2) / (0.5 * math.sqrt(2 * math.pi)) for off in (-0.5, 0.0)]
+    weights = torch.tensor([[0.2, *bell, 0.7]])
+    assert float(marching.line_of_sight(weights, middles, measured, 1.5)) == pytest.approx(0.04, abs=1e-6)
+
+
+def test_direction_code_has_the_published_width():
+    assert fields.encoded_direction(torch.tensor([[0.0, 0.0, 1.0]])).shape == (1, fields.DIRECTION_WIDTH) == (1, 33)
+
+
+def test_schedules():
+    assert loop.rate_share(1, 1000) == pytest.approx(0.01)
+    assert loop.rate_share(200, 1000) == 1.0
+    assert loop.rate_share(1000, 1000) == pytest.approx(0.33**4)
+    assert [loop.sight_width(step, 1000, 0.08) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 2.5]
+
+
+def _camera(width: int, height: int):
+    from toy_world import camera
+
+    return camera("front", width, height)
+
+
+# ---- the fit ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("world")
+    write_scene(root / "scene", frames=4, width=24, height=16)
+    write_scene(root / "bare", frames=4, width=24, height=16, tracks=False)
+    write_fused(root / "fuse", fused_cloud(4), {})
+    fit.run(fit_config(**TINY), root / "scene", None, root / "fit")
+    return root
+
+
+def parameters(folder: Path) -> dict[str, np.ndarray]:
+    return store.read_safetensors(folder / "field.safetensors")
+
+
+def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
+
+
+def test_boxes_are_not_read(world, tmp_path):
+    fit.run(fit_config(**TINY), world / "bare", None, tmp_path / "bare")
+    assert same(parameters(world / "fit"), parameters(tmp_path / "bare"))
+
+
+def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
+    real, calls = loop.take_step, []
+
+    def stopped(state, config, step):
+        calls.append(step)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        return real(state, config, step)
+
+    monkeypatch.setattr(loop, "take_step", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        fit.run(fit_config(**TINY), world / "scene", None, tmp_path / "fit")
+    monkeypatch.setattr(loop, "take_step", lambda state, config, step: (calls.append(step), real(state, config, step))[1])
+    fit.run(fit_config(**TINY), world / "scene", None, tmp_path / "fit")
+    assert calls == [1, 2, 3, 4, 5, 6, 5, 6, 7, 8]
+    assert same(parameters(world / "fit"), parameters(tmp_path / "fit"))
+    assert not (tmp_path / "fit" / "steps").exists()
+
+
+def started(world: Path, device: torch.device | str = "cpu", **changes: object) -> tuple[loop.RadianceState, FitConfig]:
+    class Folder:
+        path = world / "none"
+
+    config = fit_config(**TINY | changes)
+    return loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device(device)), config  # type: ignore[arg-type]
+
+
+def test_a_short_fit_lowers_its_losses(world):
+    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128, radiance__samples=16)
+    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 81)]
+    for name in ("color", "lidar"):
+        assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
+
+
+def test_a_step_on_another_device_is_the_same(world):
+    with pretend_device() as there:
+        state, config = started(world, there)
+        elsewhere = [{name: float(value.detach().cpu()) for name, value in loop.take_step(state, config, step).items()} for step in (1, 2)]
+    state, config = started(world)
+    for step, found in zip((1, 2), elsewhere):
+        for name, value in loop.take_step(state, config, step).items():
+            assert found[name] == pytest.approx(float(value.detach()), rel=1e-3, abs=1e-6), name
+
+
+def test_what_is_not_finite_never_reaches_the_parameters(world):
+    state, config = started(world)
+    state.pixels._rgb = torch.full_like(state.pixels._rgb, 7).float() * torch.nan
+    before = {name: value.clone() for name, value in state.field.state_dict().items()}
+    with pytest.raises(NumericsError, match="color"):
+        loop.take_step(state, config, 1)
+    assert all(torch.equal(value, before[name]) for name, value in state.field.state_dict().items())
+
+
+def test_renders_as_observations_without_classes(world, tmp_path):
+    out = render.run(RenderConfig(shifts_m=(0.0, 2.0), video=True), world / "scene", world / "fit", tmp_path / "render")
+    seen = read_observations(out / "front_shift+2.0")[1]
+    assert seen.source == "emernerf" and seen.semantics is None
+    assert seen.rgb.shape == (3, 16, 24) and torch.isfinite(seen.rgb).all()
+    known = seen.depth[torch.isfinite(seen.depth)]
+    assert len(known) and (known > 0).all()
+    with pytest.raises(UsageError, match="no objects"):
+        render.run(RenderConfig(remove_tracks=("car",)), world / "scene", world / "fit", tmp_path / "other")
+
+
+def test_saved_field_is_the_fitted_one(world):
+    field, budget = load_field(world / "fit")
+    assert budget == loop.budget_of(fit_config(**TINY).radiance)
+    assert field.facts == {"method": "emernerf", "scene": "toy"}
+    values = store.read_json(world / "fit" / "model.json")
+    tensors = store.read_tensors(world / "fit" / "field.safetensors")
+    tensors.pop("appearance")
+    with pytest.raises(InputError, match="appearance"):
+        RadianceField.from_state(values, tensors)
+
+
+def test_what_needs_gaussians_refuses_a_radiance_field(world, tmp_path):
+    with pytest.raises(InputError, match="radiance field"):
+        FittedScene.read(world / "fit", "cpu")
+    with pytest.raises(InputError, match="radiance field"):
+        synthesize.run(SynthesizeConfig(), world / "scene", world / "fuse", tmp_path / "virtual", fitted=world / "fit")
+    with pytest.raises(InputError, match="no radiance field"):
+        load_field_of_gaussians(tmp_path)
+    with pytest.raises(UsageError, match="cannot go on"):
+        fit.run(fit_config(**TINY), world / "scene", None, tmp_path / "more", start=world / "fit")
+    with pytest.raises(UsageError, match="needs fused clouds"):
+        fit.run(fit_config(method="gs3d"), world / "scene", None, tmp_path / "gs3d")
+
+
+def load_field_of_gaussians(folder: Path) -> None:
+    store.write_json(folder / "model.json", {"schema": 1})
+    load_field(folder)
+
+
+def test_published_sizes_are_settings_of_the_same_code():
+    config = configuration.load(FitConfig, overrides=configuration.nested(dict(PUBLISHED_EMERNERF)))
+    assert config.iterations == 25_000 and config.radiance.static_grid == (10, 4, 16, 8192, 20)
+    assert isinstance(loop.sizes_of(config.radiance), FieldSizes)
+
+
+# ---- rays ------------------------------------------------------------------------------------------------------------
+
+
+def test_pixels_and_lidar_are_rays_of_the_world(world):
+    scene = read_scene(world / "scene")
+    lidar = lidar_rays(scene)
+    extent = extent_of(scene, lidar)
+    ends = lidar.origins + lidar.range_m[:, None] * lidar.directions
+    assert float((ends[:, 2]).min()) > -0.1  # nothing below the ground
+    inside = sampling.contract(ends, torch.tensor(extent.center), torch.tensor(extent.half))
+    assert 0.85 < float(((inside > 0.249) & (inside < 0.751)).all(1).float().mean()) < 0.99
+    assert extent.step == pytest.approx(0.3 / 0.9) and extent.normalised(-5.0) == 0.0
+    view = scene.frames[1].view
+    rays, z_per_m = view_rays(view, extent, 0)
+    assert torch.allclose(rays.directions.norm(dim=1), torch.ones(len(rays)), atol=1e-6)
+    place = rays.origins[5 * 24 + 7] + 10 / z_per_m[5 * 24 + 7] * rays.directions[5 * 24 + 7]
+    from mudg.base import geometry
+
+    uv, z = geometry.project(view, place.numpy()[None])
+    assert np.allclose(uv[0], (7.5, 5.5), atol=1e-3) and z[0] == pytest.approx(10.0, abs=1e-4)
+
+
+def test_a_batch_of_pixels_shows_what_the_rays_meet(world):
+    state, _ = started(world)
+    batch = state.pixels.batch(40, 0.25, seeds.torch_generator(0, 1, "batch"))
+    assert batch.rgb.shape == (40, 3) and batch.sky.dtype == torch.bool
+    assert not (batch.sky & (batch.rays.directions[:, 2] < -0.05)).any()  # no sky below the horizon
+    state.pixels.note(batch.cells, torch.ones(40))
+    assert (state.pixels.errors[batch.cells] == 1.0).all()
+    state.pixels.errors.zero_()
+    state.pixels.errors[3] = 1.0
+    chosen = state.pixels.batch(40, 1.0, seeds.torch_generator(0, 2, "batch"))
+    assert (chosen.cells == 3).all()
+
+
+def test_flow_pictures_are_black_at_rest():
+    flow = np.zeros((3, 2, 2))
+    flow[0, 0, 0], flow[1, 1, 1] = 2.0, 0.5
+    picture = flow_colors(flow)
+    assert picture[0, 1].tolist() == [0, 0, 0] and picture[0, 0].tolist() == [255, 64, 64] and picture[1, 1].max() < 128
+
+
+def test_rays_move_to_a_device_and_back(world):
+    with pretend_device() as there:
+        field = tiny_field().to(there)
+        rays, _ = view_rays(view_at(0.0, _camera(3, 2)), field.extent, 0)
+        marched = marching.march(field, rays.to(there), Budget((8, 8), 4, 0.1, 1000.0))
+        rgb = marching.colors(field, rays.to(there), marched)[0].cpu()
+    field = tiny_field()
+    marched = marching.march(field, rays, Budget((8, 8), 4, 0.1, 1000.0))
+    assert torch.allclose(rgb, marching.colors(field, rays, marched)[0], atol=1e-5)
+    assert isinstance(rays.part(0, 2), Rays)

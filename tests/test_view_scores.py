@@ -1,0 +1,346 @@
+"""Rows of the scores that need more than a true image: LiDAR points, detectors, vehicles, markings, motion, and their anchors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import toy_world
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Observation, Scene, Track, View
+from mudg.core import flicker, trajectory, view_metrics
+from mudg.core.box_scores import nta_truths
+from mudg.core.metrics import Pair
+from mudg.core.view_facts import ViewFacts
+from mudg.data.city import CityConfig, CityWorld, write_city
+from mudg.data.observations import ObservationWriter
+from mudg.data.scene import read_scene
+from mudg.report import score_tables
+from mudg.stages import score, score_truth
+from mudg.stages.config import ScoreConfig
+from mudg.stages.scoring import detections
+
+QUICK = ScoreConfig(perceptual_views=0, error_pictures=False)
+Change = Callable[[Observation], Observation]
+
+
+def written(
+    scene: Scene, out: Path, look: Callable[[View], Observation], shifts_m: tuple[float, ...], change: Change | None = None
+) -> Path:
+    """Views of a scene as something sees them."""
+    for shift_m in shifts_m:
+        path = trajectory.shifted(scene, "front", shift_m) if shift_m else trajectory.recorded(scene, "front")
+        with ObservationWriter(out / path.name, path.name, out.name) as writer:
+            for view in path.views:
+                writer.add(look(view) if change is None else change(look(view)))
+    return out
+
+
+def value(document: dict, method: str, trajectory: str, metric: str) -> object:
+    (row,) = (r for r in document["results"] if (r["method"], r["trajectory"]) == (method, trajectory))
+    return row["values"][metric]
+
+
+def anchors(document: dict, trajectory: str, metric: str) -> dict:
+    (found,) = (a for a in document["anchors"] if (a["trajectory"], a["metric"]) == (trajectory, metric))
+    return found
+
+
+def farther(seen: Observation) -> Observation:
+    assert seen.depth is not None
+    return dataclasses.replace(seen, depth=seen.depth * 1.1)
+
+
+def gray(seen: Observation) -> Observation:
+    return dataclasses.replace(seen, rgb=torch.full_like(seen.rgb, 0.4), semantics=torch.zeros_like(seen.semantics))
+
+
+# ---- a log: no exact truth ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def log_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("log") / "scene"
+    toy_world.write_scene(root, frames=4, width=192, height=128)
+    return root
+
+
+@pytest.fixture(scope="module")
+def log_scores(log_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
+    folder, scene = tmp_path_factory.mktemp("scores"), read_scene(log_scene)
+    methods = {
+        name: written(scene, folder / name, toy_world.truth, (0.0, 2.0), change)
+        for name, change in {"right": None, "far": farther, "gray": gray}.items()
+    }
+    out = score.run(QUICK, log_scene, methods, folder / "score")
+    return store.read_json(out / "metrics.json")
+
+
+def test_lidar_points_measure_depth_and_color_beside_the_path_of_a_log(log_scores: dict) -> None:
+    here = "front_shift+2.0"
+    assert value(log_scores, "right", here, "psnr") == score_tables.NO_TRUTH
+    assert value(log_scores, "right", here, "lidar_abs_rel") < 0.02  # measured 0.007: a point is not at its pixel's centre
+    assert value(log_scores, "far", here, "lidar_abs_rel") == pytest.approx(0.1, abs=0.01)
+    assert value(log_scores, "far", here, "lidar_delta1") > 0.95
+    assert value(log_scores, "right", here, "lidar_psnr") > 18  # measured 21.6: edges
+    assert value(log_scores, "gray", here, "lidar_psnr") < 16
+    (row,) = (r for r in log_scores["results"] if (r["method"], r["trajectory"]) == ("far", here))
+    parts = row["details"]["points"]
+    assert parts["lidar_abs_rel_static"] == pytest.approx(0.1, abs=0.01)
+    assert parts["lidar_abs_rel_dynamic"] == pytest.approx(0.1, abs=0.02)
+
+
+def test_classes_carried_by_points_agree_with_those_of_the_truth_and_not_with_one_class(log_scores: dict) -> None:
+    for here in ("front_recorded", "front_shift+2.0"):
+        assert value(log_scores, "right", here, "agreement") > 0.8
+        assert value(log_scores, "gray", here, "agreement") < 0.35
+    assert "agreement" in {anchor["metric"] for anchor in log_scores["anchors"]}
+
+
+def test_lanes_of_a_log_are_carried_over_by_the_ground(log_scores: dict) -> None:
+    here = "front_shift+2.0"
+    assert value(log_scores, "right", here, "lane_correlation") > 0.8
+    assert value(log_scores, "right", here, "lane_psnr") > 20
+    assert value(log_scores, "gray", here, "lane_psnr") < 15
+    assert value(log_scores, "right", here, "lane_iou") == score_tables.NO_TRUTH  # nobody marked the lanes
+    assert value(log_scores, "right", here, "agent_iou") == score_tables.NO_TRUTH
+    assert value(log_scores, "right", here, "warp_error") == score_tables.NO_TRUTH
+
+
+def test_a_still_video_does_not_flicker(log_scores: dict) -> None:
+    assert value(log_scores, "gray", "front_shift+2.0", "temporal_flickering") == 1.0
+    assert 0.8 < value(log_scores, "right", "front_shift+2.0", "temporal_flickering") < 0.99
+
+
+def test_missing_files_name_their_flags(log_scores: dict) -> None:
+    text = score_tables.markdown(log_scores)
+    for flag in ("--detections", "--lanes", "--dino-weights", "--clip-weights", "--video-features", "--lpips-vgg-weights"):
+        assert flag in text
+
+
+def boxes_json(path: Path, scene: Scene, method: str, moved: float = 0.0, confidence: float = 0.9, category: int = 2) -> Path:
+    """What a perfect detector would say of a method's views and of the recorded images, moved by some pixels."""
+    records = []
+    for prefix, views in (
+        (f"{method}/front_shift+2.0", trajectory.shifted(scene, "front", 2.0).views),
+        ("recorded/front", trajectory.recorded(scene, "front").views),
+    ):
+        for number, view in enumerate(views):
+            for _, box in nta_truths(view, scene.tracks):
+                x, y, right, bottom = (box + moved).tolist()
+                record = {"image_id": f"{prefix}/rgb/{number:06d}.png", "category_id": category, "score": confidence}
+                records.append({**record, "bbox": [x, y, right - x, bottom - y]})
+    store.write_json(path, records)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("moved", "confidence", "category", "expected", "cars"),
+    [(0.0, 0.9, 2, 1.0, 1.0), (0.0, 0.5, 2, 0.0, 0.0), (8.0, 0.9, 2, 0.0, 0.0), (0.0, 0.9, 7, 1.0, 0.0)],
+)
+def test_nta_iou_from_a_file_of_boxes(
+    tmp_path: Path, log_scene: Path, moved: float, confidence: float, category: int, expected: float, cars: float
+) -> None:
+    scene = read_scene(log_scene)
+    views = written(scene, tmp_path / "right", toy_world.truth, (2.0,))
+    boxes = boxes_json(tmp_path / "boxes.json", scene, "right", moved, confidence, category)
+    out = score.run(dataclasses.replace(QUICK, detections=str(boxes)), log_scene, {"right": views, "other": views}, tmp_path / "score")
+    document = store.read_json(out / "metrics.json")
+    (row,) = (r for r in document["results"] if r["method"] == "right")
+    assert row["values"]["nta_iou"] == pytest.approx(expected)
+    assert row["nta"]["car_and_bus"] == pytest.approx(cars)
+    assert row["nta"]["truths"] >= 2
+    assert value(document, "other", "front_shift+2.0", "nta_iou") == score_tables.NO_DETECTIONS
+    assert anchors(document, "front_shift+2.0", "nta_iou")["recorded"] == pytest.approx(expected)
+    made = document["detections"]["nta_iou"]
+    assert made["fewest_points"] == 10 and made["file_sha256"] == store.sha256_file(boxes)
+    assert any("cut at the near plane" in rule for rule in document["rules"])
+
+
+def test_boxes_of_images_of_another_size_are_scaled(tmp_path: Path) -> None:
+    store.write_json(tmp_path / "boxes.json", {
+        "images": [{"id": 4, "file_name": "m/t/000001.jpg", "width": 960, "height": 320}],
+        "annotations": [{"image_id": 4, "category_id": 5, "bbox": [100, 10, 20, 30], "score": 0.7}],
+    })  # fmt: skip
+    ((name, (found,)),) = detections.read_detections(tmp_path / "boxes.json").items()
+    assert name == "m/t/000001"
+    assert found.box.tolist() == [50, 10, 60, 40]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"boxes": []}, "malformed"),
+        ([{"image_id": "a", "category_id": 2, "bbox": [1, 2, 3], "score": 1}], "record 0"),
+        ([{"image_id": "a", "category_id": 2, "bbox": [1, 2, -3, 4], "score": 1}], "impossible"),
+        ([{"image_id": "a", "category_id": 2, "bbox": [1, 2, 3, 4], "score": 7}], "impossible"),
+        ("boxes", "no list"),
+    ],
+)
+def test_malformed_boxes_are_refused(tmp_path: Path, content: object, said: str) -> None:
+    store.write_json(tmp_path / "boxes.json", content)
+    with pytest.raises(InputError, match=said):
+        detections.read_detections(tmp_path / "boxes.json")
+
+
+def test_detected_lanes_of_a_log_are_refused(tmp_path: Path, log_scene: Path) -> None:
+    views = written(read_scene(log_scene), tmp_path / "right", toy_world.truth, (2.0,))
+    (tmp_path / "lanes").mkdir()
+    with pytest.raises(InputError, match="no lane lines"):
+        score.run(dataclasses.replace(QUICK, lanes=str(tmp_path / "lanes")), log_scene, {"right": views}, tmp_path / "score")
+
+
+def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> None:
+    scene = read_scene(log_scene)
+    store.write_json(tmp_path / "boxes.json", [])
+    counting = detections.BoxDetections(scene, tmp_path / "boxes.json", as_published=False)
+    view = scene.frames_of("front")[0].view
+    assert [track.id for track in counting._tracks_at(view)] == ["car"]
+    counting._counts[scene.sweeps[0].id]["car"] = 9
+    assert counting._tracks_at(view) == []
+
+
+# ---- a generated city: exact truth ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("city") / "scene"
+    write_city(CityConfig(seed=2100101, n_frames=4, width=240, height=160, cameras=("front",)), root, test_every=0)
+    return root
+
+
+@pytest.fixture(scope="module")
+def city_run(city: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    folder, scene = tmp_path_factory.mktemp("scores"), read_scene(city)
+    world = CityWorld.from_source(scene.source)
+    methods = {
+        name: written(scene, folder / name, world.observation, (2.0,), change) for name, change in {"right": None, "gray": gray}.items()
+    }
+    path = trajectory.shifted(scene, "front", 2.0)
+    for name, masks in (("right", True), ("gray", False), ("truth", True)):
+        for number, view in enumerate(path.views):
+            lanes = detections.lane_scores.lane_truth(view, world.lane_lines())
+            target = folder / "lanes" / name / path.name / f"{number:06d}.png"
+            store.write_image(target, (lanes & masks).astype(np.uint8) * 255)
+    truth = score_truth.write_truth(city, [path], folder / "drawn")
+    config = dataclasses.replace(QUICK, lanes=str(folder / "lanes"))
+    out = score.run(config, city, methods, folder / "score", truth=truth)
+    drawn = score.run(QUICK, city, methods, folder / "score_drawn")
+    stored, again = (store.read_json(o / "metrics.json") for o in (out, drawn))
+    for name in ("agent_iou", "lane_iou", "lane_correlation", "warp_error", "lidar_abs_rel", "temporal_flickering"):
+        close = pytest.approx(value(again, "right", path.name, name), abs=2e-2)  # stored truth has 8 bits
+        assert value(stored, "right", path.name, name) == close, name
+    return out, stored
+
+
+def test_vehicles_and_lanes_of_a_city_have_ceilings(city_run: tuple[Path, dict]) -> None:
+    out, document = city_run
+    here = "front_shift+2.0"
+    for metric, least in (("agent_iou", 0.5), ("lane_iou", 0.6)):
+        beside = anchors(document, here, metric)
+        assert value(document, "right", here, metric) == pytest.approx(beside["truth"], abs=0.02)
+        assert beside["truth"] > least and beside["recorded"] > least
+        assert value(document, "gray", here, metric) < 0.05
+    assert value(document, "right", here, "lane_correlation") > 0.99
+    (row,) = (r for r in document["results"] if r["method"] == "right")
+    assert row["details"]["agents"] >= 4
+    assert 50 < row["details"]["lane_mean_of_classes"] < 100
+    text = (out / "metrics.md").read_text()
+    assert "agent IoU: true images" in text and "NTA-IoU" not in text.split("## ")[1]  # never under the published name
+
+
+def test_ntl_iou_from_masks(city_run: tuple[Path, dict]) -> None:
+    _, document = city_run
+    here = "front_shift+2.0"
+    assert value(document, "right", here, "ntl_iou") == 100
+    assert 45 < value(document, "gray", here, "ntl_iou") < 50
+    (row,) = (r for r in document["results"] if r["method"] == "gray")
+    assert row["ntl"]["lanes"] == 0 and 45 < row["ntl"]["against_detector"] < 50
+    assert anchors(document, here, "ntl_iou") == {"trajectory": here, "metric": "ntl_iou", "truth": 100.0}
+
+
+def test_a_missing_mask_is_named(city: Path, city_run: tuple[Path, dict]) -> None:
+    scene = read_scene(city)
+    lanes = detections.LaneDetections(scene, city_run[0].parent / "lanes")
+    views = trajectory.shifted(scene, "front", 2.0).views
+    images = detections.ViewImages("right/front_shift+2.0", (0, 9), views[:2])
+    with pytest.raises(InputError, match="000009"):
+        lanes.of(images)
+    assert lanes.of(dataclasses.replace(images, key="nobody")) == score_tables.NO_DETECTIONS
+
+
+def test_paint_is_where_the_image_is_bright(city: Path) -> None:
+    world = CityWorld.from_source(read_scene(city).source)
+    for view in world.frame_views("front")[:2]:
+        truth = world.render(view)
+        marking = world.markings(view, truth)
+        near = (truth.semantics == 0) & (truth.depth < 30)
+        on, off = truth.rgb[marking & near].mean(), truth.rgb[near & ~marking].mean()
+        assert marking.sum() > 300 and on > 1.5 * off  # measured 2.0
+        assert not (marking & (truth.semantics != 0)).any()
+
+
+# ---- neighbouring views --------------------------------------------------------------------------------------------------
+
+CAMERA = Camera("front", 24, 16, 20.0, 20.0, 12.0, 8.0)
+
+
+def wall_pair(number: int, rgb: torch.Tensor, object_at: float | None = None) -> Pair:
+    """A wall 10 m ahead of a camera that stands still; ``object_at``: left column of a vehicle of 4 columns, a metre in front of it."""
+    depth, ids = torch.full((1, 16, 24), 10.0), torch.zeros(16, 24, dtype=torch.int64)
+    instance = np.zeros((16, 24), np.int32)
+    if object_at is not None:
+        columns = slice(int(object_at), int(object_at) + 4)
+        depth[..., columns], ids[:, columns], instance[:, columns] = 9.0, 13, 5
+    view = View(CAMERA, np.eye(4), 0.1 * number)
+    return Pair(rgb, None, None, rgb, depth, None, ids, view=view, facts=ViewFacts(instance=instance))
+
+
+def test_temporal_flickering_by_hand() -> None:
+    metric = view_metrics.TemporalFlickering()
+    assert metric.value() is None
+    for tone in (0, 51, 0):
+        metric.add(metric.source(Pair(torch.full((3, 4, 4), tone / 255), *[None] * 6)))
+    assert metric.value() == pytest.approx((255 - 51) / 255)
+
+
+def test_warp_error_follows_vehicles_by_their_boxes() -> None:
+    """A vehicle of random colours moves by two columns: nothing changes where it is followed."""
+    noise = torch.rand(3, 16, 24, generator=torch.Generator().manual_seed(0))
+    car = torch.rand(3, 16, 4, generator=torch.Generator().manual_seed(1))
+
+    def frame(left: int) -> torch.Tensor:
+        made = noise.clone()
+        made[..., left : left + 4] = car
+        return made
+
+    step_m = 2 / 20 * 9.0
+    poses = np.stack([np.eye(4), np.eye(4)])
+    poses[1, 0, 3] = step_m
+    track = Track("car-005", "car", np.ones(3), np.array([0.0, 0.1]), poses)
+    metric = view_metrics.WarpError(view_metrics.ExactMotion([(5, track)]))
+    first, second = wall_pair(0, frame(8), 8), wall_pair(1, frame(10), 10)
+    metric.add(metric.source(first))
+    metric.add(metric.source(second))
+    assert metric.value() == pytest.approx(0.0, abs=1e-5)
+    motion = view_metrics.ExactMotion([(5, track)]).between(first, second)
+    # Kept: all of the vehicle, and the wall but for what the vehicle hid in either frame.
+    assert motion.same[:, 8:12].all() and not motion.same[:, 12:14].any()
+    assert int(motion.same.sum()) == 16 * (24 - 2)
+    darker = view_metrics.WarpError(view_metrics.ExactMotion([(5, track)]))
+    darker.add(wall_pair(0, frame(8) * 0.5 + 0.1, 8))
+    darker.add(wall_pair(1, frame(10) * 0.5 + 0.2, 10))
+    assert darker.value() == pytest.approx(0.1, abs=1e-5)
+
+
+def test_without_boxes_vehicles_do_not_count() -> None:
+    pairs = [wall_pair(n, torch.zeros(3, 16, 24), 8) for n in (0, 1)]
+    frames = [flicker.TrueFrame.of(p.view, p.truth_depth, p.truth_semantics) for p in pairs]
+    assert not flicker.pixel_motion(*frames).same[:, 8:12].any()
