@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from pretend_device import pretend_device
 
 from mudg import native
 from mudg.base import geometry
@@ -374,6 +375,26 @@ def test_inserting_replacing_and_colliding() -> None:
     (found,) = [c for c in collisions(plan) if set(c["ids"]) == {"car-1", "car-new1"}]
     assert found["overlap_m"] == pytest.approx(1.0, abs=0.02)  # 4 m long, 3 m apart
     assert torch.equal(made.table.labels["node"], made.table.labels["node"].sort().values)
+
+
+def test_edits_on_another_device_are_the_same() -> None:
+    text = """
+- move: {id: parked-1, along_m: 3, ground: false}
+- lane_change: {id: car-1, left_m: 1, start_s: 0.2, duration_s: 1.5, ground: false}
+- insert: {asset: {file: a}, id: new, near: {id: ego, ahead_m: 14, left_m: 3}}
+"""
+    asset = edited.asset_of(toy(DeformableNode), "car-1")
+    here = carried(toy(DeformableNode), text, lambda source: asset)
+    with pretend_device() as there:
+        model = toy(DeformableNode).to(there)
+        made = carried(model, text, lambda source: asset)
+        assert made.device == there
+        back = made.to(torch.device("cpu"))
+        other = edited.asset_of(model, "car-1")
+    assert all(torch.equal(other.columns[name], value) for name, value in asset.columns.items())
+    for name, value in here.table.columns.items():
+        assert torch.equal(back.table[name], value), name
+    assert torch.equal(picture(back), picture(here))
 
 
 @pytest.mark.parametrize(
