@@ -274,6 +274,15 @@ def test_a_parked_car_is_cut_out_of_the_background() -> None:
     rows = moved.table.labels["node"] == 2
     assert moved.dynamic_object("parked-1").pose_matrix(0.5)[0, 3] == pytest.approx(15.0)
     assert int(rows.sum()) > 40  # with its contact shadow
+    world = world_of(model)
+    others = {"far": Actor("car", SIZE, straight(0.0, 2.0, start=90.0)), "way": Actor("car", SIZE, straight(9.0))}
+    hidden = EditWorld({**world.actors, **others}, world.ego)
+    for name in ("far", "way"):  # the fit shows neither of them
+        plan = plan_edits(parse_edits(f"- remove: {{ids: [{name}]}}", "e"), hidden, lambda source: None)
+        assert torch.equal(picture(edited_model(model, plan)), picture(model))
+        plan = plan_edits(parse_edits(f"- move: {{id: {name}, along_m: 1, ground: false}}", "e"), hidden, lambda source: None)
+        with pytest.raises(UsageError, match=name):
+            edited_model(model, plan)
     empty = Track("nobody", "car", np.array(SIZE), parked().times_s, parked().world_from_object @ geometry.yaw_matrix(0, (0, 0, 50)))
     with pytest.raises(UsageError, match="nothing of the fitted background"):
         edited.cut_out(model, empty)

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from mudg.base import geometry, store
-from mudg.base.errors import InputError
+from mudg.base import geometry, log, store
+from mudg.base.errors import InputError, UsageError
 from mudg.base.types import EgoPath, FusedCloud, PointCloud, Scene, Track, View
 from mudg.core.edit import Motion
 from mudg.core.ground import HeightMap
@@ -39,10 +39,8 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
         sky: panorama of the plan's ``sky``.
     """
     for name in sorted({*plan.changes, *plan.removed} - set(model.node_names())):
-        model = edited.cut_out(model, _track(name, plan.before.actors[name]))
-        if name not in plan.removed:
-            model = edited.with_shadow(model, name, CUT_SHADOW)
-    model = model.without_nodes(plan.removed)
+        model = _cut_out(model, name, plan)
+    model = model.without_nodes([name for name in plan.removed if name in model.node_names()])
     kept = {node.name: node for node in model.nodes if isinstance(node, RigidNode)}
     model = edited.with_motions(model, {name: plan.changed(name, edited.motion_of(kept[name])) for name in plan.changes})
     for name, insertion in plan.inserted.items():
@@ -55,6 +53,26 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
         model = replace(model, sky=panorama(sky, plan.sky.yaw_deg, model))
     model.sort_rows()
     return model
+
+
+def _cut_out(model: SceneModel, name: str, plan: EditPlan) -> SceneModel:
+    """A copy with an object of its own for what stands in a box; unchanged where the fit shows nothing that is to be removed.
+
+    Raises:
+        UsageError: an object that is to be moved does not show in the fit.
+    """
+    actor = plan.before.actors[name]
+    try:
+        if actor.moves:
+            raise UsageError("this object has no Gaussians of its own in the fit: the recording hardly saw it", where=f"track {name!r}",
+                remedy="leave it out of the script")  # fmt: skip
+        cut = edited.cut_out(model, _track(name, actor))
+    except UsageError as problem:
+        if name not in plan.removed:
+            raise
+        log.info(f"edit: {name} is not in the fit: {problem.what}")
+        return model
+    return cut if name in plan.removed else edited.with_shadow(cut, name, CUT_SHADOW)
 
 
 def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
@@ -77,7 +95,8 @@ def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
 def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
     """Fused clouds with a plan carried out; moved objects need no other points, for these lie in the frame of their box."""
     static, objects = cloud.static, dict(cloud.objects)
-    for name in sorted({*plan.changes, *plan.removed} - set(objects)):
+    standing = {name for name in (*plan.changes, *plan.removed) if not plan.before.actors[name].moves}
+    for name in sorted(standing - set(objects)):
         static, objects[name] = _cut_points(static, _track(name, plan.before.actors[name]))
     objects = {name: points for name, points in objects.items() if name not in plan.removed}
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
