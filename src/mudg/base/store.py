@@ -300,7 +300,7 @@ def write_safetensors(
         tempfile.TemporaryDirectory(prefix=f".{path.stem}.", suffix=".part", dir=path.parent) as own,
     ):  # the library writes beside its target, under a name of its own
         try:
-            save_file(arrays, Path(own) / path.name, None if metadata is None else dict(metadata))
+            save_file(arrays, Path(own) / path.name, **({} if metadata is None else {"metadata": dict(metadata)}))
         except SafetensorError as error:  # what it makes of a full disk
             raise OSError(str(error)) from error
         (Path(own) / path.name).replace(temporary)
