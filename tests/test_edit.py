@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,8 @@ from mudg.core.table import Table
 from mudg.data.city import CityConfig, CityWorld
 from mudg.data.edits import parse_edits, read_edits
 from mudg.models.scene import edited
+from mudg.models.scene.bezier import BezierNode
+from mudg.models.scene.deformed import DeformedNode
 from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import CERTAINTY, SceneModel, compose
 from mudg.models.scene.nodes import DeformableNode, RigidNode, StaticNode
@@ -298,6 +301,33 @@ def test_a_walking_person_shows_the_moments_of_its_path() -> None:
     assert torch.allclose(made.displacement(at, 1.0), node.displacement(at, 0.5), atol=1e-6)
     still = carried(model, "- stop: {id: car-1, at_s: 0.3, brake_m_s2: 10}").dynamic_object("car-1")
     assert torch.equal(still.displacement(at, 1.5), still.displacement(at, 2.0))
+
+
+def test_an_asset_keeps_the_shape_of_the_middle_of_its_track() -> None:
+    model = toy(DeformableNode)
+    node = model.dynamic_object("car-1")
+    with torch.no_grad():
+        node.offsets["deform"].copy_(torch.arange(21.0).view(21, 1, 1, 1, 1).expand_as(node.offsets["deform"]) * 0.01)
+    rows = model.table["means"].detach()[640:]
+    asset = edited.asset_of(model, "car-1")
+    middle = float(node.times_s[10])
+    assert torch.allclose(asset.columns["means"], rows + node.displacement(rows, middle), atol=1e-5)
+    again = edited.with_asset(model.without_nodes(["car-1"]), asset, "car-1", edited.motion_of(node))
+    assert (picture(again, middle) - picture(model, middle)).abs().max() < 1e-4
+
+
+def test_objects_of_other_methods_are_edited_or_refused() -> None:
+    curved = toy(BezierNode)
+    curved = replace(curved, table=Table({**{k: v.detach() for k, v in curved.table.columns.items()}, "curve": torch.zeros(690, 4, 3)},
+                                         curved.table.labels))  # fmt: skip
+    with pytest.raises(InputError, match="curves"):
+        carried(curved, "- stop: {id: car-1, at_s: 0.5}")
+    assert carried(curved, "- remove: {ids: [car-1]}").node_names() == ()
+    asset = edited.asset_of(curved, "car-1")
+    assert len(carried(curved, "- replace: {id: car-1, by: {file: a}}", lambda source: asset).table) == 690
+    deformed = toy(DeformedNode)
+    deformed.dynamic_object("car-1").instance = 3
+    assert carried(deformed, "- stop: {id: car-1, at_s: 0.5}").dynamic_object("car-1").instance == 3
 
 
 def test_an_asset_goes_through_its_file_and_renders_as_the_object_did(tmp_path: Path) -> None:

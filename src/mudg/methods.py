@@ -34,6 +34,10 @@ _STREET: Final = ("color", "semantics", "lidar", "sky")
 METHODS: Final[dict[str, Method]] = {
     "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics")),
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
+    "pvg": Method("PVG, our sky model", "render", ("static", "sky"), _STREET),
+    "s3gaussian": Method("S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar")),
+    "bezier": Method("BezierGS", "render", ("static", "objects", "sky"), _STREET),
+    "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET),
     "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance"),
     "mudg_r": Method("Diffusion output", "synthesize"),
     "freevs": Method("FreeVS condition, our network", "synthesize"),

@@ -143,6 +143,35 @@ def dense_depth_map(depth_m: Tensor, target_m: Tensor, delta: float = 0.1) -> Te
     return F.huber_loss(difference, torch.zeros_like(difference), reduction="none", delta=delta) / delta
 
 
+def sparse_squared_depth(depth_m: Tensor, pixel: Tensor, target_m: Tensor, span_m: float) -> Tensor:
+    """Mean squared difference of depths over ``span_m``, over sparse LiDAR pixels that are at most that far (S3Gaussian)."""
+    near = (target_m > 0.01) & (target_m < span_m)
+    return weighted_mean(((depth_m.reshape(-1)[pixel] - target_m) / span_m).square(), near)
+
+
+def inverse_depth(depth_m: Tensor, alpha: Tensor, sky_m: float) -> Tensor:
+    """Inverse depth of a pixel that is partly sky, in 1/m: ``alpha / depth + (1 - alpha) / sky_m`` (Periodic Vibration Gaussians).
+
+    Args:
+        depth_m: expected depth of what covers the pixel, any shape. alpha: the same shape, in [0, 1].
+    """
+    return alpha / depth_m.clamp_min(1e-2) + (1 - alpha) / sky_m
+
+
+def sparse_inverse_depth(inverse: Tensor, pixel: Tensor, target_m: Tensor) -> Tensor:
+    """Mean of |1 / target - inverse| over sparse LiDAR pixels, 1/m; ``pixel`` and ``target_m`` as in ``sparse_depth``."""
+    return (1 / target_m - inverse.reshape(-1)[pixel]).abs().mean()
+
+
+def edge_aware(values: Tensor, rgb: Tensor) -> Tensor:
+    """Mean absolute difference of neighbouring ``values`` ``[1, H, W]``, less where the image ``[3, H, W]`` has an edge."""
+    total = values.new_zeros(())
+    for dim in (1, 2):
+        edge = torch.diff(rgb, dim=dim).abs().mean(0, keepdim=True)
+        total = total + (torch.diff(values, dim=dim).abs() * torch.exp(-edge)).mean()
+    return total
+
+
 # ---- sky, semantics, objects -------------------------------------------------------------------------------------
 
 
@@ -155,6 +184,17 @@ def sky_map(alpha: Tensor, sky: Tensor, floor: float = 1e-3) -> Tensor:
     _same_shape(alpha, sky, "sky_map")
     opaque = alpha.clamp(floor, 1 - floor)
     return -torch.log(torch.where(sky, 1 - opaque, opaque))
+
+
+def empty_sky(alpha: Tensor, sky: Tensor, floor: float = 1e-3) -> Tensor:
+    """Mean over all pixels of ``-log(1 - alpha)`` where ``sky`` (bool), 0 elsewhere; ``[1, H, W]`` each."""
+    _same_shape(alpha, sky, "empty_sky")
+    return torch.where(sky, -torch.log(1 - alpha.clamp(max=1 - floor)), 0.0).mean()
+
+
+def opacity_entropy(alpha: Tensor, floor: float = 1e-3) -> Tensor:
+    """Mean of ``-alpha log alpha``: a pixel is covered, or it is not."""
+    return -(alpha * torch.log(alpha.clamp_min(floor))).mean()
 
 
 def semantic_map(logits: Tensor, target: Tensor) -> Tensor:

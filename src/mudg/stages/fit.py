@@ -62,10 +62,11 @@ from mudg.stages.fitting.kept import chosen_ahead, keep, recorded_bytes, scratch
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
 from mudg.stages.fitting.poses import refine_poses
+from mudg.stages.fitting.recipe import DrawnView
+from mudg.stages.fitting.recipes import recipe_of
 from mudg.stages.fitting.rendering import NEAR_M as NEAR_M
 from mudg.stages.fitting.rendering import render_view as render_view
 from mudg.stages.fitting.schedule import appearance_rates, densify_schedule, learning_rates, pose_round_due
-from mudg.stages.fitting.start import start_model
 from mudg.stages.fitting.storage import load_model as load_model
 from mudg.stages.fitting.storage import save_appearance, save_model
 from mudg.stages.fitting.trust import unseen_maps, unseen_rows
@@ -122,6 +123,7 @@ def run(
         return _run_radiance(config, Path(scene), out, start, overwrite)
     if fused is None:
         raise UsageError(f"{config.method} needs fused clouds", remedy="run `mudg fuse` and give its folder as --fused")
+    recipe_of(config.method).check(config, start is not None)
     learns_virtual = "virtual" in METHODS[config.method].supervision
     folders = (observations,) if isinstance(observations, Path) else tuple(map(Path, observations or ()))
     named = {"observations" + f" {n}" * (n > 0): folder for n, folder in enumerate(folders)}
@@ -216,7 +218,7 @@ class FitInputs:
 
 def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene, fused, start = read_scene(given.scene), read_fused(given.fused), given.start
+    scene, fused, start = recipe_of(config.method).scene(read_scene(given.scene)), read_fused(given.fused), given.start
     frames, invented = training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
     needed = recorded_bytes(frames, config.width_px) + virtual_bytes(given.virtual)
     scratch = scratch_folder(len(frames) + invented, needed, out)
@@ -252,7 +254,7 @@ def recorded_views(
 
 def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]) -> FitState:
     """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
-    model = start_model(scene, cloud, views.recorded, classes, config)
+    model = recipe_of(config.method).start(scene, cloud, views.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
     stats = DensifyStats.zeros(len(model.table))
     return FitState(model, views, stats, densify_schedule(config), 0, appearance=_nothing_corrected(config, views))
@@ -363,22 +365,28 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Rende
     Returns:
         The picture, and the weighted loss terms.
     """
-    config, step, raster = how.config, how.step, how.raster
+    config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
     recorded = view.kind == "recorded"
+    model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
     feeds_densify = recorded or config.virtual.densify
     growing = feeds_densify and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
     with_classes = not recorded or step % config.loss.semantic_every == 0
-    gaussians = compose(state.model, view.view.time_s, with_classes)
+    gaussians = compose(model, view.view.time_s, with_classes)
     pose = state.appearance.world_from_cam(view.view, view.name) if recorded else None
     render = rasterize(gaussians, view.view, raster, absgrad=growing, world_from_cam=pose)
-    terms = recorded_terms(state, render, view, config) if recorded else virtual_terms(state, render, view, config, how.perception)
+    if recorded:
+        terms = recorded_terms(state, render, view, recipe.common(config))
+        terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))
+    else:
+        terms = virtual_terms(state, render, view, config, how.perception)
     terms |= (regularisers(gaussians, config) if how.first else {}) | correction_terms(state, gaussians, view, config, raster, step)
     how.check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
     how.check.gradients(view.name, state.model, state.appearance)
     if growing:
         camera = view.view.camera
-        state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0])
+        timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None
+        state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0], timed)
     return render, terms
 
 

@@ -26,6 +26,7 @@ from mudg.core.quaternions import rotate
 from mudg.core.table import Table
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
+from mudg.models.scene.vibration import SHORT_BETA, born_later
 
 SPLIT_SHRINK = 1.6
 """Both halves of a split Gaussian are this much smaller (published value)."""
@@ -46,6 +47,8 @@ class DensifySettings:
         prune_scale_m: rows larger are removed (static rows only beyond ``start``).
         box_margin: object rows outside this many half-sizes of their box are removed.
         reset_every: steps between opacity resets, 0 = never. reset_opacity: the value opacities are pulled down to.
+        time_gradient: threshold on the mean gradient of ``tau``, for Gaussians that have one (``vibration.py``).
+        late: step from which their splits give three children with shorter lives, not two.
     """
 
     start: int
@@ -61,6 +64,8 @@ class DensifySettings:
     box_margin: float = 1.25
     reset_every: int = 0
     reset_opacity: float = 0.01
+    time_gradient: float = 2e-3
+    late: int = 0
 
     def due(self, step: int) -> bool:
         """Whether to densify after step ``step`` (from 1)."""
@@ -73,10 +78,12 @@ class DensifySettings:
 
 @dataclass
 class DensifyStats:
-    """What was seen of each row since the last densification: ``gradient`` f32[N] (sum), ``seen`` f32[N] (views)."""
+    """What was seen of each row since the last densification: ``gradient`` f32[N] (sum), ``seen`` f32[N] (views); ``time`` f32[N], the
+    sum of the gradient of ``tau``, where Gaussians have one."""
 
     gradient: Tensor
     seen: Tensor
+    time: Tensor | None = None
 
     @classmethod
     def zeros(cls, rows: int, device: torch.device | None = None) -> DensifyStats:
@@ -85,15 +92,18 @@ class DensifyStats:
 
     def to(self, device: torch.device) -> DensifyStats:
         """The same statistics on a device."""
-        return DensifyStats(self.gradient.to(device), self.seen.to(device))
+        return DensifyStats(self.gradient.to(device), self.seen.to(device), None if self.time is None else self.time.to(device))
 
-    def observe(self, trace: RasterTrace, width: int, height: int, plain_from: int | None = None) -> None:
+    def observe(
+        self, trace: RasterTrace, width: int, height: int, plain_from: int | None = None, time_gradient: Tensor | None = None
+    ) -> None:
         """Add one backward pass (gradients in pixels; stored in units of half the image).
 
         Args:
             trace: of a render with absolute gradients, after backward.
             plain_from: rows from here on (those of the objects) count with their plain gradient, where the contributions
                 of single pixels cancel; None = all rows with the absolute one.
+            time_gradient: f32[N], that of ``tau``, or None.
         """
         if trace.abs_grad2d is None:
             raise ValueError("the render was made without absolute gradients")
@@ -105,15 +115,18 @@ class DensifyStats:
         length = torch.view_as_complex(gradient * half_size).abs()  # far faster than a norm over rows of two
         self.gradient += length * visible
         self.seen += visible
+        if time_gradient is not None:
+            before = torch.zeros_like(self.gradient) if self.time is None else self.time
+            self.time = before + time_gradient.abs() * visible
 
     def state(self) -> dict[str, Tensor]:
         """For a checkpoint."""
-        return {"gradient": self.gradient, "seen": self.seen}
+        return {"gradient": self.gradient, "seen": self.seen, **({} if self.time is None else {"time": self.time})}
 
     @classmethod
     def from_state(cls, tensors: Mapping[str, Tensor]) -> DensifyStats:
         """Inverse of ``state``."""
-        return cls(tensors["gradient"].clone(), tensors["seen"].clone())
+        return cls(tensors["gradient"].clone(), tensors["seen"].clone(), tensors["time"].clone() if "time" in tensors else None)
 
 
 @functools.lru_cache(maxsize=64)
@@ -132,12 +145,15 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
         Counts: ``cloned``, ``split``, ``pruned``, ``rows`` (after).
     """
     grow = _rows_to_grow(model, stats, settings)
-    largest = model.table["log_scales"].detach().amax(1).exp()
-    split_rows = (grow & (largest > settings.split_above_m)).nonzero()[:, 0]
-    clone_rows = (grow & (largest <= settings.split_above_m)).nonzero()[:, 0]
+    large = model.table["log_scales"].detach().amax(1).exp() > settings.split_above_m
+    if stats.time is not None:
+        hurried = stats.time / stats.seen.clamp_min(1) >= settings.time_gradient
+        large |= hurried & (model.table["log_beta"].detach().exp() > SHORT_BETA)
+    split_rows = (grow & large).nonzero()[:, 0]
+    clone_rows = (grow & ~large).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool, device=model.device)
     keep[split_rows] = False
-    for columns, labels in (copied_rows(model.table, clone_rows), *_halves(model, split_rows, step, run_seed)):
+    for columns, labels in (copied_rows(model.table, clone_rows), *_halves(model, split_rows, step, run_seed, settings)):
         model.table.append(columns, labels)
     keep = torch.cat([keep, keep.new_ones(len(model.table) - len(keep))])
     doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
@@ -168,8 +184,10 @@ def shorten_needles(table: Table, longest_to_middle: float) -> None:
 def _rows_to_grow(model: SceneModel, stats: DensifyStats, settings: DensifySettings) -> Tensor:
     """Bool[N]: rows over their threshold, the strongest first where the budget is short."""
     mean = stats.gradient / stats.seen.clamp_min(1)
-    static = torch.tensor([node.kind == "static" for node in model.nodes]).to(model.device)[model.table.labels["node"].long()]
+    static = torch.tensor([not isinstance(node, RigidNode) for node in model.nodes]).to(model.device)[model.table.labels["node"].long()]
     relative = mean / torch.where(static, settings.static_gradient, settings.object_gradient)
+    if stats.time is not None:
+        relative = torch.maximum(relative, stats.time / stats.seen.clamp_min(1) / settings.time_gradient)
     wanted = relative > 1
     budget = min(settings.max_rows - len(model.table), int(settings.growth * len(model.table)))
     if budget <= 0:
@@ -187,16 +205,23 @@ def copied_rows(table: Table, rows: Tensor) -> tuple[dict[str, Tensor], dict[str
     return columns, {name: value[rows] for name, value in table.labels.items()}
 
 
-def _halves(model: SceneModel, rows: Tensor, step: int, run_seed: int) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
-    """Two smaller Gaussians drawn from each split one (centres sampled from its own density)."""
-    halves = []
-    for half in (0, 1):
+def _halves(
+    model: SceneModel, rows: Tensor, step: int, run_seed: int, settings: DensifySettings
+) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
+    """Two smaller Gaussians drawn from each split one (centres sampled from its own density, times of those that have a life span
+    too; of these three, late)."""
+    halves, timed = [], "tau" in model.table.columns
+    late = timed and 0 < settings.late <= step
+    for half in range(3 if late else 2):
         columns, labels = copied_rows(model.table, rows)
         generator = seeds.torch_generator(run_seed, step, f"split half {half}")
         noise = torch.randn(len(rows), 3, generator=generator).to(rows.device)  # drawn on the CPU: the same on every device
         local = torch.exp(columns["log_scales"]) * noise
         columns["means"] = columns["means"] + rotate(columns["quats"], local)
         columns["log_scales"] = columns["log_scales"] - torch.log(torch.tensor(SPLIT_SHRINK))
+        if timed:
+            drawn = torch.randn(len(rows), generator=seeds.torch_generator(run_seed, step, f"split time {half}"))
+            columns = born_later(columns, drawn.to(rows.device), late)
         halves.append((columns, labels))
     return halves
 

@@ -21,9 +21,11 @@ from mudg.base.types import Track
 from mudg.core.edit import Motion
 from mudg.core.quaternions import left_product_matrix
 from mudg.core.table import Table
+from mudg.models.scene.bezier import BezierNode
+from mudg.models.scene.deformed import DeformedNode
 from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import CERTAINTY, COLUMNS, SceneModel
-from mudg.models.scene.nodes import DeformableNode, RigidNode
+from mudg.models.scene.nodes import NodeRows, RigidNode
 
 GROUND_CLASSES: Final = tuple(ID[name] for name in ("road", "sidewalk", "terrain"))
 CUT_MARGIN_M: Final = 0.1
@@ -48,12 +50,23 @@ def motion_of(node: RigidNode) -> Motion:
 
 
 def node_along(node: RigidNode, motion: Motion) -> RigidNode:
-    """The same object on another path; what its rows do inside the box is that of the moments that the path shows."""
+    """The same object on another path; what its rows do inside the box is that of the moments that the path shows (a ``DeformedNode``:
+    of the time itself).
+
+    Raises:
+        InputError: an object on curves, whose Gaussians have places along the recorded path.
+    """
+    if isinstance(node, BezierNode):
+        raise InputError("an object that was fitted on curves cannot take another path", got=node.name,
+            remedy="remove or replace it, or use a fit with boxes (mudg_s, street_gaussians)")  # fmt: skip
     shown = np.interp(motion.source_s, node.times_s, np.arange(len(node.times_s), dtype=np.float64))
     columns = {name: _at_keys(node.offsets[name].detach(), shown) for name in node.offsets.columns if name not in ("shift", "yaw")}
     zero = torch.zeros(len(shown), device=node.offsets.device)
     offsets = Table({"shift": zero[:, None].repeat(1, 3), "yaw": zero, **columns})
-    return type(node)(node.name, node.label, node.size_m, motion.times_s, motion.poses, offsets, node.learn_pose)
+    made = type(node)(node.name, node.label, node.size_m, motion.times_s, motion.poses, offsets, node.learn_pose)
+    if isinstance(made, DeformedNode) and isinstance(node, DeformedNode):
+        made.instance, made.field = node.instance, node.field
+    return made
 
 
 def _at_keys(values: Tensor, shown: NDArray[np.float64]) -> Tensor:
@@ -112,8 +125,11 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
         track: a box that stands; its middle pose counts.
 
     Raises:
-        UsageError: nothing of the background lies in the box.
+        UsageError: nothing of the background lies in the box, or the background changes with time.
     """
+    if model.nodes[0].kind != "static":
+        raise UsageError("nothing can be cut out of a background that changes with time", where=f"track {track.id!r}",
+            expected="a fit of mudg_s or street_gaussians", got=f"a background of kind {model.nodes[0].kind}")  # fmt: skip
     pose = track.world_from_object[len(track.times_s) // 2]
     table = model.table
     local = geometry.transform_points(geometry.invert(pose), table["means"].detach().cpu().numpy().astype(np.float64))
@@ -180,10 +196,8 @@ def asset_of(model: SceneModel, name: str, seen_rad: Sequence[float] = (), origi
     index = model.nodes.index(node)
     rows = (model.table.labels["node"] == index).nonzero()[:, 0]
     columns = {key: model.table[key].detach()[rows].cpu() for key in ("means", "quats", "log_scales", "logits", "sh_dc")}
-    if isinstance(node, DeformableNode):
-        with torch.no_grad():
-            shift = node.displacement(model.table["means"].detach()[rows], float(node.times_s[len(node.times_s) // 2]))
-        columns["means"] = columns["means"] + shift.cpu()
+    if type(node) is not RigidNode:
+        columns |= _shape_at_middle(model, node, rows)
     road, known = road_color(model), model.certainty
     size = (node.size_m[0], node.size_m[1], node.size_m[2])
     return Asset(
@@ -191,6 +205,22 @@ def asset_of(model: SceneModel, name: str, seen_rad: Sequence[float] = (), origi
         node.label, size, None if road is None else (float(road[0]), float(road[1]), float(road[2])),
         tuple(float(a) for a in seen_rad), origin or f"{model.facts.get('scene', 'a scene')}: {name}",
     )  # fmt: skip
+
+
+@torch.no_grad()
+def _shape_at_middle(model: SceneModel, node: RigidNode, rows: Tensor) -> dict[str, Tensor]:
+    """Places and rotations of an object's Gaussians in the middle of its track, in the frame of its box, on the CPU."""
+    own = {name: value.detach()[rows] for name, value in model.table.columns.items()}
+    time_s = float(node.times_s[len(node.times_s) // 2])
+    given = NodeRows(own["means"], own["quats"], torch.sigmoid(own["logits"]), own["sh_dc"],
+                     {name: value for name, value in own.items() if name not in COLUMNS})  # fmt: skip
+    now, pose = node.at_time(given, time_s), node.pose_matrix(time_s)
+    if now is None or pose is None:
+        return {}
+    box_from_world = geometry.invert(pose)
+    means = geometry.transform_points(box_from_world, now.means.cpu().numpy())
+    turn = torch.from_numpy(geometry.quaternion_from_matrix(box_from_world)).float()
+    return {"means": torch.from_numpy(means), "quats": now.quats.cpu() @ left_product_matrix(turn).T}
 
 
 def matched_light(asset: Asset, model: SceneModel) -> tuple[Asset, NDArray[np.float64]]:
@@ -223,7 +253,7 @@ def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label
     """A copy with an object more, on a path.
 
     Raises:
-        UsageError: the scene has an object of that name. InputError: the scene's Gaussians have columns that no asset has.
+        UsageError: the scene has an object of that name.
     """
     if name in model.node_names():
         raise UsageError("there is an object of this name already", got=name, remedy="give the inserted object another id")
@@ -235,11 +265,8 @@ def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label
             channels[torch.from_numpy(asset.class_ids == train_id), channel] = -ABSENT_LOGIT
         columns["semantics"] = channels
     for column in table.columns:
-        if column == "sh_rest":
+        if column not in columns:  # harmonics of the view's direction, and what other kinds of node know
             columns[column] = torch.zeros(count, *table[column].shape[1:])
-        elif column not in columns:
-            kind = "a column" if column in COLUMNS else "a column of another kind of scene"
-            raise InputError(f"an object cannot be put into this scene: its Gaussians have {kind} that no asset has", got=column)
     labels = {"node": torch.full((count,), len(model.nodes), dtype=torch.int32)}
     for key, value in table.labels.items():
         if key == CERTAINTY:

@@ -12,6 +12,8 @@ Columns of the table (raw, unactivated):
     sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0)
     semantics [N, C]  class logits of the classes in ``SceneModel.classes``
 
+and those that a kind of node needs (``vibration.py``, ...), which its ``at_time`` gets as ``NodeRows.own``.
+
 Label columns: ``node`` i32[N], the index into ``SceneModel.nodes``; of a finished fit also ``certainty`` (``SceneModel.certainty``).
 """
 
@@ -32,10 +34,18 @@ from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
 from mudg.core import native_ops
 from mudg.core.table import Table
+from mudg.models.scene.bezier import BezierNode
+from mudg.models.scene.deformed import DeformationField, DeformedNode
+from mudg.models.scene.hexplane import HexPlaneNode
 from mudg.models.scene.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
+from mudg.models.scene.vibration import VibrationNode
 
-NODES: Final[dict[str, Any]] = {"static": StaticNode, "rigid": RigidNode, "deformable": DeformableNode, "sky": SkyNode}
+NODES: Final[dict[str, Any]] = {
+    "static": StaticNode, "rigid": RigidNode, "deformable": DeformableNode, "sky": SkyNode, "vibration": VibrationNode,
+    "deformed": DeformedNode, "deformation": DeformationField, "hexplane": HexPlaneNode,
+    "bezier": BezierNode,
+}  # fmt: skip
 COLUMNS: Final = frozenset({"means", "quats", "log_scales", "logits", "sh_dc", "sh_rest", "semantics"})
 """Columns that every scene may have; others belong to a kind of node (``NodeRows.own``)."""
 CERTAINTY: Final = "certainty"
@@ -66,6 +76,9 @@ class SceneModel:
     facts: dict[str, Any] = field(default_factory=dict)
     colors: CameraColors = SAME_COLORS
     _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self.nodes = tuple(node.linked(self.nodes) for node in self.nodes)
 
     @property
     def device(self) -> torch.device:
@@ -102,7 +115,7 @@ class SceneModel:
 
     def node_names(self) -> tuple[str, ...]:
         """Names of the dynamic objects."""
-        return tuple(node.name for node in self.nodes if node.kind != "static")
+        return tuple(node.name for node in self.nodes if isinstance(node, RigidNode))
 
     def dynamic_object(self, name: str) -> RigidNode:
         """The node of a dynamic object.
@@ -124,7 +137,7 @@ class SceneModel:
             UsageError: an object that the scene has no node for.
         """
         gone = {self.dynamic_object(name).name for name in names}
-        kept = [index for index, node in enumerate(self.nodes) if node.name not in gone or node.kind == "static"]
+        kept = [index for index, node in enumerate(self.nodes) if node.name not in gone or not isinstance(node, RigidNode)]
         renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
         owner = renumber.to(self.device)[self.table.labels["node"].long()]
@@ -132,6 +145,12 @@ class SceneModel:
         labels = {key: value[rows] for key, value in self.table.labels.items()} | {"node": owner[rows]}
         table = Table({key: value.detach()[rows] for key, value in self.table.columns.items()}, labels)
         return replace(self, table=table, nodes=tuple(self.nodes[i] for i in kept), facts=dict(self.facts))
+
+    def with_nodes(self, nodes: tuple[StaticNode | RigidNode, ...]) -> SceneModel:
+        """The same scene with other nodes for the same rows; it shares the table of Gaussians."""
+        other = replace(self, nodes=nodes)
+        other._counted = self._counted
+        return other
 
     def with_object_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:
         """A copy with one dynamic object displaced in its own frame by a rigid 4x4; it shares the table of Gaussians.

@@ -74,6 +74,10 @@ class StaticNode:
         """The node's own optimisable table beside the shared one, or None."""
         return None
 
+    def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
+        """The same node as part of a scene of these nodes, for kinds that use what another node learns."""
+        return self
+
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """What rebuilds the node: plain JSON values and tensors."""
         return {"name": self.name}, {}
@@ -254,6 +258,10 @@ class RigidNode:
     def parameters(self) -> Table | None:
         """None: offsets are not learnt by gradient steps but by ``stages/fitting/poses.py``, which weighs what each picture can tell."""
         return None
+
+    def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
+        """See ``StaticNode``."""
+        return self
 
     def after_step(self, share: float) -> None:
         """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning rate."""

@@ -48,6 +48,26 @@ class ObjectConfig:
     """Let pedestrians and cyclists change shape inside their boxes."""
     mirror_start: bool = True
     """Initialise vehicles with their points mirrored to the side that LiDAR did not measure."""
+    network_layers: int = Field(default=4, ge=1)
+    """omnire: hidden layers of the network that deforms pedestrians and cyclists (published: 8)."""
+    network_width: int = Field(default=64, ge=1)
+    """omnire: width of these layers (published: 256)."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class HexplaneConfig:
+    """s3gaussian: sizes of the field that moves Gaussians."""
+
+    features: int = Field(default=8, ge=1)
+    """Numbers per place of a plane (published: 32)."""
+    levels: int = Field(default=2, ge=1, le=6)
+    """Planes of `space`, 2, 4, ... times as many cells (published: 4 sizes)."""
+    space: int = Field(default=64, ge=2)
+    """Cells along x, y and z of the smallest planes."""
+    time: int = Field(default=25, ge=2)
+    """Cells along the time."""
+    width: int = Field(default=64, ge=1)
+    """Width of the networks."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -164,9 +184,9 @@ class FitConfig:
                          "virtual_seen_weight")),
     }  # fmt: skip
 
-    method: Literal["gs3d", "street_gaussians", "emernerf", "mudg_s"] = "mudg_s"
-    """gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. emernerf: a radiance field of static,
-    dynamic and flow parts, without boxes. mudg_s: as street_gaussians, also supervised by virtual views."""
+    method: Literal["gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "mudg_s"] = "mudg_s"
+    """gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, also supervised by
+    virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier: published methods for comparison (docs/baselines.md)."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
     """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
     to this number. With `--start-from`: further steps, the second half of a schedule of twice as many."""
@@ -193,6 +213,7 @@ class FitConfig:
     start: StartConfig = Field(default_factory=StartConfig)
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     objects: ObjectConfig = Field(default_factory=ObjectConfig)
+    hexplane: HexplaneConfig = Field(default_factory=HexplaneConfig)
     poses: PoseConfig = Field(default_factory=PoseConfig)
     appearance: AppearanceConfig = Field(default_factory=AppearanceConfig)
     loss: RecordedLossConfig = Field(default_factory=RecordedLossConfig)

@@ -14,6 +14,11 @@ from mudg.models.scene.mcmc import McmcSettings
 from mudg.stages.config import FitConfig
 
 PUBLISHED_STEPS = 30_000
+FIELD_STEPS = 55_000
+"""Published steps of the field of ``s3gaussian``, whose rates a shorter run raises in proportion, within bounds: the field starts from
+nothing, and has as far to go."""
+LAST_DENSIFIED = {"pvg": 0.5, "omnire": 0.5, "s3gaussian": 0.5}
+"""Share of the run after which a method no longer densifies; 0.6 for all others."""
 LAST_POSE_ROUND = 0.85
 
 
@@ -36,6 +41,15 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "semantics": 1e-2 * boost,
         "panorama": 1e-2 * gentle,
         "deform": 1e-3 * boost * gentle,
+        "network": 1e-3 * gentle,
+        "embeddings": 1e-3 * gentle,
+        "planes": min(2e-2, 1.6e-4 * FIELD_STEPS / iterations) * 0.1**along,
+        "plane_network": min(2e-3, 1.6e-5 * FIELD_STEPS / iterations) * 0.1**along,
+        "curve": 1.6e-3 * 10.0 * boost * decay,
+        "trajectory": 1.6e-5 * 10.0 * boost * decay,
+        "tau": 8e-4 * boost * decay,
+        "log_beta": 2e-3 * boost,
+        "velocity": 1e-3 * 10.0 * boost,
     }
 
 
@@ -59,10 +73,11 @@ def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None
         return None
     return DensifySettings(
         start,
-        int(0.6 * total),
+        stop := int(LAST_DENSIFIED.get(config.method, 0.6) * total),
         every,
         max_rows=config.densify.max_gaussians,
         reset_every=3000 if total >= 10_000 else 0,
+        late=stop // 2,
     )
 
 

@@ -87,7 +87,7 @@ def start_model(
             nodes.append(node)
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
     owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
-    sky = _painted_sky(views, fused.colors) if "sky" in kinds else None
+    sky = painted_sky(views, fused.colors) if "sky" in kinds else None
     static = len(blocks[0]["means"])
     log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
     return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors)
@@ -98,9 +98,9 @@ def _static_columns(
 ) -> Mapping[str, torch.Tensor]:
     cloud = fused.static
     centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
-    rows = _thinned(cloud.xyz, centers, config)
+    rows = thinned(cloud.xyz, centers, config)
     points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
-    filled = _fill_unreached(views, points.xyz, classes, config.start.far_m, fused.colors)
+    filled = fill_unreached(views, points.xyz, classes, config.start.far_m, fused.colors)
     return (points if filled is None else StartPoints.joined([points, filled])).columns(classes, config.sh_degree)
 
 
@@ -108,7 +108,7 @@ def _labels(cloud: PointCloud) -> NDArray[np.uint8]:
     return np.full(len(cloud), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics
 
 
-def _thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitConfig) -> NDArray[np.int64]:
+def thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitConfig) -> NDArray[np.int64]:
     """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera, at most the wanted number."""
     distance, _ = cKDTree(centers).query(xyz, k=1, workers=1)
     size = config.start.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
@@ -152,7 +152,7 @@ def _object_columns(
 # ---- beyond LiDAR ---------------------------------------------------------------------------------------------------
 
 
-def _fill_unreached(
+def fill_unreached(
     views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float, cameras: CameraColors
 ) -> StartPoints | None:
     """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
@@ -208,7 +208,7 @@ def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns
     return np.where(np.isfinite(depth), depth, np.minimum(padded[:, :-2], padded[:, 2:]))
 
 
-def _painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
+def painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
     """A sky that starts with the mean recorded colour per direction, in common colours."""
     sky = SkyNode.uniform(SKY_ROWS)
     sky.fill(_sky_pixels(views, cameras))

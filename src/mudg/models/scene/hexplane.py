@@ -1,0 +1,220 @@
+"""A world without boxes whose Gaussians are moved and recoloured by a field of place and time (S3Gaussian, Huang et al. 2024).
+
+The field lies in six planes (xy, xz, yz and xt, yt, zt) of several sizes. A Gaussian at x, y, z and the time t takes from each the
+bilinear value at its place; the six values are multiplied, those of the sizes joined. A linear layer and two small networks turn them
+into a displacement and a change of colour:
+
+    mean(t) = mean + dx(x, y, z, t)        colour(t) = colour + dc(x, y, z, t)
+
+Rows outside the box of the field keep still.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mudg.base import seeds
+from mudg.base.types import View
+from mudg.core.table import Table
+from mudg.models.scene.flat_network import FlatNetwork
+from mudg.models.scene.nodes import NodeRows, StaticNode
+
+PLANES: Final = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
+"""The two axes of each plane: x, y, z, t."""
+TIME: Final = 3
+FRUSTUM_MARGIN: Final = 1.3
+"""A Gaussian may be moved this much further than the edge of the image, as a share of half the image, plus `NEAR_MARGIN_M`."""
+NEAR_MARGIN_M: Final = 5.0
+
+
+@dataclass(frozen=True)
+class PlaneSizes:
+    """Sizes of the planes: ``features`` numbers per place, ``levels`` of 1, 2, 4, ... times ``space`` cells along x, y and z, ``time``
+    cells along t at every level; ``width`` of the networks."""
+
+    features: int
+    levels: int
+    space: int
+    time: int
+    width: int
+
+    def shapes(self) -> Iterator[tuple[int, tuple[int, int], tuple[int, int, int]]]:
+        """Level, axes and shape (features, second axis, first axis) of every plane, in the order in which their numbers lie."""
+        for level in range(self.levels):
+            for axes in PLANES:
+                second, first = (self.time if axis == TIME else self.space * 2**level for axis in axes[::-1])
+                yield level, axes, (self.features, second, first)
+
+
+class HexPlaneNode(StaticNode):
+    """The whole world as Gaussians that a field moves.
+
+    Its table: ``planes`` [1, P], all planes one after the other, and ``plane_network`` [1, Q].
+
+    Args:
+        low, high: corners of the field's box: x, y, z in metres, t in seconds.
+    """
+
+    kind = "hexplane"
+
+    def __init__(
+        self, name: str, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, learnt: Table
+    ) -> None:
+        super().__init__(name)
+        self.low, self.high = tuple(map(float, low)), tuple(map(float, high))
+        self.sizes, self.learnt, self.rests = sizes, learnt, False
+        self._view: View | None = None
+        inner = sizes.features * sizes.levels
+        self.networks = (
+            FlatNetwork((inner, sizes.width)),
+            FlatNetwork((sizes.width, sizes.width, 3), leading=True),
+            FlatNetwork((sizes.width, sizes.width, 3), leading=True),
+        )
+
+    @classmethod
+    def fresh(cls, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, run_seed: int) -> HexPlaneNode:
+        """A field that moves nothing yet: planes of space between 0.1 and 0.5, planes of time 1."""
+        generator = seeds.torch_generator(run_seed, 0, "hexplane")
+        planes = [
+            torch.ones(shape).flatten()
+            if TIME in axes
+            else torch.rand(shape, generator=generator).flatten() * 0.4 + 0.1
+            for _, axes, shape in sizes.shapes()
+        ]
+        node = cls("background", low, high, sizes, Table({"planes": torch.zeros(1, 1)}))
+        trunk, *heads = node.networks
+        network = [trunk.start(generator, silent=False), *(head.start(generator) for head in heads)]
+        node.learnt = Table({"planes": torch.cat(planes)[None], "plane_network": torch.cat(network, 1)})
+        return node
+
+    def resting(self) -> Self:
+        """The same world without the field."""
+        made = copy.copy(self)
+        made.rests = True
+        return made
+
+    def seen_by(self, view: View) -> Self:
+        """The same world for one view: the field is asked for Gaussians in and around its frustum only."""
+        made = copy.copy(self)
+        made._view = view
+        return made
+
+    def planes(self) -> Iterator[tuple[tuple[int, int], Tensor]]:
+        """Axes and numbers ``[features, second axis, first axis]`` of every plane, level by level."""
+        shapes = list(self.sizes.shapes())
+        parts = self.learnt["planes"][0].split(
+            [shape[0] * shape[1] * shape[2] for _, _, shape in shapes]
+        )  # one gradient for all
+        for (_, axes, shape), part in zip(shapes, parts):
+            yield axes, part.view(shape)
+
+    def features(self, places: Tensor) -> Tensor:
+        """What the planes say at places ``[n, 4]``, -1 to 1 along x, y, z, t: ``[n, features * levels]``."""
+        levels: list[Tensor] = []
+        for index, (axes, plane) in enumerate(self.planes()):
+            at = places[None, None, :, list(axes)]
+            value = F.grid_sample(plane[None], at, mode="bilinear", padding_mode="border", align_corners=True)[
+                0, :, 0
+            ].T
+            if index % len(PLANES):
+                levels[-1] = levels[-1] * value
+            else:
+                levels.append(value)
+        return torch.cat(levels, 1)
+
+    def changes(self, means: Tensor, time_s: float) -> tuple[Tensor, Tensor]:
+        """Displacement ``[n, 3]`` m and change of colour ``[n, 3]`` of Gaussians at ``means`` [n, 3] at a time."""
+        low, high = (means.new_tensor(corner) for corner in (self.low, self.high))
+        places = 2 * (torch.cat([means, means.new_full((len(means), 1), time_s)], 1) - low) / (high - low) - 1
+        flat, found, offset = self.learnt["plane_network"], [], 0
+        for network in self.networks:
+            found.append(flat[:, offset : offset + network.numbers])
+            offset += network.numbers
+        trunk, move, color = self.networks
+        hidden = trunk(found[0], self.features(places))
+        return move(found[1], hidden), color(found[2], hidden)
+
+    def asked(self, means: Tensor) -> Tensor:
+        """Rows i64[m] that the field may change: in its box, and near the frustum of the view if there is one."""
+        with torch.no_grad():
+            low, high = (means.new_tensor(corner[:3]) for corner in (self.low, self.high))
+            inside = ((means >= low) & (means <= high)).all(1)
+            if self._view is not None:
+                inside &= _near_frustum(self._view, means)
+            return inside.nonzero()[:, 0]
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """See ``StaticNode``."""
+        if self.rests:
+            return rows
+        asked = self.asked(rows.means)
+        moved, colored = self.changes(rows.means[asked], time_s)
+        return replace(
+            rows, means=rows.means.index_add(0, asked, moved), sh_dc=rows.sh_dc.index_add(0, asked, colored[:, None])
+        )
+
+    def parameters(self) -> Table:
+        """See ``StaticNode``."""
+        return self.learnt
+
+    def to(self, device: torch.device) -> Self:
+        """See ``StaticNode``."""
+        there = copy.copy(self)
+        there.learnt = self.learnt.to(device)
+        return there
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``StaticNode``."""
+        return {
+            "name": self.name,
+            "low": list(self.low),
+            "high": list(self.high),
+            **asdict(self.sizes),
+        }, self.learnt.state()
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HexPlaneNode:
+        """Inverse of ``state``."""
+        sizes = PlaneSizes(**{name: int(facts[name]) for name in PlaneSizes.__dataclass_fields__})
+        return cls(str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors))
+
+
+def _near_frustum(view: View, means: Tensor) -> Tensor:
+    """Bool[N]: in the view, or not far from it."""
+    camera, pose = view.camera, means.new_tensor(view.cam_from_world)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    ahead = z.clamp_min(0)
+    across = max(camera.cx, camera.width - camera.cx) / camera.fx * FRUSTUM_MARGIN
+    down = max(camera.cy, camera.height - camera.cy) / camera.fy * FRUSTUM_MARGIN
+    margin = NEAR_MARGIN_M
+    return (z > -margin) & (x.abs() < ahead * across + margin) & (y.abs() < ahead * down + margin)
+
+
+def moving_rows(displacement_m: Tensor) -> Tensor:
+    """Bool[N]: Gaussians whose largest displacement component ``[N, 3]`` is above the mean of all (published rule for display)."""
+    largest = displacement_m.detach().abs().amax(1)
+    return largest > largest.mean()
+
+
+def plane_smoothness(node: HexPlaneNode) -> tuple[Tensor, Tensor, Tensor]:
+    """Three scalars, sums over planes: mean squared second differences of the planes of space (both axes) and of time (along the time),
+    and the mean |1 - value| of the planes of time."""
+    space = time = flat = node.learnt["planes"].new_zeros(())
+    for axes, plane in node.planes():
+        if TIME in axes:
+            time = time + _bending(plane, 1)
+            flat = flat + (1 - plane).abs().mean()
+        else:
+            space = space + _bending(plane, 1) + _bending(plane, 2)
+    return space, time, flat
+
+
+def _bending(plane: Tensor, dim: int) -> Tensor:
+    return torch.diff(plane, n=2, dim=dim).square().mean()

@@ -1,0 +1,118 @@
+"""A world without boxes whose Gaussians swing about a point and show for a while (Periodic Vibration Gaussians, Chen et al. 2023).
+
+Every Gaussian has a peak time ``tau``, a life span ``beta`` and a velocity ``v``. At the time t, with the cycle l,
+
+    mean(t)    = mean + v sin(2 pi (t - tau) / l) l / (2 pi)
+    opacity(t) = opacity exp(-(t - tau)^2 / (2 beta^2)),   nothing where the factor is at most 0.05
+
+What stands still has a long life span and no velocity; what moves is either carried by its velocity or drawn by Gaussians that show
+one after the other. Times are counted in units of 50 frames (a frame is 0.02), 0 in the middle of the log, as published.
+
+Columns: ``tau`` [N], ``log_beta`` [N] (natural logarithm), ``velocity`` [N, 3] metres per unit of time.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from mudg.models.scene.nodes import NodeRows, StaticNode
+
+FRAME: Final = 0.02
+"""A frame in units of time."""
+CYCLE: Final = 0.2
+LEAST_FACTOR: Final = 0.05
+SHRINK: Final = 1.6
+"""The life span of children of a late split is this much shorter."""
+SHORT_BETA: Final = 0.01
+"""Life span above which a Gaussian is split in time, below which it is copied."""
+
+
+class VibrationNode(StaticNode):
+    """The whole world as vibrating Gaussians.
+
+    Args:
+        name: of the node.
+        middle_s: seconds; time 0. frame_s: seconds between frames.
+        early: difference D between the time that is drawn and the time whose state is drawn, in units of time; the state at t - D is
+            carried by D times the average velocity (temporal smoothing, while fitting).
+    """
+
+    kind = "vibration"
+
+    def __init__(self, name: str, middle_s: float, frame_s: float, early: float = 0.0) -> None:
+        super().__init__(name)
+        self.middle_s, self.frame_s, self.early = float(middle_s), float(frame_s), float(early)
+
+    @classmethod
+    def of_times(cls, times_s: Sequence[float], name: str = "background") -> VibrationNode:
+        """The node of a log with images at these times (repeats allowed)."""
+        times = sorted(set(times_s))
+        span = times[-1] - times[0]
+        return cls(name, (times[0] + times[-1]) / 2, span / (len(times) - 1) if span > 0 else 0.1)
+
+    def smoothed(self, early: float) -> VibrationNode:
+        """The same node drawing the state of ``early`` units of time before."""
+        other = copy.copy(self)
+        other.early = float(early)
+        return other
+
+    def time_of(self, time_s: float) -> float:
+        """Seconds to units of time."""
+        return (time_s - self.middle_s) / self.frame_s * FRAME
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """See ``StaticNode``."""
+        tau, beta, velocity = rows.own["tau"], rows.own["log_beta"].exp(), rows.own["velocity"]
+        since = self.time_of(time_s) - self.early - tau
+        factor = torch.exp(-(since**2) / (2 * beta**2))
+        swing = torch.sin(since * (2 * math.pi / CYCLE)) * (CYCLE / (2 * math.pi))
+        means = rows.means + velocity * swing[:, None]
+        if self.early:
+            means = means + average_velocity(velocity, beta) * self.early
+        return replace(rows, means=means, opacity=rows.opacity * factor * (factor > LEAST_FACTOR))
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``StaticNode``."""
+        return {"name": self.name, "middle_s": self.middle_s, "frame_s": self.frame_s}, {}
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> VibrationNode:
+        """Inverse of ``state``."""
+        return cls(str(facts["name"]), float(facts["middle_s"]), float(facts["frame_s"]))
+
+
+def average_velocity(velocity: Tensor, beta: Tensor) -> Tensor:
+    """``v exp(-beta / (2 l))`` [N, 3], metres per unit of time: what lives long has a swing, but goes nowhere."""
+    return velocity * torch.exp(-beta / (2 * CYCLE))[:, None]
+
+
+def starting_columns(count: int, tau: Tensor, duration: float) -> dict[str, Tensor]:
+    """Columns of Gaussians that have not learnt to move: ``tau`` [count] and ``duration`` in units of time."""
+    beta = math.sqrt(0.1 * max(duration, FRAME))
+    return {"tau": tau.float(), "log_beta": torch.full((count,), math.log(beta)), "velocity": torch.zeros(count, 3)}
+
+
+def born_later(columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
+    """Children of split rows: each at another time of its parent's life, where the parent would be then.
+
+    Args:
+        noise: standard normal ``[n]``.
+        late: whether the life span shrinks too (the second half of densification).
+    """
+    beta = columns["log_beta"].exp()
+    later = beta * noise
+    moved = columns["means"] + average_velocity(columns["velocity"], beta) * later[:, None]
+    shorter = math.log(SHRINK) * (beta >= SHORT_BETA) if late else torch.zeros_like(beta)
+    return {**columns, "means": moved, "tau": columns["tau"] + later, "log_beta": columns["log_beta"] - shorter}
+
+
+def moving_rows(columns: Mapping[str, Tensor], least_beta: float = 0.2) -> Tensor:
+    """Bool[N]: Gaussians that show for a short while only, which draw what moves (published: all with beta at most 0.2)."""
+    return columns["log_beta"].detach().exp() <= least_beta

@@ -1,0 +1,445 @@
+"""Methods whose Gaussians depend on time: their equations, and their fits end to end on a tiny exact street."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_settings import fit_config
+from pretend_device import pretend_device
+from toy_world import camera, fused_cloud, truth, view_at, write_scene
+
+from mudg.base import geometry
+from mudg.base.errors import UsageError
+from mudg.base.palette import ID
+from mudg.base.types import Track
+from mudg.core import losses, metrics
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.core.table import Table
+from mudg.data.cloudfile import write_fused
+from mudg.models.scene import densify, nodes
+from mudg.models.scene.bezier import BezierNode, bernstein, distance_change, fit_path
+from mudg.models.scene.deformed import DeformationField, DeformedNode
+from mudg.models.scene.flat_network import FlatNetwork, waves
+from mudg.models.scene.hexplane import HexPlaneNode, PlaneSizes, plane_smoothness
+from mudg.models.scene.hexplane import moving_rows as hexplane_moving
+from mudg.models.scene.initial import columns_from_points
+from mudg.models.scene.model import SceneModel, compose
+from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
+from mudg.models.scene.vibration import VibrationNode, average_velocity, born_later, moving_rows, starting_columns
+from mudg.stages import fit
+from mudg.stages.fitting import pvg
+from mudg.stages.fitting.recipes import RECIPES
+
+SIZE, FRAMES = (60, 40), 6
+OWN = {
+    "bezier": {"curve", "trajectory"},
+    "omnire": {"network", "embeddings"},
+    "pvg": {"tau", "log_beta", "velocity"},
+    "s3gaussian": {"planes", "plane_network"},
+}
+BOX_FREE = [name for name, recipe in RECIPES.items() if not recipe.boxes]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> dict[str, Path]:
+    """A scene with a moving car, the same without its track, and what fusing gives."""
+    root = tmp_path_factory.mktemp("world")
+    write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
+    write_scene(root / "untracked", frames=FRAMES, width=SIZE[0], height=SIZE[1], tracks=False)
+    write_fused(root / "fuse", fused_cloud(FRAMES), {})
+    return {name: root / name for name in ("scene", "untracked", "fuse")}
+
+
+@pytest.fixture(autouse=True)
+def cars_that_walk(monkeypatch):
+    """The one object of the toy street may deform, too."""
+    monkeypatch.setattr(nodes, "LIMBED_LABELS", nodes.LIMBED_LABELS | {"car"})
+
+
+def settings(method: str, **changes):
+    small = {"iterations": 24, "start__gaussians": 900, "densify__max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
+    return fit_config(method=method, **{**small, **changes})
+
+
+def fitted_bytes(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in ("gaussians.safetensors", "nodes.safetensors", "model.json")}
+
+
+# ---- vibration -------------------------------------------------------------------------------------------------------
+
+
+def vibrating(count: int = 5) -> NodeRows:
+    g = torch.Generator().manual_seed(3)
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    own = {"tau": 0.03 * drawn(count), "log_beta": -2.5 + 0.5 * drawn(count), "velocity": 20 * drawn(count, 3)}
+    return NodeRows(drawn(count, 3), drawn(count, 4), torch.sigmoid(drawn(count)), drawn(count, 1, 3), own)
+
+
+def test_vibration_by_hand():
+    """A quarter of a cycle after its peak a Gaussian is v l / (2 pi) away, and as faint as the normal density says."""
+    node = VibrationNode("background", middle_s=10.0, frame_s=0.1)
+    assert node.time_of(10.1) == pytest.approx(0.02)
+    own = {"tau": torch.tensor([0.0, 0.05]), "log_beta": torch.tensor([0.05, 0.01]).log(), "velocity": torch.tensor([[2.0, 0, 0]] * 2)}
+    rows = NodeRows(torch.zeros(2, 3), torch.ones(2, 4), torch.tensor([0.8, 0.8]), torch.zeros(2, 1, 3), own)
+    seen = node.at_time(rows, 10.25)  # t = 0.05, a quarter of the cycle 0.2
+    assert seen.means[0].tolist() == pytest.approx([2.0 * 0.2 / (2 * math.pi), 0, 0])
+    assert seen.means[1].tolist() == pytest.approx([0, 0, 0])
+    assert seen.opacity.tolist() == pytest.approx([0.8 * math.exp(-0.5), 0.8])
+    later = node.at_time(rows, 10.4)  # t = 0.08: three life spans after the peak of the second
+    assert later.opacity[1] == 0.0
+    assert average_velocity(own["velocity"], torch.tensor([0.4, 0.0]))[:, 0].tolist() == pytest.approx([2 * math.exp(-1), 2.0])
+
+
+def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
+    rows, node = vibrating(), VibrationNode("background", 1.0, 0.1).smoothed(0.013)
+    seen = node.at_time(rows, 1.2)
+    for i in range(len(rows.means)):
+        beta, since = math.exp(rows.own["log_beta"][i]), 0.04 - 0.013 - float(rows.own["tau"][i])
+        factor = math.exp(-(since**2) / (2 * beta**2))
+        assert float(seen.opacity[i]) == pytest.approx(float(rows.opacity[i]) * (factor if factor > 0.05 else 0.0), rel=1e-12)
+        for axis in range(3):
+            v = float(rows.own["velocity"][i, axis])
+            moved = v * math.sin(2 * math.pi * since / 0.2) * 0.2 / (2 * math.pi) + v * math.exp(-beta / 0.4) * 0.013
+            assert float(seen.means[i, axis]) == pytest.approx(float(rows.means[i, axis]) + moved, rel=1e-12)
+    held = [rows.means, rows.opacity, *(rows.own[name] for name in ("tau", "log_beta", "velocity"))]
+
+    def at(means, opacity, tau, log_beta, velocity):
+        now = node.at_time(replace(rows, means=means, opacity=opacity, own={"tau": tau, "log_beta": log_beta, "velocity": velocity}), 1.2)
+        return now.means, now.opacity
+
+    assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in held])
+
+
+def test_children_lie_on_their_parents_path():
+    columns = {"means": torch.zeros(2, 3), "tau": torch.tensor([0.1, 0.1]), "log_beta": torch.tensor([0.04, 0.005]).log(),
+               "velocity": torch.tensor([[3.0, 0, 0]] * 2)}  # fmt: skip
+    born = born_later(columns, torch.tensor([1.0, -2.0]), late=True)
+    assert born["tau"].tolist() == pytest.approx([0.14, 0.09])
+    assert born["means"][:, 0].tolist() == pytest.approx([3 * math.exp(-0.1) * 0.04, -3 * math.exp(-0.0125) * 0.01])
+    assert born["log_beta"].exp().tolist() == pytest.approx([0.04 / 1.6, 0.005])
+    assert born_later(columns, torch.zeros(2), late=False)["log_beta"].tolist() == columns["log_beta"].tolist()
+    assert moving_rows(columns).tolist() == [True, True]
+    assert moving_rows(columns, 0.01).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("step", "late", "rows"), [(10, 20, 5), (20, 20, 6)])
+def test_what_changes_in_time_is_split_in_time(step, late, rows):
+    """Of three Gaussians with small image gradients, one has a gradient of tau and a long life: it becomes two, late in the run three."""
+    columns = columns_from_points(np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8), None, (), 0, np.full(4, 0.1, np.float32))
+    columns |= starting_columns(4, torch.zeros(4), 0.2) | {"log_beta": torch.tensor([0.1, 0.1, 0.1, 0.005]).log()}
+    model = SceneModel(Table(columns, {"node": torch.zeros(4, dtype=torch.int32)}), (VibrationNode("b", 0.0, 0.1),), None, (), 0)
+    stats = densify.DensifyStats(torch.zeros(4), torch.ones(4), torch.tensor([0.0, 1.0, 0.0, 0.0]))
+    report = densify.densify(model, stats, step, densify.DensifySettings(1, 99, 10, growth=9.0, late=late), 0)
+    assert (report["split"], report["cloned"], report["rows"]) == (1, 0, rows)
+    assert len(set(model.table["tau"].tolist())) == rows - 2
+    copied = densify.densify(model, densify.DensifyStats(*(torch.ones(rows) for _ in range(3))), step,
+                             densify.DensifySettings(1, 99, 10, static_gradient=9.0, growth=9.0), 0)  # fmt: skip
+    assert copied["cloned"] == 1
+
+
+def test_the_losses_of_pvg_by_hand():
+    alpha, depth = torch.tensor([[[0.5, 1.0]]]), torch.tensor([[[10.0, 20.0]]])
+    inverse = losses.inverse_depth(depth, alpha, 1000.0)
+    assert inverse.flatten().tolist() == pytest.approx([0.05 + 0.0005, 0.05])
+    assert losses.sparse_inverse_depth(inverse, torch.tensor([1]), torch.tensor([10.0])).item() == pytest.approx(0.05)
+    rgb = torch.tensor([[[0.0, 1.0]]] * 3)
+    assert losses.edge_aware(torch.tensor([[[1.0, 3.0], [1.0, 3.0]]]), rgb.expand(3, 2, 2)).item() == pytest.approx(2 * math.exp(-1))
+    assert losses.opacity_entropy(alpha).item() == pytest.approx(-0.25 * math.log(0.5))
+    assert losses.empty_sky(alpha, torch.tensor([[[True, False]]])).item() == pytest.approx(-0.5 * math.log(0.5))
+
+
+def test_half_of_the_steps_draw_the_state_of_another_time():
+    table = Table({"means": torch.zeros(1, 3)}, {"node": torch.zeros(1, dtype=torch.int32)})
+    model = SceneModel(table, (VibrationNode("b", 0, 0.1),), None, (), 0)
+    drawn = [pvg.VibrationRecipe().drawn_model(model, None, step, settings("pvg")).nodes[0].early for step in range(400)]
+    moved = [early for early in drawn if early]
+    assert 160 < len(moved) < 240
+    assert max(map(abs, moved)) <= 0.03
+    assert max(moved) > 0.02 and min(moved) < -0.02
+    assert model.nodes[0].early == 0.0
+
+
+# ---- deformed objects ------------------------------------------------------------------------------------------------
+
+
+def person() -> tuple[DeformationField, DeformedNode]:
+    track = Track("walker", "pedestrian", [0.8, 0.6, 1.8], [0.0, 1.0], np.stack([geometry.yaw_matrix(0.3, (0, 0, 0))] * 2))
+    return DeformationField.fresh((0.0, 2.0), 2, 8, 3, 5), DeformedNode.of_rigid(RigidNode.from_track(track), 2)
+
+
+def test_a_flat_network_is_the_network_it_stands_for():
+    network, g = FlatNetwork((5, 4, 3), leading=True), torch.Generator().manual_seed(1)
+    flat = torch.randn(1, network.numbers, generator=g, dtype=torch.float64)
+    x = torch.randn(6, 5, generator=g, dtype=torch.float64)
+    weights, values = flat[0].numpy(), np.maximum(x.numpy(), 0)
+    hidden = np.maximum(values @ weights[:20].reshape(4, 5).T + weights[20:24], 0)
+    assert np.allclose(network(flat, x).numpy(), hidden @ weights[24:36].reshape(3, 4).T + weights[36:39], rtol=1e-12)
+    start = network.start(g)
+    assert start.shape == flat.shape and bool((start[0, 24:] == 0).all()) and bool((start[0, :20] != 0).all())
+    assert torch.autograd.gradcheck(network, [flat.requires_grad_(), x.requires_grad_()])
+    assert waves(torch.tensor([[0.25]]), 2).tolist()[0] == pytest.approx([0.25, 0.5**0.5, 1, 0.5**0.5, 0], 1e-6, 1e-6)
+
+
+def test_a_deformed_object_stays_one_through_everything_a_scene_does():
+    """At first it is rigid; then it moves as the field says, differently at other times and for other objects, saved and on its own."""
+    field, node = person()
+    columns = columns_from_points(np.random.default_rng(1).random((4, 3), np.float32) - 0.5, np.zeros((4, 3), np.uint8), None, (), 0)
+    scene = SceneModel(Table(columns, {"node": torch.ones(4, dtype=torch.int32)}), (StaticNode(), node, field), None, (), 0)
+    rigid = RigidNode.from_track(Track("w", "car", node.size_m, node.times_s, node.world_from_object))
+    rows = NodeRows(columns["means"], columns["quats"], columns["logits"], columns["sh_dc"])
+    assert torch.equal(compose(scene, 0.5).means, rigid.at_time(rows, 0.5).means)
+    with torch.no_grad():
+        field.learnt["network"].normal_(generator=torch.Generator().manual_seed(2))
+    moved = compose(scene, 0.5).means
+    place = 2 * columns["means"] / torch.tensor(node.size_m)
+    expected = rigid.at_time(replace(rows, means=rows.means + field.displacement(place, 0.5, 2)), 0.5)
+    assert torch.equal(moved, expected.means)
+    assert not torch.equal(field.displacement(place, 0.5, 2), field.displacement(place, 0.5, 1))
+    assert not torch.equal(moved, compose(scene, 0.7).means)
+    assert torch.equal(compose(SceneModel.from_state(*scene.state()), 0.5).means, moved)
+    assert torch.equal(compose(scene.with_object_moved("walker", np.eye(4)), 0.5).means, moved)
+    assert scene.node_names() == ("walker",)
+    assert scene.without_nodes(["walker"]).node_names() == ()
+    resting = scene.with_nodes((scene.nodes[0], scene.nodes[1].resting(), field))
+    assert torch.equal(compose(resting, 0.5).means, rigid.at_time(rows, 0.5).means)
+
+
+# ---- hexplane --------------------------------------------------------------------------------------------------------
+
+
+def field_in_float64() -> HexPlaneNode:
+    """A small field with numbers everywhere."""
+    node = HexPlaneNode.fresh([-2, -3, 0, 1], [2, 3, 1, 2], PlaneSizes(2, 2, 3, 4, 5), 1)
+    g = torch.Generator().manual_seed(4)
+    node.learnt = Table({name: torch.rand(value.shape, generator=g).double() - 0.4 for name, value in node.learnt.columns.items()})
+    return node
+
+
+def test_planes_agree_with_a_plain_loop():
+    node, g = field_in_float64(), torch.Generator().manual_seed(5)
+    places = torch.rand(7, 4, generator=g).double() * 2.4 - 1.2
+    planes = [(axes, plane.detach().numpy()) for axes, plane in node.planes()]
+    assert [plane.shape for _, plane in planes] == [(2, 3, 3)] * 3 + [(2, 4, 3)] * 3 + [(2, 6, 6)] * 3 + [(2, 4, 6)] * 3
+    expected = np.ones((7, 4))
+    for index, (axes, plane) in enumerate(planes):
+        for row, place in enumerate(places.numpy()):
+            x, y = ((np.clip(place[axis], -1, 1) + 1) / 2 * (plane.shape[2 - n] - 1) for n, axis in enumerate(axes))
+            i, j = min(int(x), plane.shape[2] - 2), min(int(y), plane.shape[1] - 2)
+            u, v = x - i, y - j
+            for feature in range(2):
+                p = plane[feature]
+                low, high = p[j, i] * (1 - u) + p[j, i + 1] * u, p[j + 1, i] * (1 - u) + p[j + 1, i + 1] * u
+                expected[row, 2 * (index // 6) + feature] *= low * (1 - v) + high * v
+    assert np.allclose(node.features(places).detach().numpy(), expected, rtol=1e-10)
+
+
+def test_the_field_moves_and_recolors_what_lies_in_its_box():
+    node, g = field_in_float64(), torch.Generator().manual_seed(6)
+    means = torch.cat([torch.rand(4, 3, generator=g).double(), torch.tensor([[9.0, 0, 0]]).double()])
+    rows = NodeRows(means, torch.ones(5, 4).double(), torch.ones(5).double(), torch.zeros(5, 1, 3).double())
+    now, later, resting = node.at_time(rows, 1.2), node.at_time(rows, 1.9), node.resting().at_time(rows, 1.2)
+    assert bool((now.means[:4] != means[:4]).all()) and torch.equal(now.means[4], means[4])
+    assert bool((now.sh_dc[:4] != 0).all()) and bool((now.sh_dc[4] == 0).all())
+    assert not torch.equal(now.means, later.means)
+    assert resting is rows
+    fresh = HexPlaneNode.fresh([-2, -3, 0, 1], [2, 3, 1, 2], PlaneSizes(2, 2, 3, 4, 5), 1)
+    single = NodeRows(means.float(), torch.ones(5, 4), torch.ones(5), torch.zeros(5, 1, 3))
+    assert torch.equal(fresh.at_time(single, 1.2).means, means.float())
+    columns = [value.detach() for value in node.learnt.columns.values()]
+
+    def at(planes, network, places):
+        node.learnt.columns = {"planes": planes, "plane_network": network}
+        found = node.at_time(replace(rows, means=places), 1.37)
+        return found.means, found.sh_dc
+
+    assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in (*columns, means)])
+    seen = node.seen_by(view_at(0.6, camera())).asked(torch.tensor([[1.0, 1, 0.5], [-2, 2, 0.5]]).double())
+    assert set(seen.tolist()) <= {0, 1}
+
+
+def test_what_is_far_from_the_frustum_is_not_asked():
+    node = HexPlaneNode.fresh([-99, -99, -9, 0], [99, 99, 9, 1], PlaneSizes(1, 1, 2, 2, 2), 1)
+    view = view_at(0.0, camera())
+    center, look = view.world_from_cam[:3, 3], view.world_from_cam[:3, 2]
+    means = torch.from_numpy(np.stack([center + 20 * look, center - 20 * look])).float()
+    assert node.asked(means).tolist() == [0, 1]
+    assert node.seen_by(view).asked(means).tolist() == [0]
+    assert hexplane_moving(torch.tensor([[0.0, 0, 0], [0.0, 3, 0]])).tolist() == [False, True]
+
+
+def test_the_losses_of_s3gaussian_by_hand():
+    depth, pixel = torch.tensor([[[10.0, 20.0]]]), torch.tensor([0, 1])
+    assert losses.sparse_squared_depth(depth, pixel, torch.tensor([18.0, 90.0]), 80.0).item() == pytest.approx(0.01)
+    node = HexPlaneNode.fresh([0, 0, 0, 0], [1, 1, 1, 1], PlaneSizes(1, 1, 3, 3, 2), 1)
+    with torch.no_grad():
+        for axes, plane in node.planes():
+            bent = torch.tensor([0.0, 1.0, 0.0]).view(1, 3, 1).expand(1, 3, 3)
+            plane.copy_(bent if axes in ((0, 1), (0, 3)) else torch.ones(1, 3, 3))
+    space, time, flat = plane_smoothness(node)
+    assert (space.item(), time.item(), flat.item()) == pytest.approx((4.0, 4.0, 2 / 3))
+
+
+# ---- Bezier curves ---------------------------------------------------------------------------------------------------
+
+
+def test_bernstein_polynomials():
+    assert bernstein(np.array([0.0, 0.5, 1.0])).tolist() == [[1, 0, 0, 0], [0.125, 0.375, 0.375, 0.125], [0, 0, 0, 1]]
+    assert bernstein(np.linspace(-0.2, 1.2, 9)).sum(1) == pytest.approx(np.ones(9))
+
+
+def test_a_cubic_track_is_fitted_exactly_and_others_well():
+    times = np.linspace(3.0, 5.0, 12)
+    control = np.array([[0.0, 0, 1], [8, 1, 1], [14, 6, 1.2], [15, 12, 1]])
+    path = fit_path(times, bernstein((times - 3) / 2) @ control)
+    assert np.abs(path.control - control).max() < 1e-9
+    assert np.abs(path.at(4.237) - bernstein(np.array(1.237 / 2)) @ control).max() < 1e-9
+    turning = np.stack([10 * np.sin(times - 3), 10 - 10 * np.cos(times - 3), 0 * times], 1)
+    assert fit_path(times, turning).error_m < 0.02
+    braking = np.stack([20 * (1 - np.exp(-(times - 3))), 0 * times, 0 * times], 1)
+    assert fit_path(times, braking).error_m < 0.04
+
+
+@pytest.mark.parametrize("keys", [1, 2, 3])
+def test_short_and_standing_tracks_have_a_path(keys):
+    times = np.arange(keys) * 0.1
+    positions = np.stack([2 * times, -times, 1 + 0 * times], 1)
+    path = fit_path(times, positions)
+    assert np.abs(path.at(times) - positions).max() < 1e-6
+    if keys > 1:
+        assert path.at(0.05) == pytest.approx([0.1, -0.05, 1], abs=1e-6)
+    still = fit_path(times, np.ones((keys, 3)))
+    assert np.abs(still.at(times) - 1).max() < 1e-9
+
+
+def test_an_object_on_curves_starts_where_its_box_is_and_moves_with_its_columns():
+    times = np.linspace(0, 1, 6)
+    keys = np.stack([geometry.yaw_matrix(0.4 * t, (5 * t, t**2, 0.5)) for t in times])
+    track = Track("car", "car", [4.0, 2.0, 1.5], times, keys)
+    node, rigid, g = BezierNode.from_track(track), RigidNode.from_track(track), torch.Generator().manual_seed(2)
+    rows = NodeRows(torch.randn(5, 3, generator=g), torch.randn(5, 4, generator=g), torch.ones(5), torch.zeros(5, 1, 3),
+                    {"curve": torch.zeros(5, 4, 3)})  # fmt: skip
+    for time_s in (0.0, 0.4, 1.0):
+        ours, boxes = node.at_time(rows, time_s), rigid.at_time(rows, time_s)
+        assert (ours.means - boxes.means).abs().max() < 2e-3
+        assert torch.equal(ours.quats, boxes.quats)
+    assert node.at_time(rows, 1.2) is None
+    assert distance_change(node, rows, (0.0, 0.8)).item() < 1e-2
+    shaken = replace(rows, own={"curve": torch.randn(5, 4, 3, generator=g)})
+    weights = torch.from_numpy(bernstein(node.path.tau_at(0.33))).float()
+    expected = node.at_time(rows, 0.33).means + (weights[:, None] * shaken.own["curve"]).sum(1)
+    assert (node.at_time(shaken, 0.33).means - expected).abs().max() < 1e-5
+    with torch.no_grad():
+        node.learnt["trajectory"][0, 3] = torch.tensor([0.0, 0, 1])
+    assert (node.at_time(shaken, 1.0).means - expected.new_tensor([0, 0, 1])).isfinite().all()
+    assert (node.at_time(rows, 1.0).means[:, 2] - rigid.at_time(rows, 1.0).means[:, 2] - 1).abs().max() < 2e-3
+    again = BezierNode.from_state(*node.state())
+    assert torch.equal(again.at_time(shaken, 0.5).means, node.at_time(shaken, 0.5).means)
+    assert torch.allclose(node.moved(np.eye(4)).at_time(shaken, 0.5).means, node.at_time(shaken, 0.5).means, atol=1e-5)
+    assert distance_change(node, shaken, (0.0, 0.8)).item() > 0.5
+
+    def at(curve, trajectory):
+        made = BezierNode.from_track(track)
+        made.learnt.columns = {"trajectory": trajectory}
+        made._curves = {key: tuple(part.double() for part in value) for key, value in node._curves.items()}
+        given = replace(rows, means=rows.means.double(), quats=rows.quats, own={"curve": curve})
+        return made.at_time(given, 0.5).means
+
+    assert torch.autograd.gradcheck(at, [shaken.own["curve"].double().requires_grad_(), torch.zeros(1, 4, 3).double().requires_grad_()])
+
+
+# ---- fits ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, monkeypatch, method):
+    reached: set[str] = set()
+    adam_step = fit.adam_step
+
+    def spy(model, *rest):
+        for table in (model.table, *model.node_tables().values()):
+            reached.update(name for name, value in table.gradients().items() if bool((value != 0).any()))
+        adam_step(model, *rest)
+
+    monkeypatch.setattr(fit, "adam_step", spy)
+    folder = fit.run(settings(method, iterations=60), world["scene"], world["fuse"], tmp_path / "fit")
+    assert OWN[method] <= reached
+    model = fit.load_model(folder)
+    view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
+    seen = fit.render_view(model, view, RasterConfig())
+    exact = truth(view)
+    assert metrics.psnr(seen.rgb, exact.rgb, (exact.semantics != ID["sky"])[None]) > 17.0
+    values, groups = model.state()
+    again = SceneModel.from_state(values, groups)
+    assert torch.equal(fit.render_view(again, view, RasterConfig()).rgb, seen.rgb)
+    assert not torch.equal(compose(again, 0.0).means, compose(again, 0.45).means)
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, method):
+    config, stops = settings(method, iterations=26), [4, 13]
+    whole = fit.run(config, world["scene"], world["fuse"], tmp_path / "whole")
+    adam_step = fit.adam_step
+
+    def stopped(model, step, *rest):
+        adam_step(model, step, *rest)
+        if step == stops[0]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(fit, "adam_step", stopped)
+    while stops:
+        with pytest.raises(KeyboardInterrupt):
+            fit.run(config, world["scene"], world["fuse"], tmp_path / "parts")
+        stops.pop(0)
+    monkeypatch.setattr(fit, "adam_step", adam_step)
+    assert fitted_bytes(fit.run(config, world["scene"], world["fuse"], tmp_path / "parts")) == fitted_bytes(whole)
+
+
+@pytest.mark.parametrize("method", BOX_FREE)
+def test_methods_without_boxes_do_not_read_them(world, tmp_path, method):
+    """Neither the tracks of the scene nor the clouds of its objects change a byte."""
+    fused = fused_cloud(FRAMES)
+    write_fused(tmp_path / "fuse", replace(fused, objects={}), {})
+    tracked = fit.run(settings(method), world["scene"], world["fuse"], tmp_path / "tracked")
+    untracked = fit.run(settings(method), world["untracked"], tmp_path / "fuse", tmp_path / "untracked")
+    assert fitted_bytes(tracked) == fitted_bytes(untracked)
+
+
+@pytest.mark.parametrize("method", BOX_FREE)
+@pytest.mark.parametrize("changes", [{"poses__learn": True}, {"objects__deformable": False}, {"loss__object_weight": 0.1}])
+def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_path, method, changes):
+    with pytest.raises(UsageError, match="knows nothing of it"):
+        fit.run(settings(method, **changes), world["scene"], world["fuse"], tmp_path / "fit")
+    assert not (tmp_path / "fit").exists()
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
+    for weight in RECIPES[method].own_weights:
+        with pytest.raises(UsageError, match="published weights of its own"):
+            fit.run(settings(method, **{f"loss__{weight}": 0.33}), world["scene"], world["fuse"], tmp_path / "fit")
+    with pytest.raises(UsageError, match="densifies by gradients"):
+        fit.run(settings(method, densify__kind="mcmc"), world["scene"], world["fuse"], tmp_path / "fit")
+    with pytest.raises(UsageError, match="cannot go on"):
+        fit.run(settings(method), world["scene"], world["fuse"], tmp_path / "fit", start=tmp_path / "other")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", RECIPES)
+def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
+    small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch", "hexplane__space": 4}
+    here = fit.run(settings(method, device="cpu", **small), world["scene"], world["fuse"], tmp_path / "here")
+    with pretend_device():
+        there = fit.run(settings(method, device="pretend", **small), world["scene"], world["fuse"], tmp_path / "there")
+    view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
+    pictures = [fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb for folder in (here, there)]
+    assert metrics.psnr(*pictures) > 45.0
