@@ -39,7 +39,7 @@ from mudg.stages.editing import assets
 from mudg.stages.editing.apply import edited_model
 from mudg.stages.editing.carried import carry_out
 from mudg.stages.editing.checks import collisions
-from mudg.stages.editing.plan import Actor, EditWorld, plan_edits
+from mudg.stages.editing.plan import Actor, Background, EditPlan, EditWorld, Sources, plan_edits
 from mudg.stages.fitting.rendering import render_view
 
 SIZE = (4.0, 2.0, 1.5)
@@ -220,8 +220,12 @@ def world_of(model: SceneModel) -> EditWorld:
     return EditWorld({**world.actors, track.id: other}, ego, None)
 
 
+def planned(text: str, world: EditWorld, opened=lambda source: None, background=lambda name: None) -> EditPlan:
+    return plan_edits(parse_edits(text, "edits.yaml"), world, Sources(opened, background))
+
+
 def carried(model: SceneModel, text: str, opened=lambda source: None) -> SceneModel:
-    return edited_model(model, plan_edits(parse_edits(text, "edits.yaml"), world_of(model), opened))
+    return edited_model(model, planned(text, world_of(model), opened))
 
 
 @pytest.mark.parametrize(
@@ -235,7 +239,7 @@ def carried(model: SceneModel, text: str, opened=lambda source: None) -> SceneMo
 )
 def test_an_edited_object_renders_as_one_fitted_to_the_edited_track(text: str) -> None:
     model = toy()
-    plan = plan_edits(parse_edits(text, "edits.yaml"), world_of(model), lambda source: None)
+    plan = planned(text, world_of(model))
     actor = plan.after.actors["car-1"]
     track = Track("car-1", "car", np.array(SIZE), actor.motion.times_s, actor.motion.poses)
     refitted = SceneModel(model.table, (StaticNode(), RigidNode.from_track(track)), model.sky, model.classes, 0, {})
@@ -258,7 +262,7 @@ def test_removing_an_object_leaves_the_picture_without_it() -> None:
 def test_objects_are_chosen_by_kind() -> None:
     model = toy()
     assert carried(model, "- remove: {class: car, moving: true}").node_names() == ()
-    near = plan_edits(parse_edits("- remove: {within_m: 11}", "e"), world_of(model), lambda source: None)
+    near = planned("- remove: {within_m: 11}", world_of(model))
     assert near.removed == ["car-1"]  # its first place is 8 m away, the parked car 12.6 m
     with pytest.raises(InputError, match="no object is of this kind") as refused:
         carried(model, "- remove: {class: tram}")
@@ -281,9 +285,9 @@ def test_a_parked_car_is_cut_out_of_the_background() -> None:
     others = {"far": Actor("car", SIZE, straight(0.0, 2.0, start=90.0)), "way": Actor("car", SIZE, straight(9.0))}
     hidden = EditWorld({**world.actors, **others}, world.ego)
     for name in ("far", "way"):  # the fit shows neither of them
-        plan = plan_edits(parse_edits(f"- remove: {{ids: [{name}]}}", "e"), hidden, lambda source: None)
+        plan = planned(f"- remove: {{ids: [{name}]}}", hidden)
         assert torch.equal(picture(edited_model(model, plan)), picture(model))
-        plan = plan_edits(parse_edits(f"- move: {{id: {name}, along_m: 1, ground: false}}", "e"), hidden, lambda source: None)
+        plan = planned(f"- move: {{id: {name}, along_m: 1, ground: false}}", hidden)
         with pytest.raises(UsageError, match=name):
             edited_model(model, plan)
     empty = Track("nobody", "car", np.array(SIZE), parked().times_s, parked().world_from_object @ geometry.yaw_matrix(0, (0, 0, 50)))
@@ -404,7 +408,7 @@ def test_inserting_replacing_and_colliding() -> None:
 - insert: {asset: {file: a}, near: {id: car-1, ahead_m: 3}}
 - move: {id: new, along_m: 1}
 """
-    plan = plan_edits(parse_edits(text, "e"), world_of(model), lambda source: asset)
+    plan = planned(text, world_of(model), lambda source: asset)
     made = edited_model(model, plan)
     assert set(made.node_names()) == {"new", "car-1", "car-new1"}
     pose = made.dynamic_object("new").pose_matrix(1.0)
@@ -443,7 +447,7 @@ def test_edits_on_another_device_are_the_same() -> None:
         ("- lane_change: {id: car-1, left_m: 3.5, start_s: 0.1, duration_s: 1}", "too sharp"),
         ("- stop: {id: car-1, at_s: 9}", "outside its path"),
         ("- remove: {ids: [car-1]}\n- stop: {id: car-1, at_s: 1}", "line 2: stop.id"),
-        ("- background: {run: other}", "by this version"),
+        ("- background: {run: other}", "belongs is not known"),
     ],
 )
 def test_what_cannot_be_done_is_told_with_line_and_verb(text: str, said: str) -> None:
@@ -472,7 +476,7 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
     world = EditWorld(actors, Motion.recorded(ego.times_s, ego.world_from_ego))
     asset = edited.asset_of(toy(), "car-1")
     for path in scripts:
-        plan = plan_edits(read_edits(path), world, lambda source: asset)
+        plan = plan_edits(read_edits(path), world, Sources(lambda source: asset, lambda name: None))
         assert plan.removed or plan.changes
         assert not [found for found in collisions(plan) if "ego" in found["ids"]]
 
@@ -493,6 +497,29 @@ def test_the_city_is_drawn_again_with_an_object_elsewhere() -> None:
     assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
     with pytest.raises(UsageError, match="no such object"):
         city.rearranged({"car-999": None})
+
+
+def test_another_street_lies_where_the_vehicle_drives() -> None:
+    """The same street, elsewhere, turned and 2 m lower, put back around the objects: nothing changes."""
+    model = toy()
+    away = geometry.yaw_matrix(0.5, (30.0, -7.0, -2.0))
+    ground = np.asarray(slope(0.0).heights)
+    x, y = np.meshgrid(np.arange(-6, 40, 0.5), np.arange(-8, 8, 0.5), indexing="ij")
+    xyz = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
+    assert np.nanmax(np.abs(ground)) < 1e-9
+    other = edited.with_background(model, model, away).without_nodes(["car-1"])
+    ego = Motion.recorded([0.0, 2.0], np.stack([geometry.yaw_matrix(0.0)] * 2))
+    street = Background(other, replace(ego, poses=away @ ego.poses), geometry.transform_points(away, xyz))
+    world = EditWorld(EditWorld.of_model(model, None).actors, ego, HeightMap.from_points(xyz))
+    plan = planned("- background: {run: other}", world, background=lambda name: street)
+    made = edited_model(model, plan)
+    assert made.node_names() == ("car-1",)
+    assert (picture(made) - picture(model)).abs().max() < 0.02  # the sky was turned by whole texels
+    assert torch.allclose(made.table["means"], model.table["means"], atol=1e-4)
+    alone = edited_model(model, planned("- background: {run: other, keep: [ego]}", world, background=lambda name: street))
+    assert alone.node_names() == ()
+    with pytest.raises(InputError, match="own path"):
+        planned("- background: {run: other, keep: [objects]}", world)
 
 
 def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:

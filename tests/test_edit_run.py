@@ -175,6 +175,22 @@ def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: p
     assert "seldom-seen side" in kinds  # the recording saw its back only
 
 
+def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
+    """Its own street put in again changes nothing but the sky's texels."""
+    model = run / "fit" / "street_gaussians"
+    edits = script(tmp_path, f"- background: {{run: {run}}}")
+    made = edit.run(EditConfig(), model, edits, tmp_path / "out", scene=run / "scene")
+    before, after = (rendered(run / "scene", folder, tmp_path / name) for folder, name in ((model, "a"), (made, "b")))
+    for one, two in zip(before, after, strict=True):
+        assert (one - two).abs().mean() < 0.01
+    with pytest.raises(InputError, match="whole run"):
+        edit.run(EditConfig(), run, edits, tmp_path / "whole")
+    with pytest.raises(InputError, match="where its street lies"):
+        edit.run(EditConfig(), model, script(tmp_path, f"- background: {{run: {model}}}"), tmp_path / "fit", scene=run / "scene")
+    assert not (tmp_path / "whole").exists()
+    assert not (tmp_path / "fit").exists()
+
+
 def test_from_python(run: Path, tmp_path: Path) -> None:
     fitted = mudg.FittedScene.read(run / "fit" / "street_gaussians")
     scene = mudg.read_scene(run / "scene")

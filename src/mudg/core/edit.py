@@ -165,6 +165,18 @@ def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
     return replace(motion, poses=poses)
 
 
+def regrounded(motion: Motion, old: HeightMap, new: HeightMap) -> Motion:
+    """A path on other ground below the same places: the height above it and the tilt against it stay. Unknown ground changes nothing."""
+    xy = motion.poses[:, :2, 3]
+    poses = motion.poses.copy()
+    rise = new.height(xy) - old.height(xy)
+    for i, (up, below, above) in enumerate(zip(rise, old.normal(xy), new.normal(xy), strict=True)):
+        if np.isfinite(up):
+            poses[i, 2, 3] += up
+            poses[i, :3, :3] = _turn_between(below, above) @ poses[i, :3, :3]
+    return replace(motion, poses=poses)
+
+
 def along_points(points: Array, height_m: float, ground: HeightMap | None, floor_m: float = 0.0) -> Motion:
     """A path through given places.
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mudg.base import store
 from mudg.base.config import result_settings
+from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.raster.place import drawing_device
@@ -55,6 +56,9 @@ def run(
     model = load_model(parts.model) if loaded is None else model_of_scene(parts.model, loaded)
     cloud = None if clouds is None else read_fused(clouds)
     drive = carry_out(parsed, model, loaded, cloud)
+    if parts.whole and drive.plan.background is not None:
+        raise InputError("images and clouds of a whole run cannot get another background", where=str(script),
+            remedy=f"edit a fit: mudg edit {parts.model} ... --scene {place}")  # fmt: skip
     made = drive.model(model, keep_ego=not parts.whole)
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:

@@ -192,11 +192,19 @@ def _refuse_place(edit: InsertEdit) -> None:
     raise InputError("an object to insert needs one place", expected="path or near", got="both" if edit.path else "neither")
 
 
+def _with_ego(keep: list[str]) -> list[str]:
+    if "ego" not in keep:
+        raise InputError("the vehicle keeps its own path", expected="[objects, ego] or [ego]", got=str(keep))
+    return keep
+
+
 class BackgroundEdit(StrictRecord):
-    """Another street around the objects of this one."""
+    """Another street around the vehicle and the moving objects of this one: that of a folder of ``mudg run``."""
 
     run: Name
-    keep: Annotated[list[Literal["objects", "ego"]], Field(min_length=1)] = Field(default_factory=lambda: ["objects", "ego"])
+    keep: Annotated[list[Literal["objects", "ego"]], Field(min_length=1), after(_with_ego)] = Field(
+        default_factory=lambda: ["objects", "ego"]
+    )
 
 
 class SkyEdit(StrictRecord):

@@ -156,6 +156,52 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
     return made
 
 
+# -- backgrounds -----------------------------------------------------------------------------------------------------------
+
+
+def with_background(model: SceneModel, other: SceneModel, world_from_other: NDArray[np.float64]) -> SceneModel:
+    """A copy whose background and sky are those of another scene; its objects stay.
+
+    Classes are taken over by name, colours of degree 1 and more dropped: they hold the other scene's directions.
+
+    Args:
+        world_from_other: rigid 4x4, a turn about z and a translation.
+
+    Raises:
+        UsageError: a background that changes with time.
+    """
+    for scene in (model, other):
+        if scene.nodes[0].kind != "static":
+            raise UsageError("a background that changes with time cannot be exchanged", got=f"kind {scene.nodes[0].kind}")
+    there, mine = model.device, (model.table.labels["node"] > 0).nonzero()[:, 0]
+    rows = (other.table.labels["node"] == 0).nonzero()[:, 0]
+    given = {name: value.detach()[rows].cpu() for name, value in other.table.columns.items()}
+    means = geometry.transform_points(world_from_other, given["means"].numpy())
+    turn = torch.from_numpy(geometry.quaternion_from_matrix(world_from_other)).float()
+    columns = {"means": torch.from_numpy(means), "quats": given["quats"] @ left_product_matrix(turn).T}
+    columns |= {name: given[name] for name in ("log_scales", "logits", "sh_dc")}
+    if "semantics" in model.table.columns:
+        channels = torch.full((len(rows), len(model.classes)), ABSENT_LOGIT)
+        for channel, train_id in enumerate(model.classes):
+            if train_id in other.classes:
+                channels[:, channel] = given["semantics"][:, other.classes.index(train_id)]
+        columns["semantics"] = channels
+    labels = {key: torch.zeros(len(rows), *value.shape[1:], dtype=value.dtype) for key, value in model.table.labels.items()}
+    if CERTAINTY in labels and other.certainty is not None:
+        labels[CERTAINTY] = other.certainty[rows].cpu().to(labels[CERTAINTY].dtype)
+    table = Table(
+        {name: torch.cat([columns.get(name, torch.zeros(len(rows), *value.shape[1:])).to(there), value.detach()[mine]])
+         for name, value in model.table.columns.items()},
+        {key: torch.cat([labels[key].to(there), value[mine]]) for key, value in model.table.labels.items()},
+    )  # fmt: skip
+    sky = None
+    if other.sky is not None:
+        shift = round(geometry.yaw_of(world_from_other) / np.pi * other.sky.rows)
+        turned = torch.roll(other.sky.table["panorama"].detach(), shift, dims=3)
+        sky = type(other.sky)(Table({"panorama": turned})).to(there)
+    return replace(model, table=table, sky=sky, facts=dict(model.facts))
+
+
 # -- assets --------------------------------------------------------------------------------------------------------------
 
 

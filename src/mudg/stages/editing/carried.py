@@ -8,16 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from mudg.base import log
+from mudg.base.errors import InputError
 from mudg.base.types import FusedCloud, Scene
+from mudg.core.edit import Motion
 from mudg.data.edits import EditScript, read_edits
 from mudg.data.edits.records import AssetSource
-from mudg.models.scene.edited import Asset
+from mudg.data.scene import read_scene
+from mudg.models.scene.edited import Asset, ground_points
 from mudg.models.scene.model import SceneModel
 from mudg.stages.editing.apply import EGO_FACT, edited_cloud, edited_model, edited_scene, ego_fact, ground_of
 from mudg.stages.editing.assets import asset_from, read_asset
 from mudg.stages.editing.checks import check
-from mudg.stages.editing.plan import EditPlan, EditWorld, plan_edits
-from mudg.stages.editing.runs import find_run
+from mudg.stages.editing.plan import Background, EditPlan, EditWorld, Sources, plan_edits
+from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.fitting.storage import load_model
 
 FACT = "edits"
 """Fact of an edited fitted scene: the script, its digest, and what its checks found."""
@@ -63,7 +67,7 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     """
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
-    plan = plan_edits(script, world, opener(script))
+    plan = plan_edits(script, world, Sources(opener(script), lambda name: background_of(find_run(script.path_of(name)), name)))
     made = None if scene is None else edited_scene(scene, plan)
     views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
     notes = check(plan, *views)
@@ -72,6 +76,22 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     if plan.conditions:
         log.warn(f"edit: {', '.join(plan.conditions)} noted in the result; renders do not show it yet")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
+
+
+def background_of(parts: RunParts, name: str) -> Background:
+    """The street of a run.
+
+    Raises:
+        InputError: a fit by itself, of which the path of the vehicle is not known, or one without ground.
+    """
+    if parts.scene is None:
+        raise InputError("of a fit alone it is not known where its street lies", where="run", got=name,
+            expected="a folder made by `mudg run`")  # fmt: skip
+    scene, model = read_scene(parts.scene), load_model(parts.model)
+    ground = ground_points(model)
+    if not len(ground):
+        raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
+    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
 
 
 def opener(script: EditScript) -> Callable[[AssetSource], Asset]:

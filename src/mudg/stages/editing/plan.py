@@ -30,6 +30,25 @@ from mudg.models.scene.nodes import RigidNode
 Change = Callable[[Motion], Motion]
 OpenAsset = Callable[[AssetSource], Asset]
 """Reads the object that a script names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Background:
+    """Another street: its fit, the path of its vehicle, and points f32[N, 3] of its ground."""
+
+    model: SceneModel
+    ego: Motion
+    ground_xyz: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Reads what a script names: objects, and backgrounds by the path that is written there."""
+
+    asset: OpenAsset
+    background: Callable[[str], Background]
+
+
 VEHICLE_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "trailer"})
 MOVING_M: Final = 1.0
 """An object moves if its box gets farther than this from its first place."""
@@ -95,7 +114,8 @@ class EditPlan:
         before, after: the world, its actors and the vehicle, without and with the edits.
         changes: what is done to the path of an actor of the recording, in order.
         removed: actors of the recording that are not there any more. inserted: new ones, by id.
-        sky: settings of the last `sky`, or None. conditions: records of weather, light and season.
+        sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
+        conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
     """
 
@@ -105,6 +125,7 @@ class EditPlan:
     removed: list[str] = field(default_factory=list)
     inserted: dict[str, Insertion] = field(default_factory=dict)
     sky: Any = None
+    background: tuple[Background, np.ndarray] | None = None
     conditions: dict[str, Any] = field(default_factory=dict)
     notes: list[dict[str, Any]] = field(default_factory=list)
     moves_ego: bool = False
@@ -118,7 +139,7 @@ class EditPlan:
         return tuple(dict.fromkeys([*(name for name in self.changes if name in self.after.actors), *self.inserted]))
 
 
-def plan_edits(script: EditScript, world: EditWorld, open_asset: OpenAsset) -> EditPlan:
+def plan_edits(script: EditScript, world: EditWorld, sources: Sources) -> EditPlan:
     """Carry out a script on paths.
 
     Raises:
@@ -129,7 +150,7 @@ def plan_edits(script: EditScript, world: EditWorld, open_asset: OpenAsset) -> E
         if edit.verb in plan.conditions:
             continue
         try:
-            _VERBS[edit.verb](plan, edit.settings, open_asset)
+            _VERBS[edit.verb](plan, edit.settings, sources)
         except (InputError, UsageError) as problem:
             raise _located(problem, edit) from problem
     return plan
@@ -143,16 +164,19 @@ def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
 # -- verbs ---------------------------------------------------------------------------------------------------------------
 
 
-def _remove(plan: EditPlan, given: Any, _: OpenAsset) -> None:
+def _remove(plan: EditPlan, given: Any, _: Sources) -> None:
     names = given.ids if given.ids is not None else _chosen(plan.after, given)
     for name in names:
         _actor(plan.after, name)
-        if name in plan.inserted:
-            del plan.inserted[name]
-        if name in plan.before.actors:
-            plan.removed.append(name)
-            plan.changes.pop(name, None)
-        plan.after = replace(plan.after, actors={key: value for key, value in plan.after.actors.items() if key != name})
+        _take_away(plan, name)
+
+
+def _take_away(plan: EditPlan, name: str) -> None:
+    plan.inserted.pop(name, None)
+    if name in plan.before.actors and name not in plan.removed:
+        plan.removed.append(name)
+        plan.changes.pop(name, None)
+    plan.after = replace(plan.after, actors={key: value for key, value in plan.after.actors.items() if key != name})
 
 
 def _chosen(world: EditWorld, given: Any) -> list[str]:
@@ -176,16 +200,16 @@ def _nearest_m(world: EditWorld, actor: Actor) -> float:
     return float(np.linalg.norm(apart, axis=-1).min())
 
 
-def _move(plan: EditPlan, given: Any, _: OpenAsset) -> None:
+def _move(plan: EditPlan, given: Any, _: Sources) -> None:
     by = Displacement(given.along_m, given.left_m, given.up_m, math.radians(given.yaw_deg), given.from_s, given.ramp_s)
     _change(plan, given.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if given.ground else None))
 
 
-def _stop(plan: EditPlan, given: Any, _: OpenAsset) -> None:
+def _stop(plan: EditPlan, given: Any, _: Sources) -> None:
     _change(plan, given.id, functools.partial(paths.stopped, at_s=given.at_s, brake_m_s2=given.brake_m_s2))
 
 
-def _speed(plan: EditPlan, given: Any, _: OpenAsset) -> None:
+def _speed(plan: EditPlan, given: Any, _: Sources) -> None:
     motion = _motion(plan.after, given.id)
     begin = float(motion.times_s[0]) if given.from_s is None else max(given.from_s, float(motion.times_s[0]))
     ahead = max(0.0, (given.factor - 1) * (float(motion.times_s[-1]) - begin))
@@ -195,7 +219,7 @@ def _speed(plan: EditPlan, given: Any, _: OpenAsset) -> None:
     _change(plan, given.id, functools.partial(paths.sped, factor=given.factor, from_s=given.from_s))
 
 
-def _lane_change(plan: EditPlan, given: Any, _: OpenAsset) -> None:
+def _lane_change(plan: EditPlan, given: Any, _: Sources) -> None:
     peak = paths.QUINTIC_PEAK * abs(given.left_m) / given.duration_s**2
     if peak > given.most_lateral_m_s2:
         least = math.sqrt(paths.QUINTIC_PEAK * abs(given.left_m) / given.most_lateral_m_s2)
@@ -210,7 +234,7 @@ def _lane_change(plan: EditPlan, given: Any, _: OpenAsset) -> None:
     ))  # fmt: skip
 
 
-def _path(plan: EditPlan, given: Any, _: OpenAsset) -> None:
+def _path(plan: EditPlan, given: Any, _: Sources) -> None:
     ground = plan.after.ground if given.ground else None
     _change(plan, given.id, functools.partial(_other_path, points=_points(given.points), ground=ground))
 
@@ -232,8 +256,8 @@ def _points(points: list[list[float]]) -> np.ndarray:
     return made
 
 
-def _replace(plan: EditPlan, given: Any, open_asset: OpenAsset) -> None:
-    old, asset = _actor(plan.after, given.id), open_asset(given.by)
+def _replace(plan: EditPlan, given: Any, sources: Sources) -> None:
+    old, asset = _actor(plan.after, given.id), sources.asset(given.by)
     up = Displacement(up_m=(asset.size_m[2] - old.size_m[2]) / 2)  # wheels stay where they were
     new = Actor(asset.label, asset.size_m, paths.moved(old.motion, up))
     if given.id in plan.before.actors and given.id not in plan.removed:
@@ -243,8 +267,8 @@ def _replace(plan: EditPlan, given: Any, open_asset: OpenAsset) -> None:
     plan.after = replace(plan.after, actors={**plan.after.actors, given.id: new})
 
 
-def _insert(plan: EditPlan, given: Any, open_asset: OpenAsset) -> None:
-    asset, world = open_asset(given.asset), plan.after
+def _insert(plan: EditPlan, given: Any, sources: Sources) -> None:
+    asset, world = sources.asset(given.asset), plan.after
     name = given.id or _free_name(world, given.class_ or asset.label)
     if name in world.actors:
         raise InputError("there is an object of this id already", where="id", got=name, remedy="give the new one another id")
@@ -302,16 +326,64 @@ def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None)
     return paths.along_points(points, height, ground, _floor(world))
 
 
-def _background(plan: EditPlan, given: Any, _: OpenAsset) -> None:
-    raise InputError("another background cannot be put in by this version", got=given.run,
-        remedy="remove this edit; replace and insert put objects of other scenes in")  # fmt: skip
+def _background(plan: EditPlan, given: Any, sources: Sources) -> None:
+    world = plan.after
+    if world.ego is None or world.ground is None:
+        raise InputError("where the other street belongs is not known", remedy="give --scene, of a scene with classes")
+    if plan.background is not None:
+        raise InputError("there is another background already", got=given.run)
+    other = sources.background(given.run)
+    pose = place_background(world, other)
+    new = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
+    if "objects" not in given.keep:
+        for name in list(world.actors):
+            _take_away(plan, name)
+    standing = [name for name, actor in plan.after.actors.items() if name in plan.before.actors and not actor.moves]
+    for name in standing:  # it belongs to the street that is gone
+        _take_away(plan, name)
+    again = functools.partial(paths.regrounded, old=world.ground, new=new)
+    for name in list(plan.after.actors):
+        _change(plan, name, again)
+    _change(plan, EGO, again)
+    plan.background = other, pose
+    plan.after = replace(plan.after, ground=new)
+    plan.notes += _seams(plan.after, new)
 
 
-def _sky(plan: EditPlan, given: Any, _: OpenAsset) -> None:
+def place_background(world: EditWorld, other: Background) -> np.ndarray:
+    """world_from_other f64[4, 4]: both vehicles begin at the same place and drive the same way; heights agree along the path of ours."""
+    if world.ego is None or world.ground is None:
+        raise InputError("where the other street belongs is not known", remedy="give --scene")
+    mine, theirs = (_level(motion.poses[0]) for motion in (world.ego, other.ego))
+    pose = mine @ geometry.invert(theirs)
+    xy = world.ego.poses[:, :2, 3]
+    there = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
+    pose[2, 3] += float(np.nan_to_num(np.nanmedian(np.append(world.ground.height(xy) - there.height(xy), np.nan))))
+    return pose
+
+
+def _level(pose: np.ndarray) -> np.ndarray:
+    """A pose without pitch and roll."""
+    return geometry.yaw_matrix(geometry.yaw_of(pose), pose[:3, 3])
+
+
+def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
+    """Paths that leave the known ground of the other street."""
+    motions = {**{name: actor.motion for name, actor in world.actors.items()}, **({} if world.ego is None else {EGO: world.ego})}
+    notes = []
+    for name, motion in motions.items():
+        share = float(np.isnan(ground.height(motion.poses[:, :2, 3])).mean())
+        if share > 0.05:
+            text = f"{name} is off the known ground of the other street for {share:.0%} of its path"
+            notes.append({"kind": "off the ground", "id": name, "share": round(share, 3), "text": text})
+    return notes
+
+
+def _sky(plan: EditPlan, given: Any, _: Sources) -> None:
     plan.sky = given
 
 
-_VERBS: Final[dict[str, Callable[[EditPlan, Any, OpenAsset], None]]] = {
+_VERBS: Final[dict[str, Callable[[EditPlan, Any, Sources], None]]] = {
     "remove": _remove, "move": _move, "stop": _stop, "speed": _speed, "lane_change": _lane_change, "path": _path,
     "replace": _replace, "insert": _insert, "background": _background, "sky": _sky,
 }  # fmt: skip
