@@ -39,7 +39,7 @@ from mudg.stages.editing import assets
 from mudg.stages.editing.apply import edited_model
 from mudg.stages.editing.carried import carry_out
 from mudg.stages.editing.checks import collisions
-from mudg.stages.editing.plan import Actor, Background, EditPlan, EditWorld, Sources, plan_edits
+from mudg.stages.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.fitting.rendering import render_view
 
 SIZE = (4.0, 2.0, 1.5)
@@ -221,7 +221,7 @@ def world_of(model: SceneModel) -> EditWorld:
 
 
 def planned(text: str, world: EditWorld, opened=lambda source: None, background=lambda name: None) -> EditPlan:
-    return plan_edits(parse_edits(text, "edits.yaml"), world, Sources(opened, background))
+    return plan_edits(parse_edits(text, "edits.yaml"), world, EditSources(opened, background))
 
 
 def carried(model: SceneModel, text: str, opened=lambda source: None) -> SceneModel:
@@ -476,7 +476,7 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
     world = EditWorld(actors, Motion.recorded(ego.times_s, ego.world_from_ego))
     asset = edited.asset_of(toy(), "car-1")
     for path in scripts:
-        plan = plan_edits(read_edits(path), world, Sources(lambda source: asset, lambda name: None))
+        plan = plan_edits(read_edits(path), world, EditSources(lambda source: asset, lambda name: None))
         assert plan.removed or plan.changes
         assert not [found for found in collisions(plan) if "ego" in found["ids"]]
 

@@ -97,7 +97,7 @@ def most_visible(scene: Scene, model: SceneModel) -> str:
     Raises:
         InputError: the city has none.
     """
-    pixels = sum(np.bincount(read_label(scene, frame, "instance").ravel(), minlength=4096) for frame in scene.frames)
+    pixels = np.sum([np.bincount(read_label(scene, frame, "instance").ravel(), minlength=4096) for frame in scene.frames], 0)
     names = [name for name in model.node_names() if name.startswith(("car", "truck", "bus"))]
     if not names:
         raise InputError("no vehicle moves in this city", where=scene.id)
@@ -125,7 +125,7 @@ def row_of(case: EditCase, name: str, text: str) -> dict[str, Any]:
         parts = (new[mask], old[mask], new[mine], old[then.instance == instance], new[mask & ~mine])
         for place, part in zip(_PSNR, parts, strict=True):
             errors[place].append(part)
-        far = ~ndimage.binary_dilation(mask, iterations=NEARBY_PX)
+        far = np.logical_not(ndimage.binary_dilation(mask, iterations=NEARBY_PX))
         outside.append((np.abs(made - usual).max(-1) > SAME)[far])
         for row, seen, model in ((0, now, edited), (1, then, case.model)):
             there, drawn = seen.instance == instance, _drawn(model, case.name, frame.view)

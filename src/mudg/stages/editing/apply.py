@@ -39,14 +39,15 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
         sky: panorama of the plan's ``sky``.
     """
     without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
-    for name in without_nodes if plan.background is None else [n for n in without_nodes if n in plan.changes]:
+    for name in without_nodes if plan.background is None else ():  # else it is gone with the street
         model = _cut_out(model, name, plan)
     model = model.without_nodes([name for name in plan.removed if name in model.node_names()])
     if plan.background is not None:
         other, pose = plan.background
         model = edited.with_background(model, other.model, pose)
     kept = {node.name: node for node in model.nodes if isinstance(node, RigidNode)}
-    model = edited.with_motions(model, {name: plan.changed(name, edited.motion_of(kept[name])) for name in plan.changes})
+    changed = {name: plan.changed(name, edited.motion_of(kept[name])) for name in plan.changes if name in kept}
+    model = edited.with_motions(model, changed)
     for name, insertion in plan.inserted.items():
         asset = edited.matched_light(insertion.asset, model)[0] if insertion.match_light else insertion.asset
         actor = plan.after.actors[name]

@@ -7,19 +7,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mudg.base import log
 from mudg.base.errors import InputError
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import Motion
+from mudg.data.cloudfile import read_fused
 from mudg.data.edits import EditScript, read_edits
 from mudg.data.edits.records import AssetSource
 from mudg.data.scene import read_scene
-from mudg.models.scene.edited import Asset, ground_points
+from mudg.models.scene.edited import GROUND_CLASSES, Asset, ground_points
 from mudg.models.scene.model import SceneModel
 from mudg.stages.editing.apply import EGO_FACT, edited_cloud, edited_model, edited_scene, ego_fact, ground_of
 from mudg.stages.editing.assets import asset_from, read_asset
 from mudg.stages.editing.checks import check
-from mudg.stages.editing.plan import Background, EditPlan, EditWorld, Sources, plan_edits
+from mudg.stages.editing.plan import Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.fitting.storage import load_model
 
@@ -67,7 +70,7 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     """
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
-    plan = plan_edits(script, world, Sources(opener(script), lambda name: background_of(find_run(script.path_of(name)), name)))
+    plan = plan_edits(script, world, EditSources(opener(script), lambda name: background_of(find_run(script.path_of(name)), name)))
     made = None if scene is None else edited_scene(scene, plan)
     views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
     notes = check(plan, *views)
@@ -88,7 +91,9 @@ def background_of(parts: RunParts, name: str) -> Background:
         raise InputError("of a fit alone it is not known where its street lies", where="run", got=name,
             expected="a folder made by `mudg run`")  # fmt: skip
     scene, model = read_scene(parts.scene), load_model(parts.model)
-    ground = ground_points(model)
+    ground, cloud = ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
+    if cloud is not None and cloud.semantics is not None:
+        ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
     if not len(ground):
         raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
     return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)

@@ -42,7 +42,7 @@ class Background:
 
 
 @dataclass(frozen=True, slots=True)
-class Sources:
+class EditSources:
     """Reads what a script names: objects, and backgrounds by the path that is written there."""
 
     asset: OpenAsset
@@ -139,7 +139,7 @@ class EditPlan:
         return tuple(dict.fromkeys([*(name for name in self.changes if name in self.after.actors), *self.inserted]))
 
 
-def plan_edits(script: EditScript, world: EditWorld, sources: Sources) -> EditPlan:
+def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> EditPlan:
     """Carry out a script on paths.
 
     Raises:
@@ -164,7 +164,7 @@ def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
 # -- verbs ---------------------------------------------------------------------------------------------------------------
 
 
-def _remove(plan: EditPlan, given: Any, _: Sources) -> None:
+def _remove(plan: EditPlan, given: Any, _: EditSources) -> None:
     names = given.ids if given.ids is not None else _chosen(plan.after, given)
     for name in names:
         _actor(plan.after, name)
@@ -200,16 +200,16 @@ def _nearest_m(world: EditWorld, actor: Actor) -> float:
     return float(np.linalg.norm(apart, axis=-1).min())
 
 
-def _move(plan: EditPlan, given: Any, _: Sources) -> None:
+def _move(plan: EditPlan, given: Any, _: EditSources) -> None:
     by = Displacement(given.along_m, given.left_m, given.up_m, math.radians(given.yaw_deg), given.from_s, given.ramp_s)
     _change(plan, given.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if given.ground else None))
 
 
-def _stop(plan: EditPlan, given: Any, _: Sources) -> None:
+def _stop(plan: EditPlan, given: Any, _: EditSources) -> None:
     _change(plan, given.id, functools.partial(paths.stopped, at_s=given.at_s, brake_m_s2=given.brake_m_s2))
 
 
-def _speed(plan: EditPlan, given: Any, _: Sources) -> None:
+def _speed(plan: EditPlan, given: Any, _: EditSources) -> None:
     motion = _motion(plan.after, given.id)
     begin = float(motion.times_s[0]) if given.from_s is None else max(given.from_s, float(motion.times_s[0]))
     ahead = max(0.0, (given.factor - 1) * (float(motion.times_s[-1]) - begin))
@@ -219,7 +219,7 @@ def _speed(plan: EditPlan, given: Any, _: Sources) -> None:
     _change(plan, given.id, functools.partial(paths.sped, factor=given.factor, from_s=given.from_s))
 
 
-def _lane_change(plan: EditPlan, given: Any, _: Sources) -> None:
+def _lane_change(plan: EditPlan, given: Any, _: EditSources) -> None:
     peak = paths.QUINTIC_PEAK * abs(given.left_m) / given.duration_s**2
     if peak > given.most_lateral_m_s2:
         least = math.sqrt(paths.QUINTIC_PEAK * abs(given.left_m) / given.most_lateral_m_s2)
@@ -234,7 +234,7 @@ def _lane_change(plan: EditPlan, given: Any, _: Sources) -> None:
     ))  # fmt: skip
 
 
-def _path(plan: EditPlan, given: Any, _: Sources) -> None:
+def _path(plan: EditPlan, given: Any, _: EditSources) -> None:
     ground = plan.after.ground if given.ground else None
     _change(plan, given.id, functools.partial(_other_path, points=_points(given.points), ground=ground))
 
@@ -256,7 +256,7 @@ def _points(points: list[list[float]]) -> np.ndarray:
     return made
 
 
-def _replace(plan: EditPlan, given: Any, sources: Sources) -> None:
+def _replace(plan: EditPlan, given: Any, sources: EditSources) -> None:
     old, asset = _actor(plan.after, given.id), sources.asset(given.by)
     up = Displacement(up_m=(asset.size_m[2] - old.size_m[2]) / 2)  # wheels stay where they were
     new = Actor(asset.label, asset.size_m, paths.moved(old.motion, up))
@@ -267,7 +267,7 @@ def _replace(plan: EditPlan, given: Any, sources: Sources) -> None:
     plan.after = replace(plan.after, actors={**plan.after.actors, given.id: new})
 
 
-def _insert(plan: EditPlan, given: Any, sources: Sources) -> None:
+def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
     asset, world = sources.asset(given.asset), plan.after
     name = given.id or _free_name(world, given.class_ or asset.label)
     if name in world.actors:
@@ -326,7 +326,7 @@ def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None)
     return paths.along_points(points, height, ground, _floor(world))
 
 
-def _background(plan: EditPlan, given: Any, sources: Sources) -> None:
+def _background(plan: EditPlan, given: Any, sources: EditSources) -> None:
     world = plan.after
     if world.ego is None or world.ground is None:
         raise InputError("where the other street belongs is not known", remedy="give --scene, of a scene with classes")
@@ -370,20 +370,18 @@ def _level(pose: np.ndarray) -> np.ndarray:
 def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
     """Paths that leave the known ground of the other street."""
     motions = {**{name: actor.motion for name, actor in world.actors.items()}, **({} if world.ego is None else {EGO: world.ego})}
-    notes = []
-    for name, motion in motions.items():
-        share = float(np.isnan(ground.height(motion.poses[:, :2, 3])).mean())
-        if share > 0.05:
-            text = f"{name} is off the known ground of the other street for {share:.0%} of its path"
-            notes.append({"kind": "off the ground", "id": name, "share": round(share, 3), "text": text})
-    return notes
+    shares = {name: float(np.isnan(ground.height(motion.poses[:, :2, 3])).mean()) for name, motion in motions.items()}
+    off = {name: round(share, 3) for name, share in shares.items() if share > 0.05}
+    text = ", ".join(f"{name} ({share:.0%})" for name, share in off.items())
+    note = {"kind": "off the ground", "ids": list(off), "shares": off, "text": f"part of a path is off the other street's ground: {text}"}
+    return [note] if off else []
 
 
-def _sky(plan: EditPlan, given: Any, _: Sources) -> None:
+def _sky(plan: EditPlan, given: Any, _: EditSources) -> None:
     plan.sky = given
 
 
-_VERBS: Final[dict[str, Callable[[EditPlan, Any, Sources], None]]] = {
+_VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
     "remove": _remove, "move": _move, "stop": _stop, "speed": _speed, "lane_change": _lane_change, "path": _path,
     "replace": _replace, "insert": _insert, "background": _background, "sky": _sky,
 }  # fmt: skip
