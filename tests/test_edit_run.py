@@ -179,7 +179,7 @@ def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
     """Its own street put in again changes nothing but the sky's texels."""
     model = run / "fit" / "street_gaussians"
     edits = script(tmp_path, f"- background: {{run: {run}}}")
-    made = edit.run(EditConfig(), model, edits, tmp_path / "out", scene=run / "scene")
+    made = edit.run(EditConfig(), model, edits, tmp_path / "out", scene=run / "scene", fused=run / "fuse")
     before, after = (rendered(run / "scene", folder, tmp_path / name) for folder, name in ((model, "a"), (made, "b")))
     for one, two in zip(before, after, strict=True):
         assert (one - two).abs().mean() < 0.01
