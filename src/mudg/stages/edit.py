@@ -48,7 +48,8 @@ def run(
     parsed, digest = read_and_digest(Path(script))
     parts = find_run(Path(source))
     place, clouds = scene or parts.scene, fused or parts.fused
-    refuse_overlap(out, {"run": source, "script": script, "scene": place, "fused": clouds, **parsed.files()})
+    named = {f"{script}: {name}": path for name, path in parsed.files().items()}
+    refuse_overlap(out, {"run": source, "script": script, "scene": place, "fused": clouds, **named})
     inputs = {"edits": digest} | {f"fit {name}".strip(): store.digest(path) for name, path in parts.fits.items()}
     inputs |= {name: store.digest(path) for name, path in (("scene", place), ("fused", clouds)) if path is not None}
     device = drawing_device(config.device, "render", config.raster)
