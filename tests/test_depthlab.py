@@ -29,8 +29,9 @@ from mudg.models.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, kn
 from mudg.models.depth.inputs import DepthInput, DepthOptions
 from mudg.models.depth.networks import kind_of, load_depth_network
 from mudg.models.folders import Place
-from mudg.stages import annotate, convert, convert_depthlab
+from mudg.stages import annotate, convert
 from mudg.stages.config import AnnotateConfig, ConvertConfig
+from mudg.stages.converting import depthlab as conversion
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SAMPLING = DepthLabSampling(processing_px=48, steps=5)
@@ -47,7 +48,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
 def converted(published: tuple[Path, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The converted folder, with a sampling for small images."""
     to = tmp_path_factory.mktemp("weights") / "depthlab"
-    convert_depthlab.convert_folder(published[0], to, None, 20_000)
+    conversion.convert_folder(published[0], to, None, 20_000)
     assert json.loads((to / "model.json").read_text())["sampling"] == {
         "processing_px": 768, "steps": 50, "strength": 0.8, "normalize_scale": 1.0,
     }  # fmt: skip
@@ -81,7 +82,7 @@ def test_conversion_keeps_every_value(published: tuple[Path, dict[str, Any]], co
     assert (parts.denoising_unet.config.in_channels, parts.reference_unet.config.in_channels) == (12, 4)
     assert len(told["parts"]["denoising_unet"]["files"]) > 1  # cut to the size that was asked for
     listed = {source["file"] for source in told["facts"]["sources"]}
-    assert {f"DepthLab/{name}" for name in convert_depthlab.PICKLES.values()} < listed
+    assert {f"DepthLab/{name}" for name in conversion.PICKLES.values()} < listed
     assert all(len(source["sha256"]) == 64 for source in told["facts"]["sources"])
     assert {path.suffix for path in converted.rglob("*") if path.is_file()} == {".safetensors", ".json", ".md"}
 
@@ -114,7 +115,7 @@ def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]
         renamed[name] = value
     file = folder / "marigold-depth-v1-0" / "vae" / "diffusion_pytorch_model.safetensors"
     save_file(renamed, file, metadata={"format": "pt"})
-    convert_depthlab.convert_folder(folder, tmp_path / "out", torch.float16, 1 << 20)
+    conversion.convert_folder(folder, tmp_path / "out", torch.float16, 1 << 20)
     parts = depthlab.read_parts(tmp_path / "out", json.loads((tmp_path / "out" / "model.json").read_text()))
     rounded = {name: value.half().float() for name, value in made["vae"].state_dict().items()}
     assert renamed.keys() != rounded.keys()
@@ -198,7 +199,7 @@ def test_what_is_not_depthlab_is_refused(
     monkeypatch.chdir(tmp_path)
     spoil(tmp_path / "from")
     with pytest.raises(InputError, match=message):
-        convert_depthlab.convert_folder(tmp_path / "from", tmp_path / "out", None, 1 << 20)
+        conversion.convert_folder(tmp_path / "from", tmp_path / "out", None, 1 << 20)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["from"]
 
 

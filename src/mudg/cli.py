@@ -115,7 +115,23 @@ def _fit(args: f.Fit) -> dict[str, Any]:
 def _render(args: f.RenderFlags) -> dict[str, Any]:
     from mudg.stages import render
 
-    return {"views": render.run(args.settings, args.scene, args.model, args.out, overwrite=args.overwrite)}
+    made = render.run(args.settings, args.scene, args.model, args.out, edits=args.edits, overwrite=args.overwrite)
+    return {"views": made}
+
+
+def _edit(args: f.EditFlags) -> dict[str, Any]:
+    from mudg.stages import edit
+
+    made = edit.run(
+        args.settings, args.run, args.edits, args.out, scene=args.scene, fused=args.fused, overwrite=args.overwrite
+    )
+    return {"edited": made}
+
+
+def _asset(args: f.AssetFlags) -> dict[str, Any]:
+    from mudg.stages.editing import assets
+
+    return {"asset": assets.run_export(args.run, args.id, args.out, args.scene, args.overwrite)}
 
 
 def _score(args: f.Score) -> dict[str, Any]:
@@ -238,14 +254,25 @@ VERBS: dict[str, Verb] = {
         ("mudg render scenes/city --model runs/mudg_s --shifts-m 0 3 -3 --out runs/render",),
         _render,
     ),
+    "edit": Verb(
+        "Change a drive as an edit script says: remove, move, insert, replace, change lanes.",
+        ("mudg edit runs/kitti edits.yaml --out runs/edited",
+         "mudg edit runs/mudg_s edits.yaml --scene scenes/city --fused runs/fused --out runs/edited"),
+        _edit,
+    ),
+    "asset": Verb(
+        "Write an object of a fitted scene to a file, to be inserted into other drives.",
+        ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",),
+        _asset,
+    ),
     "score": Verb(
         "Compare views with ground truth: metrics, tables, error images.",
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
         _score,
     ),
     "bench": Verb(
-        "Run a benchmark: mdm, poses or shift against exact ground truth, real on real logs, paper for tables of papers.",
-        ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses",
+        "Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers.",
+        ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses", "mudg bench edit --out runs/edits",
          "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
          "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
          "mudg bench paper city:reported --table mudg1 --out runs/mudg1"),
@@ -256,6 +283,7 @@ VERBS: dict[str, Verb] = {
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "fit", "adapt", "synthesize", "render", "score")),
+    ("change a drive", ("edit", "asset")),
     ("benchmarks", ("bench",)),
     ("published models", ("convert",)),
 )

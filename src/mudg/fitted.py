@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import rigid_problem
-from mudg.base.types import Camera, View
+from mudg.base.types import Camera, Scene, View
 
 if TYPE_CHECKING:
     from mudg.models.scene.model import SceneModel
@@ -99,6 +99,34 @@ class FittedScene:
         if problem:
             raise InputError(f"the displacement is not rigid: {problem}", where="object_from_new")
         return FittedScene(self._model.with_object_moved(track_id, matrix))
+
+    def edited(self, script: str | Path, scene: Scene | None = None) -> FittedScene:
+        """The scene with an edit script carried out (``docs/edit.md``).
+
+        Args:
+            script: YAML file. scene: the log that it was fitted to; with it, parked objects and the vehicle can be edited.
+
+        Raises:
+            InputError: the script is not valid, or asks for what cannot be done here.
+        """
+        from mudg.data.edits import read_edits
+        from mudg.stages.editing.carried import carry_out
+
+        drive = carry_out(read_edits(script), self._model, scene)
+        return FittedScene(drive.model(self._model, keep_ego=True))
+
+    def export_asset(self, track_id: str, out: str | Path, scene: Scene | None = None) -> Path:
+        """Write one object to a file that edit scripts can insert.
+
+        Args:
+            out: a name that ends in ``.safetensors``; replaced if it exists. scene: the log, for the sides from which it was seen.
+        """
+        from mudg.models.scene.edited import asset_of
+        from mudg.stages.editing.assets import sides_of, write_asset
+
+        seen = () if scene is None else sides_of(self._model, track_id, scene).tolist()
+        write_asset(Path(out), asset_of(self._model, track_id, seen))
+        return Path(out)
 
     def render(self, camera: Camera, world_from_cam: ArrayLike, time_s: float, *, backend: str = "auto") -> Picture:
         """Render a camera at a pose and time.

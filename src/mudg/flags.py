@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 from pydantic import ValidationError
@@ -172,8 +172,44 @@ class RenderFlags(Output):
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory that the Gaussian scene was fitted to."""
     model: Annotated[Path, arg(metavar="FOLDER")]
-    """Gaussian scene written by fit."""
+    """Gaussian scene written by fit, or edit."""
+    edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
+    """Edit script (docs/edit.md) to carry out before rendering."""
     settings: Annotated[stage_config.RenderConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditFlags(Output):
+    """Flags of ``mudg edit``."""
+
+    run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
+    """Gaussian scene written by fit, or folder of a finished mudg run."""
+    edits: Annotated[Path, tyro.conf.Positional, arg(metavar="EDITS.yaml")]
+    """Edit script (docs/edit.md)."""
+    scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Scene directory that a Gaussian scene was fitted to. With it, the vehicle's path and parked objects can be edited. A run has its
+    own."""
+    fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Point clouds written by fuse, for the height of the ground (not given: the Gaussians give it). A run has its own."""
+    settings: Annotated[stage_config.EditConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetFlags(Common):
+    """Flags of ``mudg asset``."""
+
+    action: Annotated[Literal["export"], tyro.conf.Positional, arg(metavar="export")]
+    """What to do: export writes one object to a file."""
+    run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
+    """Gaussian scene written by fit, or folder of a finished mudg run."""
+    id: Annotated[str, tyro.conf.Positional, arg(metavar="ID")]
+    """Track id of a dynamic object."""
+    out: Annotated[Path, arg(metavar="FILE.safetensors")]
+    """File to write."""
+    scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Scene directory that a Gaussian scene was fitted to: it tells from which sides the object was seen. A run has its own."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace the file if it exists."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,8 +282,8 @@ class Bench(Output):
     """Flags of ``mudg bench``."""
 
     name: Annotated[str, tyro.conf.Positional, arg(metavar="BENCHMARK")]
-    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), shift (complete methods off the recorded path), real
-    (complete methods on real logs) or paper (a table of a paper)."""
+    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off
+    the recorded path), real (complete methods on real logs) or paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, arg(metavar="[LOG ...]")] = ()
     """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
     generated cities."""
@@ -265,6 +301,7 @@ class Doctor(Common):
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
     "convert": Convert, "adapt": Adapt, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
+    "edit": EditFlags, "asset": AssetFlags,
 }  # fmt: skip
 
 

@@ -115,13 +115,44 @@ def fit(
 
 def render(
     scene: Location, model: Location, out: Location, *,
-    overwrite: bool = False, config: Location | None = None, **settings: Any,
+    edits: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
-    """Render a fitted scene on recorded and shifted trajectories; returns the folder of observation sets and videos."""
+    """Render a fitted scene on recorded and shifted trajectories; returns the folder of observation sets and videos.
+
+    Args:
+        edits: an edit script to carry out before.
+    """
     from mudg.stages import render as stage
 
     made = _settings(stage_config.RenderConfig, config, settings)
-    return stage.run(made, Path(scene), Path(model), Path(out), overwrite=overwrite)
+    return stage.run(made, Path(scene), Path(model), Path(out), edits=_optional(edits), overwrite=overwrite)
+
+
+def edit(
+    source: Location, script: Location, out: Location, *,
+    scene: Location | None = None, fused: Location | None = None, overwrite: bool = False,
+    config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Change a fit, or a whole run, as an edit script says; returns the folder of the edited one.
+
+    Args:
+        source: folder of a fit or of ``run``. scene, fused: of a fit, its scene and clouds; a run has its own.
+    """
+    from mudg.stages import edit as stage
+
+    made = _settings(stage_config.EditConfig, config, settings)
+    return stage.run(
+        made, Path(source), Path(script), Path(out), scene=_optional(scene), fused=_optional(fused), overwrite=overwrite
+    )
+
+
+def export_asset(
+    source: Location, track_id: str, out: Location, *, scene: Location | None = None, overwrite: bool = False
+) -> Path:
+    """Write an object of a fit, or of a run, to a file that edit scripts can insert; returns the file."""
+    from mudg.stages.editing import assets
+
+    return assets.run_export(Path(source), track_id, Path(out), _optional(scene), overwrite)
 
 
 def score(
@@ -178,7 +209,7 @@ def bench(
     """Run a benchmark; returns the folder of ``bench.json``.
 
     Args:
-        name: ``mdm``, ``poses`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``.
+        name: ``mdm``, ``poses``, ``edit`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``.
     """
     from mudg.bench import run as stage
 

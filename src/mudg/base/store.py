@@ -278,8 +278,14 @@ def sha256_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def write_safetensors(path: Path, tensors: Mapping[str, NDArray[Any] | Tensor]) -> None:
-    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically; without a copy of them in memory."""
+def write_safetensors(
+    path: Path, tensors: Mapping[str, NDArray[Any] | Tensor], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically; without a copy of them in memory.
+
+    Args:
+        metadata: texts for the file's header.
+    """
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
@@ -294,7 +300,7 @@ def write_safetensors(path: Path, tensors: Mapping[str, NDArray[Any] | Tensor]) 
         tempfile.TemporaryDirectory(prefix=f".{path.stem}.", suffix=".part", dir=path.parent) as own,
     ):  # the library writes beside its target, under a name of its own
         try:
-            save_file(arrays, Path(own) / path.name)
+            save_file(arrays, Path(own) / path.name, **({} if metadata is None else {"metadata": dict(metadata)}))
         except SafetensorError as error:  # what it makes of a full disk
             raise OSError(str(error)) from error
         (Path(own) / path.name).replace(temporary)
@@ -321,6 +327,16 @@ def parse_safetensors(content: bytes, where: str) -> dict[str, NDArray[Any]]:
         return dict(sorted(load_numpy(content).items()))  # the library hands them out in any order
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise InputError("not a valid safetensors file", where=where, got=str(error)) from error
+
+
+def safetensors_metadata(content: bytes, where: str) -> dict[str, str]:
+    """The texts in the header of safetensors bytes; InputError names ``where``."""
+    size = int.from_bytes(content[:8], "little")
+    if not 2 <= size <= len(content) - 8:
+        raise InputError("not a valid safetensors file", where=where, got=f"{len(content)} bytes")
+    header = parse_json(content[8 : 8 + size], where)
+    found = header.get("__metadata__") if isinstance(header, dict) else None
+    return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else {}
 
 
 # directories ----------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
                without given classes, at several numbers of steps, and the seam between windows of a longer video
 poses          how much of the error of tracked boxes a fit takes out (see `bench_poses`); needs no diffusion model
+edit           edits of a fitted scene against the city regenerated with them (see `bench_edit`); needs no diffusion model
 shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
 real           whole methods on real logs, against what the methods did not see of them (see `bench_real`; own folders, too)
 paper          a table of a paper, on generated cities or real logs (see `bench_paper`; own folders, too)
@@ -26,6 +27,7 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.bench import edit as bench_edit
 from mudg.bench import paper as bench_paper
 from mudg.bench import poses as bench_poses
 from mudg.bench import real as bench_real
@@ -163,5 +165,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
     "poses": bench_poses.measure,
+    "edit": bench_edit.measure,
 }
 """Every measurement that is one folder, by name."""

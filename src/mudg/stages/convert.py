@@ -1,5 +1,5 @@
-"""convert: a published checkpoint -> a model folder that `synthesize` and training read; or DepthLab's (`convert_depthlab`), or a network
-of the scores (`scoring/converted.py`).
+"""convert: a published checkpoint -> a model folder that `synthesize` and training read; or DepthLab's (`converting/depthlab.py`),
+or a network of the scores (`scoring/converted.py`).
 
 The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's restricted
 unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so that the
@@ -28,8 +28,8 @@ from mudg.models.published import clip
 from mudg.models.published import files as published_files
 from mudg.models.published.clip import TextTower
 from mudg.models.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
-from mudg.stages import convert_depthlab
 from mudg.stages.config import ConvertConfig
+from mudg.stages.converting import depthlab
 from mudg.stages.scoring.converted import convert_weights
 
 _UNET = "model.diffusion_model."
@@ -133,9 +133,9 @@ def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, i
     if config.resolution != "auto" or config.towers:
         raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(folder),
                          remedy="leave them out, or give a checkpoint file")  # fmt: skip
-    files = convert_depthlab.find(folder).files()
+    files = depthlab.find(folder).files()
     dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
-    return functools.partial(convert_depthlab.convert_folder, folder, to, dtype, shard_bytes), memory_limit(config, *files)
+    return functools.partial(depthlab.convert_folder, folder, to, dtype, shard_bytes), memory_limit(config, *files)
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:

@@ -23,10 +23,14 @@ from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
 from mudg.core.raster.rasterize import RasterConfig
+from mudg.data.edits import EditScript
 from mudg.data.exporters.video import write_mp4
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
+from mudg.models.scene.model import SceneModel
 from mudg.stages.config import RenderConfig
+from mudg.stages.editing.apply import scene_seen_by
+from mudg.stages.editing.carried import carry_out, read_and_digest
 from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.fitting.storage import RADIANCE, kind_of
 from mudg.stages.fitting.views import resized_view
@@ -36,28 +40,40 @@ from mudg.stages.radiance.storage import load_field
 _OUTPUT = VerbOutput("render", 1, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
-def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite: bool = False) -> Path:
+def run(
+    config: RenderConfig, scene: Path, model: Path, out: Path, *, edits: Path | None = None, overwrite: bool = False
+) -> Path:
     """Render every camera and shift of the configuration.
 
     Args:
         scene: scene directory; gives cameras, times and the path of the vehicle.
         model: folder made by fit.
         out: one observation folder (and video) per trajectory.
+        edits: an edit script to carry out before.
 
     Returns:
         ``out``, finished; an interrupted run continues with the next missing view.
     """
-    refuse_overlap(out, {"scene": scene, "model": model})
+    refuse_overlap(out, {"scene": scene, "model": model, "edits": edits})
     inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
+    script = None
+    if edits is not None:
+        script, inputs["edits"] = read_and_digest(Path(edits))
     radiance = kind_of(Path(model)) == RADIANCE
-    if radiance and config.remove_tracks:
-        raise UsageError("a radiance field has no objects to leave out", where=str(model), remedy="leave --remove-tracks out")
+    if radiance and (config.remove_tracks or script is not None):
+        raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),
+            remedy="leave --remove-tracks and --edits out")  # fmt: skip
     device = choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
+    edited = None if script is None else _edited(scene, model, script)  # what cannot be done is told before anything is written
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    draw, source = (_field_drawer if radiance else _scene_drawer)(config, Path(model), device)
-    paths = trajectories(read_scene(Path(scene)), config)
+    if radiance:
+        loaded, (draw, source) = read_scene(Path(scene)), _field_drawer(config, Path(model), device)
+    else:
+        loaded, fitted = edited or _edited(scene, model, None)
+        draw, source = _scene_drawer(config, fitted.to(device))
+    paths = trajectories(loaded, config)
     try:
         with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
             for path in paths:
@@ -71,12 +87,21 @@ def run(config: RenderConfig, scene: Path, model: Path, out: Path, *, overwrite:
     return folder.path
 
 
+def _edited(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene, SceneModel]:
+    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script."""
+    fitted = load_model(Path(model))
+    loaded = scene_seen_by(read_scene(Path(scene)), fitted.facts)
+    if script is None:
+        return loaded, fitted
+    drive = carry_out(script, fitted, loaded)
+    return drive.scene or loaded, drive.model(fitted)
+
+
 Drawer = Callable[[View], Observation]
 
 
-def _scene_drawer(config: RenderConfig, model: Path, device: torch.device) -> tuple[Drawer, str]:
+def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:
     """What draws the views of a scene of Gaussians, and its name."""
-    fitted = load_model(model).to(device)
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)
     source, raster = str(fitted.facts.get("method", "fit")), RasterConfig(backend=config.raster, near_m=NEAR_M)

@@ -5,6 +5,7 @@ Needs the native library: without it, building a world raises ResourceError nami
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ from mudg.data.city.weather import lamp_places, weather_numbers
 
 DATASET = "mudg procedural city"
 GENERATOR_VERSION = 1
+FAR_BELOW_M = 1000.0
+"""How far below the street what was taken away stands: nobody sees it there, and it shades nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,6 +138,30 @@ class CityWorld:
                 where="source.recipe.generator_version", expected=str(GENERATOR_VERSION),
                 got=str(recipe.get("generator_version")), remedy="generate it again")  # fmt: skip
         return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
+
+    def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
+        """The same world, light and shadows included, with some vehicles or people elsewhere or gone.
+
+        Args:
+            keys: track id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not there.
+        """
+        known = {track.id: index for index, track in enumerate(self.tracks())}
+        moved = self._keys.copy()
+        for track_id, values in keys.items():
+            if track_id not in known:
+                raise UsageError("the city has no such object", expected=", ".join(known), got=track_id)
+            if values is None:
+                moved[:, known[track_id], 2] = -FAR_BELOW_M
+            else:
+                moved[:, known[track_id]] = values
+        other = copy.copy(self)
+        other._keys = moved
+        return other
+
+    @property
+    def key_times_s(self) -> NDArray[np.float64]:
+        """Times f64[K] of the keys of all objects."""
+        return self._key_times
 
     def source(self) -> Source:
         """What a scene of this world records about its origin."""

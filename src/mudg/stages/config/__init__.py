@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.adapt import AdaptConfig
     from mudg.stages.config.bench import BenchConfig
     from mudg.stages.config.convert import ConvertConfig
+    from mudg.stages.config.edit import EditConfig
     from mudg.stages.config.fit import FitConfig
     from mudg.stages.config.learn import LearnConfig
     from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BenchConfig": "mudg.stages.config.bench",
     "ConvertConfig": "mudg.stages.config.convert",
+    "EditConfig": "mudg.stages.config.edit",
     "FitConfig": "mudg.stages.config.fit",
     "LearnConfig": "mudg.stages.config.learn",
     "AdaptConfig": "mudg.stages.config.adapt",
@@ -52,6 +54,7 @@ __all__ = [
     "AnnotateConfig",
     "BenchConfig",
     "ConvertConfig",
+    "EditConfig",
     "FitConfig",
     "FuseConfig",
     "IngestConfig",

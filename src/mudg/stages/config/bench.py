@@ -23,10 +23,10 @@ class BenchConfig:
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn."""
     cities: Literal["reported", "development"] = "reported"
-    """mdm: list of cities. Choose settings on development; report results on reported, on which nothing was chosen."""
+    """mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen."""
     count: int = Field(default=6, ge=1, le=6)
-    """mdm: number of cities taken from the list, 1 to 6. Each gives four clips: shifted by 2, 3 and 4 m, and on the recorded
-    path."""
+    """mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the
+    recorded path."""
     steps: tuple[int, ...] = (1, 2, 8)
     """mdm: numbers of denoising steps to compare; each is measured on its own."""
     sampler: Literal["ddim", "dpm_solver"] = "ddim"
@@ -38,7 +38,7 @@ class BenchConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)
-    """mdm, poses: number of torch threads."""
+    """mdm, poses, edit: number of torch threads."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     list: Literal["development", "reported"] = "development"
@@ -82,6 +82,6 @@ class BenchConfig:
     """real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says).
     paper with a list of cities: 0:END (empty = 0:24)."""
     pose_iterations: int = Field(default=300, ge=1)
-    """poses: optimisation steps of every fit."""
+    """poses, edit: optimisation steps of every fit."""
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""

@@ -1,0 +1,270 @@
+"""Changes of how road users move: pure functions on the keys of a path, for tracks, the vehicle and nodes of a fitted scene alike.
+
+A ``Motion`` is the path of one of them: poses at key times, straight lines and slerp between them. Each key also says which moment of
+the recording it shows (``source_s``), so that what moves within a box (a walking person) can follow when a path is retimed.
+
+Lane change: ``y(s) = d (10 s^3 - 15 s^4 + 6 s^5)``, ``s = (t - t0) / T``: no lateral speed and acceleration at its ends. Its largest
+lateral acceleration, at ``s = 1/2 +- sqrt(3)/6``, is ``10 / sqrt(3) d / T^2``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
+
+from mudg.base import geometry
+from mudg.base.errors import InputError
+from mudg.core.ground import HeightMap
+
+Array = NDArray[np.float64]
+STEP_S: Final = 0.05
+"""Distance of the keys that describe a changed stretch of a path."""
+STANDING_M_S: Final = 0.5
+"""Slower than this, a road user stands: it has no direction in which it could change lanes."""
+QUINTIC_PEAK: Final = 10 / 3**0.5
+"""Largest second derivative of ``quintic``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """A path.
+
+    Args:
+        times_s: f64[K], strictly increasing.
+        poses: world_from_object f64[K, 4, 4], metres.
+        source_s: f64[K], the moment of the recording that each key shows.
+    """
+
+    times_s: Array
+    poses: Array
+    source_s: Array
+
+    @classmethod
+    def recorded(cls, times_s: ArrayLike, poses: Array) -> Motion:
+        """A path as it was recorded."""
+        times = np.asarray(times_s, np.float64)
+        return cls(times, np.asarray(poses, np.float64), times)
+
+    def pose_at(self, time_s: float) -> Array | None:
+        """Pose f64[4, 4]; None outside the span."""
+        return geometry.pose_at(self.times_s, self.poses, time_s)
+
+    def at(self, times_s: Array) -> Motion:
+        """The same path with keys at these times, which lie within its span."""
+        inside = np.clip(times_s, self.times_s[0], self.times_s[-1])
+        poses = [geometry.pose_at(self.times_s, self.poses, float(t)) for t in inside]
+        return Motion(times_s, np.stack(poses), np.interp(inside, self.times_s, self.source_s))  # type: ignore[arg-type]
+
+    def with_keys_between(self, begin_s: float, end_s: float) -> Motion:
+        """The same path with further keys, every `STEP_S` within a stretch."""
+        begin, end = max(begin_s, self.times_s[0]), min(end_s, self.times_s[-1])
+        if end <= begin:
+            return self
+        more = np.linspace(begin, end, max(2, int(np.ceil((end - begin) / STEP_S)) + 1))
+        return self.at(_merged(self.times_s, more))
+
+    def speed_at(self, time_s: float) -> float:
+        """Speed in metres per second, over 0.2 s."""
+        before, after = (float(np.clip(time_s + d, self.times_s[0], self.times_s[-1])) for d in (-0.1, 0.1))
+        ends = self.at(np.array([before, after])).poses[:, :3, 3] if after > before else np.zeros((2, 3))
+        return float(np.linalg.norm(ends[1] - ends[0]) / max(after - before, 1e-9))
+
+    def travelled_m(self) -> Array:
+        """Length of the path up to each key, f64[K] metres."""
+        steps = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def quintic(s: Array) -> Array:
+    """From 0 to 1 with no speed and acceleration at the ends; 0 before, 1 after."""
+    u = np.clip(s, 0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+# -- where ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Displacement:
+    """A displacement in the frame of the object: metres ahead, to the left and up, a turn to the left in radians.
+
+    Args:
+        from_s: when it begins; None: it is there at all times. ramp_s: how long it takes to come about.
+    """
+
+    ahead_m: float = 0.0
+    left_m: float = 0.0
+    up_m: float = 0.0
+    yaw_rad: float = 0.0
+    from_s: float | None = None
+    ramp_s: float = 0.0
+
+    @property
+    def matrix(self) -> Array:
+        """f64[4, 4] of the whole displacement."""
+        return geometry.yaw_matrix(self.yaw_rad, (self.ahead_m, self.left_m, self.up_m))
+
+
+def moved(motion: Motion, by: Displacement, ground: HeightMap | None = None) -> Motion:
+    """A path displaced in the object's own frame; on ``ground``, at the height above it that it had."""
+    if by.from_s is None:
+        changed = replace(motion, poses=motion.poses @ by.matrix)
+        return changed if ground is None else grounded(changed, motion, ground)
+    ramp = max(by.ramp_s, 1e-3)
+    keyed = motion.with_keys_between(by.from_s, by.from_s + ramp)
+    share = quintic((keyed.times_s - by.from_s) / ramp)
+    steps = [geometry.yaw_matrix(w * by.yaw_rad, (w * by.ahead_m, w * by.left_m, w * by.up_m)) for w in share]
+    changed = replace(keyed, poses=keyed.poses @ np.stack(steps))
+    return changed if ground is None else grounded(changed, keyed, ground)
+
+
+def lane_changed(motion: Motion, left_m: float, start_s: float, duration_s: float, ground: HeightMap | None = None) -> Motion:
+    """A path that changes lanes: quintic offset to the left of the recorded path, heading along the new one.
+
+    Raises:
+        InputError: it begins outside the path, or the road user stands then.
+    """
+    first, last = float(motion.times_s[0]), float(motion.times_s[-1])
+    if not first <= start_s < last:
+        raise InputError("the lane change begins outside the path", where="start_s", expected=f"{first:.2f}..{last:.2f} s",
+            got=f"{start_s} s")  # fmt: skip
+    speed = motion.speed_at(start_s)
+    if speed < STANDING_M_S:
+        raise InputError("only what drives can change lanes", where="start_s", expected=f"at least {STANDING_M_S} m/s",
+            got=f"{speed:.2f} m/s at {start_s} s", remedy="use move to displace what stands")  # fmt: skip
+    keyed = motion.with_keys_between(start_s, start_s + duration_s)
+    s = (keyed.times_s - start_s) / duration_s
+    u = np.clip(s, 0, 1)
+    lateral_m_s = left_m / duration_s * 30 * u**2 * (1 - u) ** 2
+    poses = keyed.poses.copy()
+    for i, (offset, rate) in enumerate(zip(left_m * quintic(s), lateral_m_s, strict=True)):
+        heading = geometry.yaw_of(keyed.poses[i])
+        turn = np.arctan2(rate, max(keyed.speed_at(float(keyed.times_s[i])), STANDING_M_S))
+        poses[i, :3, :3] = geometry.yaw_matrix(float(turn))[:3, :3] @ keyed.poses[i, :3, :3]
+        poses[i, :2, 3] += offset * np.array([-np.sin(heading), np.cos(heading)])
+    changed = replace(keyed, poses=poses)
+    return changed if ground is None else grounded(changed, keyed, ground)
+
+
+def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
+    """Set a changed path on the ground: the height above it, and the tilt against it, are those that the path had before.
+
+    Keys of both belong together. Where the ground is unknown at either place, a key stays as it is.
+    """
+    new_xy, old_xy = motion.poses[:, :2, 3], before.poses[:, :2, 3]
+    rise = ground.height(new_xy) - ground.height(old_xy)
+    poses = motion.poses.copy()
+    for i, (up, new, old) in enumerate(zip(rise, ground.normal(new_xy), ground.normal(old_xy), strict=True)):
+        if np.isfinite(up):
+            poses[i, 2, 3] += up
+            poses[i, :3, :3] = _turn_between(old, new) @ poses[i, :3, :3]
+    return replace(motion, poses=poses)
+
+
+def regrounded(motion: Motion, old: HeightMap, new: HeightMap) -> Motion:
+    """A path on other ground below the same places: the height above it and the tilt against it stay. Unknown ground changes nothing."""
+    xy = motion.poses[:, :2, 3]
+    poses = motion.poses.copy()
+    rise = new.height(xy) - old.height(xy)
+    for i, (up, below, above) in enumerate(zip(rise, old.normal(xy), new.normal(xy), strict=True)):
+        if np.isfinite(up):
+            poses[i, 2, 3] += up
+            poses[i, :3, :3] = _turn_between(below, above) @ poses[i, :3, :3]
+    return replace(motion, poses=poses)
+
+
+def along_points(points: Array, height_m: float, ground: HeightMap | None, floor_m: float = 0.0) -> Motion:
+    """A path through given places.
+
+    Args:
+        points: f64[P, 4]: time in seconds, x, y in metres, heading in radians (NaN: along the path); times increase. One point stands.
+        height_m: of the object's origin above the ground. floor_m: height of the ground where ``ground`` does not know it.
+    """
+    times = points[:, 0] if len(points) > 1 else points[[0, 0], 0] + [0.0, 1e-3]
+    xy, yaw = points[:, 1:3], points[:, 3]
+    if len(points) > 1:
+        keys = _merged(times, np.linspace(times[0], times[-1], max(2, int(np.ceil((times[-1] - times[0]) / (2 * STEP_S))) + 1)))
+        path = PchipInterpolator(times, xy)
+        velocity = path.derivative()(keys)
+        along = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
+        given = np.isfinite(yaw)
+        yaw = along if not given.all() else np.interp(keys, times, np.unwrap(yaw))
+        xy = path(keys)
+    else:
+        keys, xy, yaw = times, xy[[0, 0]], np.nan_to_num(yaw)[[0, 0]]
+    floor = np.full(len(keys), floor_m) if ground is None else np.nan_to_num(ground.height(xy), nan=floor_m)
+    poses = np.stack([geometry.yaw_matrix(float(a), (x, y, z + height_m)) for a, (x, y), z in zip(yaw, xy, floor, strict=True)])
+    if ground is not None:
+        for pose, normal in zip(poses, ground.normal(xy), strict=True):
+            pose[:3, :3] = _turn_between(np.array([0.0, 0, 1]), normal) @ pose[:3, :3]
+    return Motion.recorded(keys, poses)
+
+
+# -- when ----------------------------------------------------------------------------------------------------------------
+
+
+def stopped(motion: Motion, at_s: float, brake_m_s2: float) -> Motion:
+    """A path that brakes evenly from ``at_s`` on until it stands; it never goes farther than the recorded one has by then.
+
+    Raises:
+        InputError: ``at_s`` lies outside the path.
+    """
+    first, last = float(motion.times_s[0]), float(motion.times_s[-1])
+    if not first <= at_s <= last:
+        raise InputError("it stops outside its path", where="at_s", expected=f"{first:.2f}..{last:.2f} s", got=f"{at_s} s")
+    keyed = motion.with_keys_between(at_s, last)
+    after = keyed.times_s >= at_s
+    way = keyed.travelled_m()
+    begun = np.interp(at_s, keyed.times_s, way)
+    passed = np.minimum(keyed.times_s[after] - at_s, motion.speed_at(at_s) / brake_m_s2)
+    braked = begun + motion.speed_at(at_s) * passed - brake_m_s2 / 2 * passed**2
+    reached = np.minimum(braked, way[after])
+    rising = np.concatenate([[True], np.diff(way[after]) > 1e-9])
+    recording = keyed.times_s.copy()
+    recording[after] = np.interp(reached, way[after][rising], keyed.times_s[after][rising])
+    if motion.speed_at(at_s) < 0.1:
+        recording[after] = at_s
+    return _retimed(motion, keyed.times_s, recording)
+
+
+def sped(motion: Motion, factor: float, from_s: float | None = None) -> Motion:
+    """A path driven at another speed from a moment on. Where it gets ahead of the recording, it goes on straight as at its end.
+
+    Args:
+        factor: > 0; 0.5 is half as fast.
+    """
+    begin = float(motion.times_s[0]) if from_s is None else float(np.clip(from_s, motion.times_s[0], motion.times_s[-1]))
+    keyed = motion.with_keys_between(begin, float(motion.times_s[-1]))
+    recording = np.where(keyed.times_s < begin, keyed.times_s, begin + factor * (keyed.times_s - begin))
+    return _retimed(motion, keyed.times_s, recording)
+
+
+def _retimed(motion: Motion, times_s: Array, recording_s: Array) -> Motion:
+    """The path that is at ``times_s`` where the given one was at ``recording_s``; beyond its end, straight on at its last speed."""
+    found, last = motion.at(recording_s), float(motion.times_s[-1])
+    beyond = np.maximum(recording_s - last, 0)
+    if beyond.any() and len(motion.times_s) > 1:
+        ends = motion.at(np.array([max(last - 0.2, float(motion.times_s[0])), last])).poses[:, :3, 3]
+        velocity = (ends[1] - ends[0]) / min(0.2, last - float(motion.times_s[0]))
+        found.poses[:, :3, 3] += beyond[:, None] * velocity
+    return Motion(times_s, found.poses, found.source_s)
+
+
+# -- helpers -------------------------------------------------------------------------------------------------------------
+
+
+def _merged(a: Array, b: Array) -> Array:
+    """Both lists of times as one, increasing; of two that nearly agree the one in ``a`` stays."""
+    near = np.abs(a[:, None] - b[None]).min(0) < 1e-4 if len(a) else np.zeros(len(b), bool)
+    return np.sort(np.concatenate([a, b[~near]]))
+
+
+def _turn_between(a: Array, b: Array) -> Array:
+    """The smallest rotation f64[3, 3] that takes unit vector ``a`` to ``b``, which are not opposite."""
+    axis, cosine = np.cross(a, b), float(a @ b)
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + cosine)

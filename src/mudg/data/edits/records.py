@@ -1,0 +1,287 @@
+"""What each verb of an edit script says. Distances in metres, times in seconds on the scene's clock, angles in degrees."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from mudg.base.errors import InputError
+from mudg.base.records import Number, StrictRecord, after, checked_by
+
+EGO: Final = "ego"
+"""The id of the recording vehicle in edit scripts."""
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+def _named(value: str) -> str:
+    if not value.strip():
+        raise InputError("an id is empty", expected="the id of a track", got=repr(value))
+    return value
+
+
+Name = Annotated[str, after(_named)]
+
+
+def _not_ego(value: str) -> str:
+    if value == EGO:
+        raise InputError("the recording vehicle cannot be edited so", expected="the id of a track", got=EGO,
+            remedy="ego takes lane_change, speed, stop, move and path")  # fmt: skip
+    return value
+
+
+ActorName = Annotated[str, after(_named), after(_not_ego)]
+
+
+class AssetSource(StrictRecord):
+    """Where an object comes from: a fitted scene (``run`` and ``id``) or an asset ``file``. Paths are relative to the script."""
+
+    run: Name | None = None
+    id: Name | None = None
+    file: Name | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.file is None) == (self.run is None) or (self.run is None) != (self.id is None):
+            checked_by(_refuse_source)(self)
+        return self
+
+
+def _refuse_source(source: AssetSource) -> None:
+    given = [name for name in ("run", "id", "file") if getattr(source, name) is not None]
+    raise InputError("it is not clear where the object comes from", expected="run and id, or file alone",
+        got=" and ".join(given) or "none of them")  # fmt: skip
+
+
+class RemoveEdit(StrictRecord):
+    """Take objects away: those of ``ids``, or those of a ``class``, all or only ``moving`` ones, all or near the vehicle's path."""
+
+    ids: Annotated[list[ActorName], Field(min_length=1)] | None = None
+    class_: Name | None = Field(default=None, alias="class")
+    moving: bool | None = None
+    within_m: Positive | None = None
+
+    @model_validator(mode="after")
+    def _either(self) -> Self:
+        by_kind = self.class_ is not None or self.moving is not None or self.within_m is not None
+        if (self.ids is None) != by_kind:
+            checked_by(_refuse_selection)(by_kind)
+        return self
+
+
+def _refuse_selection(both: bool) -> None:
+    raise InputError("objects are chosen by ids or by kind", expected="ids, or any of class, moving, within_m",
+        got="both" if both else "nothing")  # fmt: skip
+
+
+class MoveEdit(StrictRecord):
+    """Displace an object in its own frame, for good or from a moment on."""
+
+    id: Name
+    along_m: Number = 0.0
+    left_m: Number = 0.0
+    up_m: Number = 0.0
+    yaw_deg: Number = 0.0
+    from_s: Number | None = None
+    ramp_s: NotNegative = 1.0
+    ground: bool = True
+
+
+class StopEdit(StrictRecord):
+    """Brake evenly, and stand from then on."""
+
+    id: Name
+    at_s: Number
+    brake_m_s2: Annotated[float, Field(gt=0, le=12)] = 4.0
+
+
+class SpeedEdit(StrictRecord):
+    """Drive the same path faster or slower."""
+
+    id: Name
+    factor: Annotated[float, Field(gt=0, le=5)]
+    from_s: Number | None = None
+
+
+class LaneChangeEdit(StrictRecord):
+    """Change lanes, smoothly."""
+
+    id: Name
+    left_m: Number
+    start_s: Number
+    duration_s: Positive
+    most_lateral_m_s2: Positive = 4.0
+    ground: bool = True
+
+
+def _path_points(points: list[list[float]]) -> list[list[float]]:
+    for index, point in enumerate(points):
+        if len(point) not in (3, 4):
+            raise InputError("a point of a path has the wrong length", where=f"[{index}]", expected="[t, x, y] or [t, x, y, yaw_deg]",
+                got=str(point)[:80])  # fmt: skip
+        if index and point[0] <= points[index - 1][0]:
+            raise InputError("the times of a path do not increase", where=f"[{index}]", expected=f"more than {points[index - 1][0]} s",
+                got=f"{point[0]} s")  # fmt: skip
+    if len({len(point) for point in points}) > 1:
+        raise InputError("some points of a path have a yaw and others have none", expected="all or none")
+    return points
+
+
+Points = Annotated[list[list[Number]], Field(min_length=1), AfterValidator(checked_by(_path_points))]
+
+
+class PathEdit(StrictRecord):
+    """Drive another path: points [t, x, y, yaw_deg] or [t, x, y] in the world."""
+
+    id: Name
+    points: Points
+    ground: bool = True
+
+    @model_validator(mode="after")
+    def _drives(self) -> Self:
+        if len(self.points) < 2:
+            checked_by(_refuse_point)(self.points)
+        return self
+
+
+def _refuse_point(points: list[list[float]]) -> None:
+    raise InputError("a path needs two points", where="points", got=str(points))
+
+
+class ReplaceEdit(StrictRecord):
+    """Put another object in the place of one."""
+
+    id: ActorName
+    by: AssetSource
+    match_light: bool = True
+
+
+class PlaceNear(StrictRecord):
+    """A place relative to the vehicle or to an object: where that is at ``at_s``, or with it all the time."""
+
+    id: Name = EGO
+    at_s: Number | None = None
+    ahead_m: Number = 0.0
+    left_m: Number = 0.0
+    yaw_deg: Number = 0.0
+
+
+class InsertEdit(StrictRecord):
+    """Add an object, on a ``path`` or ``near`` something."""
+
+    asset: AssetSource
+    id: ActorName | None = None
+    class_: Name | None = Field(default=None, alias="class")
+    path: Points | None = None
+    near: PlaceNear | None = None
+    ground: bool = True
+    shadow: Share = 0.6
+    match_light: bool = True
+
+    @model_validator(mode="after")
+    def _placed(self) -> Self:
+        if (self.path is None) == (self.near is None):
+            checked_by(_refuse_place)(self)
+        return self
+
+
+def _refuse_place(edit: InsertEdit) -> None:
+    raise InputError("an object to insert needs one place", expected="path or near", got="both" if edit.path else "neither")
+
+
+def _with_ego(keep: list[str]) -> list[str]:
+    if "ego" not in keep:
+        raise InputError("the vehicle keeps its own path", expected="[objects, ego] or [ego]", got=str(keep))
+    return keep
+
+
+class BackgroundEdit(StrictRecord):
+    """Another street around the vehicle and the moving objects of this one: that of a folder of ``mudg run``."""
+
+    run: Name
+    keep: Annotated[list[Literal["objects", "ego"]], Field(min_length=1), after(_with_ego)] = Field(
+        default_factory=lambda: ["objects", "ego"]
+    )
+
+
+class SkyEdit(StrictRecord):
+    """Another sky: a panorama of all directions (longitude across, zenith at the top), turned to the left by ``yaw_deg``."""
+
+    image: Name
+    yaw_deg: Number = 0.0
+
+
+class FogEdit(StrictRecord):
+    """Fog: where contrast falls to 5 %; how it thins out with height."""
+
+    visibility_m: Annotated[float, Field(ge=5, le=100_000)] = 150.0
+    height_m: Annotated[float, Field(ge=0, le=2000)] = 0.0
+    top_m: Annotated[float, Field(ge=5, le=5000)] = 300.0
+
+
+Wind = Annotated[list[Annotated[float, Field(ge=-40, le=40)]], Field(min_length=2, max_length=2)]
+
+
+class RainEdit(StrictRecord):
+    """Falling rain."""
+
+    mm_h: Annotated[float, Field(ge=0, le=150)] = 10.0
+    wind_m_s: Wind = Field(default_factory=lambda: [0.0, 0.0])
+    reach_m: Annotated[float, Field(ge=1, le=30)] = 8.0
+
+
+class SnowEdit(StrictRecord):
+    """Snow on the ground, and falling."""
+
+    cover: Share = 0.6
+    mm_h: Annotated[float, Field(ge=0, le=10)] = 0.0
+    tracks: Share = 0.3
+    wind_m_s: Wind = Field(default_factory=lambda: [0.5, 0.0])
+    reach_m: Annotated[float, Field(ge=1, le=30)] = 8.0
+
+
+class WeatherEdit(StrictRecord):
+    """Other weather."""
+
+    fog: FogEdit | None = None
+    recorded_visibility_m: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
+    rain: RainEdit | None = None
+    wet: Share = 0.0
+    puddles: Share = 0.0
+    snow: SnowEdit | None = None
+
+
+class LightEdit(StrictRecord):
+    """Other light."""
+
+    time: Literal["as_recorded", "overcast", "dusk", "night"] = "as_recorded"
+    sun_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    sun_elevation_deg: Annotated[float, Field(ge=-10, le=90)] = 6.0
+    headlights: bool = True
+    lamps: bool = True
+    exposure_ev: Annotated[float, Field(ge=-10, le=10)] = 0.0
+
+
+class SeasonEdit(StrictRecord):
+    """Another season."""
+
+    leaves: Literal["autumn", "bare"]
+
+
+VERBS: Final[dict[str, type[StrictRecord]]] = {
+    "remove": RemoveEdit, "move": MoveEdit, "stop": StopEdit, "speed": SpeedEdit, "lane_change": LaneChangeEdit, "path": PathEdit,
+    "replace": ReplaceEdit, "insert": InsertEdit, "background": BackgroundEdit, "sky": SkyEdit,
+    "weather": WeatherEdit, "light": LightEdit, "season": SeasonEdit,
+}  # fmt: skip
+CONDITIONS: Final = ("weather", "light", "season")
+"""Verbs that change no geometry."""
+
+
+def files_of(edit: Any) -> list[str]:
+    """Paths that an edit names, as written."""
+    source = getattr(edit, "asset", None) or getattr(edit, "by", None)
+    named = [source.run or source.file] if source is not None else []
+    return named + [value for name in ("run", "image") if isinstance(value := getattr(edit, name, None), str)]

@@ -1,0 +1,187 @@
+"""A plan carried out: on a fitted scene, on fused clouds, on what a scene says of boxes and of the vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from mudg.base import geometry, log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import EgoPath, FusedCloud, PointCloud, Scene, Track, View
+from mudg.core.edit import Motion
+from mudg.core.ground import HeightMap
+from mudg.data.scene import decode_image
+from mudg.models.scene import edited
+from mudg.models.scene.edited import Asset
+from mudg.models.scene.initial import SH_C0
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
+from mudg.models.scene.sky import SkyNode
+from mudg.stages.editing.plan import Actor, EditPlan
+
+EGO_FACT: Final = "edited_ego"
+"""Fact of a fitted scene that was edited by itself: the vehicle's path, keys as rows [time, 16 numbers of the pose]."""
+CUT_SHADOW: Final = 0.6
+"""Strength of the contact shadow of what was cut out of the background."""
+
+
+def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> SceneModel:
+    """A fitted scene with a plan carried out.
+
+    Args:
+        sky: panorama of the plan's ``sky``.
+    """
+    without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
+    for name in without_nodes if plan.background is None else ():  # else it is gone with the street
+        model = _cut_out(model, name, plan)
+    model = model.without_nodes([name for name in plan.removed if name in model.node_names()])
+    if plan.background is not None:
+        other, pose = plan.background
+        model = edited.with_background(model, other.model, pose)
+    kept = {node.name: node for node in model.nodes if isinstance(node, RigidNode)}
+    changed = {name: plan.changed(name, edited.motion_of(kept[name])) for name in plan.changes if name in kept}
+    model = edited.with_motions(model, changed)
+    for name, insertion in plan.inserted.items():
+        asset = edited.matched_light(insertion.asset, model)[0] if insertion.match_light else insertion.asset
+        actor = plan.after.actors[name]
+        model = edited.with_asset(model, asset, name, actor.motion, actor.label)
+        if insertion.shadow > 0:
+            model = edited.with_shadow(model, name, insertion.shadow)
+    if sky is not None and plan.sky is not None:
+        model = replace(model, sky=panorama(sky, plan.sky.yaw_deg, model))
+    model.sort_rows()
+    return model
+
+
+def _cut_out(model: SceneModel, name: str, plan: EditPlan) -> SceneModel:
+    """A copy with an object of its own for what stands in a box; unchanged where the fit shows nothing that is to be removed.
+
+    Raises:
+        UsageError: an object that is to be moved does not show in the fit.
+    """
+    actor = plan.before.actors[name]
+    try:
+        if actor.moves:
+            raise UsageError("this object has no Gaussians of its own in the fit: the recording hardly saw it", where=f"track {name!r}",
+                remedy="leave it out of the script")  # fmt: skip
+        cut = edited.cut_out(model, _track(name, actor))
+    except UsageError as problem:
+        if name not in plan.removed:
+            raise
+        log.info(f"edit: {name} is not in the fit: {problem.what}")
+        return model
+    return cut if name in plan.removed else edited.with_shadow(cut, name, CUT_SHADOW)
+
+
+def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
+    """A sky from an image of all directions: longitude across, growing to the right as one looks at it; zenith in the top row."""
+    rows = 256 if model.sky is None else model.sky.rows
+    rgb = decode_image(store.read_bytes(path), str(path))
+    height, width = rgb.shape[:2]
+    if width != 2 * height:
+        raise InputError("a panorama of the sky is twice as wide as it is high", where=str(path), got=f"{width}x{height}")
+    small = np.asarray(Image.fromarray(rgb).resize((2 * rows, rows), Image.Resampling.BOX), np.float32) / 255
+    turned = np.roll(small[:, ::-1], round(yaw_deg / 360 * 2 * rows), axis=1)  # columns of ``SkyNode`` grow to the left
+    sky = SkyNode.uniform(rows)
+    sky.table.columns["panorama"].detach().copy_(torch.from_numpy(turned.transpose(2, 0, 1).copy())[None])
+    return sky.to(model.device)
+
+
+# -- clouds --------------------------------------------------------------------------------------------------------------
+
+
+def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
+    """Fused clouds with a plan carried out; moved objects need no other points, for these lie in the frame of their box."""
+    static, objects = cloud.static, dict(cloud.objects)
+    standing = {name for name in (*plan.changes, *plan.removed) if not plan.before.actors[name].moves}
+    for name in sorted(standing - set(objects)):
+        static, objects[name] = _cut_points(static, _track(name, plan.before.actors[name]))
+    objects = {name: points for name, points in objects.items() if name not in plan.removed}
+    objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
+    return FusedCloud(static, objects, cloud.colors)
+
+
+def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointCloud]:
+    """The static cloud without what stands in a box, and that, in the frame of the box."""
+    pose = track.world_from_object[len(track.times_s) // 2]
+    local = geometry.transform_points(geometry.invert(pose), static.xyz.astype(np.float64))
+    half = track.size_m / 2 + edited.CUT_MARGIN_M
+    inside = (np.abs(local[:, :2]) <= half[:2]).all(1) & (np.abs(local[:, 2]) <= half[2])
+    low = local[:, 2] < -track.size_m[2] / 2 + edited.CUT_FLOOR_M
+    ground = low if static.semantics is None else np.isin(static.semantics, edited.GROUND_CLASSES)
+    inside &= ~ground
+
+    def part(rows: NDArray[np.bool_], xyz: NDArray[np.float32], frame: Any) -> PointCloud:
+        return PointCloud(xyz[rows], static.rgb[rows], frame, None if static.semantics is None else static.semantics[rows])
+
+    return part(~inside, static.xyz, "world"), part(inside, local.astype(np.float32), "object")
+
+
+def asset_points(asset: Asset) -> PointCloud:
+    """The solid Gaussians of an asset as coloured points."""
+    solid = torch.sigmoid(asset.columns["logits"]).numpy() > edited.SOLID_OPACITY
+    rgb = (0.5 + SH_C0 * asset.columns["sh_dc"].numpy()[:, 0]).clip(0, 1)
+    ids = np.where(asset.class_ids < 0, 255, asset.class_ids).astype(np.uint8)
+    return PointCloud(asset.columns["means"].numpy()[solid], (rgb[solid] * 255 + 0.5).astype(np.uint8), "object", ids[solid])
+
+
+def ground_of(cloud: FusedCloud | None, model: SceneModel) -> HeightMap | None:
+    """Height map of the ground: of the fused points of ground classes, else of the fitted Gaussians; None where there are neither."""
+    xyz = np.zeros((0, 3), np.float32)
+    if cloud is not None and cloud.static.semantics is not None:
+        xyz = cloud.static.xyz[np.isin(cloud.static.semantics, edited.GROUND_CLASSES)]
+    xyz = edited.ground_points(model) if not len(xyz) else xyz
+    return HeightMap.from_points(xyz) if len(xyz) else None
+
+
+# -- what a scene says ---------------------------------------------------------------------------------------------------
+
+
+def edited_scene(scene: Scene, plan: EditPlan) -> Scene:
+    """A scene with other boxes, another path of the vehicle and other poses of its frames; its files stay what they are."""
+    tracks = tuple(_track(name, actor) for name, actor in plan.after.actors.items())
+    given = {track.id: track for track in scene.tracks}
+    tracks = tuple(given[t.id] if t.id in given and t.id not in {*plan.changes, *plan.inserted} else t for t in tracks)
+    scene = replace(scene, tracks=tracks)
+    if not plan.moves_ego or plan.after.ego is None:
+        return scene
+    return with_ego(scene, plan.after.ego)
+
+
+def with_ego(scene: Scene, ego: Motion) -> Scene:
+    """A scene whose vehicle drives another path; every camera goes with it."""
+    frames = tuple(replace(frame, view=_carried(frame.view, scene.ego, ego)) for frame in scene.frames)
+    return replace(scene, ego=EgoPath(ego.times_s, ego.poses), frames=frames)
+
+
+def _carried(view: View, before: EgoPath, after: Motion) -> View:
+    """A view from the same place of the vehicle, on its new path; before its first and after its last key the vehicle stands there."""
+    time_s = float(np.clip(view.time_s, before.times_s[0], before.times_s[-1]))
+    old, new = before.pose_at(time_s), after.pose_at(float(np.clip(time_s, after.times_s[0], after.times_s[-1])))
+    if old is None or new is None:
+        raise InputError("the vehicle has no pose at the time of a frame", where=f"camera {view.camera.name}", got=f"{view.time_s} s")
+    return View(view.camera, new @ geometry.invert(old) @ view.world_from_cam, view.time_s)
+
+
+def ego_fact(ego: Motion) -> list[list[float]]:
+    """A path as JSON values."""
+    return np.column_stack([ego.times_s, ego.poses.reshape(-1, 16)]).tolist()
+
+
+def scene_seen_by(scene: Scene, facts: Mapping[str, Any]) -> Scene:
+    """The scene on the vehicle's path that an edited fit asks for; itself if it asks for none."""
+    if EGO_FACT not in facts:
+        return scene
+    rows = np.asarray(facts[EGO_FACT], np.float64)
+    return with_ego(scene, Motion.recorded(rows[:, 0], rows[:, 1:].reshape(-1, 4, 4)))
+
+
+def _track(name: str, actor: Actor) -> Track:
+    return Track(name, actor.label, np.array(actor.size_m), actor.motion.times_s, actor.motion.poses)

@@ -1,0 +1,125 @@
+"""Objects of fitted scenes as files: one safetensors file each, with the description as JSON in its header.
+
+    means f32[n, 3]  quats f32[n, 4]  log_scales f32[n, 3]  logits f32[n]  sh_dc f32[n, 1, 3]   raw, in the frame of the box
+    class_ids u8[n] (255 = unknown)   certainty f16[n], if it is known
+    header "mudg_asset": {schema, label, size_m, road_rgb, seen_deg, origin}
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.base.records import Number, StrictRecord, parse_record
+from mudg.base.run_folder import refuse_overlap
+from mudg.base.types import Scene
+from mudg.data.scene import read_scene
+from mudg.models.scene.edited import Asset, asset_of, motion_of
+from mudg.models.scene.model import SceneModel
+from mudg.stages.editing.checks import sides_seen
+from mudg.stages.editing.plan import Actor
+from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.fitting.storage import load_model
+
+HEADER: Final = "mudg_asset"
+_SHAPES: Final = {"means": (3,), "quats": (4,), "log_scales": (3,), "logits": (), "sh_dc": (1, 3)}
+Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class AssetHeader(StrictRecord):
+    """Description of an asset file."""
+
+    schema_: Literal[1] = Field(alias="schema")
+    label: str
+    size_m: Annotated[list[Size], Field(min_length=3, max_length=3)]
+    road_rgb: Annotated[list[Number], Field(min_length=3, max_length=3)] | None
+    seen_deg: list[Number]
+    origin: str
+
+
+def run_export(run: Path, name: str, out: Path, scene: Path | None = None, overwrite: bool = False) -> Path:
+    """``mudg asset export``: write one object of a fit, or of a folder of ``mudg run``, to a file; returns it.
+
+    Args:
+        scene: the scene that a fit belongs to, for the sides from which the object was seen; a run's own is found.
+
+    Raises:
+        UsageError: no such object, or the file exists and ``overwrite`` is not set.
+    """
+    refuse_overlap(out, {"run": run, "scene": scene})
+    if out.exists() and not overwrite:
+        raise UsageError("the file exists", where=str(out), remedy="choose another --out, or add --overwrite")
+    if out.suffix != ".safetensors":
+        raise UsageError("an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out))
+    parts = find_run(run)
+    asset = asset_from(parts, name, scene)
+    write_asset(out, asset)
+    log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions) in {out}")
+    return out
+
+
+def asset_from(parts: RunParts, name: str, scene: Path | None = None) -> Asset:
+    """An object of a run, with the sides from which its scene shows it."""
+    model = load_model(parts.model)
+    place = scene or parts.scene
+    seen = np.zeros(0) if place is None else sides_of(model, name, read_scene(place))
+    return asset_of(model, name, seen.tolist())
+
+
+def sides_of(model: SceneModel, name: str, scene: Scene) -> np.ndarray:
+    """From which sides the recorded images of a scene show an object, radians."""
+    node = model.dynamic_object(name)
+    return sides_seen(Actor(node.label, (1, 1, 1), motion_of(node)), [frame.view for frame in scene.frames])
+
+
+def write_asset(path: Path, asset: Asset) -> None:
+    """Write an asset file."""
+    arrays = {key: asset.columns[key].numpy() for key in _SHAPES}
+    arrays["class_ids"] = np.where(asset.class_ids < 0, UNLABELLED, asset.class_ids).astype(np.uint8)
+    if asset.certainty is not None:
+        arrays["certainty"] = asset.certainty.astype(np.float16)
+    header = {
+        "schema": 1, "label": asset.label, "size_m": list(asset.size_m), "origin": asset.origin,
+        "road_rgb": None if asset.road_rgb is None else list(asset.road_rgb),
+        "seen_deg": [round(float(np.degrees(a)), 2) for a in asset.seen_rad],
+    }  # fmt: skip
+    store.write_safetensors(path, arrays, {HEADER: store.json_text(header, indent=None)})
+
+
+def read_asset(path: Path) -> Asset:
+    """Read an asset file.
+
+    Raises:
+        InputError: it is missing, damaged, or no asset.
+    """
+    content = store.read_bytes(path)
+    arrays, text = store.parse_safetensors(content, str(path)), store.safetensors_metadata(content, str(path)).get(HEADER)
+    if text is None:
+        raise InputError("this file is no asset", where=str(path), expected="a file written by `mudg asset export`")
+    header = parse_record(AssetHeader, store.parse_json(text, f"{path}: header"), f"{path}: header: ")
+    count = len(arrays["means"]) if "means" in arrays else 0
+    wanted = {**{key: (count, *shape) for key, shape in _SHAPES.items()}, "class_ids": (count,)}
+    for name, shape in wanted.items():
+        kind = np.uint8 if name == "class_ids" else np.float32
+        if name not in arrays or arrays[name].shape != shape or arrays[name].dtype != kind or not count:
+            got = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "nothing"
+            expected = f"{kind.__name__} {shape}"
+            raise InputError(f"tensor {name!r} of an asset has the wrong form", where=str(path), expected=expected, got=got)
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"tensor {name!r} of an asset holds values that are not finite", where=str(path))
+    ids = arrays["class_ids"].astype(np.int64)
+    known = arrays.get("certainty")
+    length, width, height = header.size_m
+    return Asset(
+        {key: torch.from_numpy(arrays[key].copy()) for key in _SHAPES}, np.where(ids < len(CLASSES), ids, -1),
+        None if known is None or known.shape != (count,) else known.astype(np.float32), header.label, (length, width, height),
+        None if header.road_rgb is None else (header.road_rgb[0], header.road_rgb[1], header.road_rgb[2]),
+        tuple(float(a) for a in np.radians(header.seen_deg)), header.origin,
+    )  # fmt: skip

@@ -1,0 +1,116 @@
+"""A script carried out on a fitted scene and the log that it belongs to, in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mudg.base import log
+from mudg.base.errors import InputError
+from mudg.base.types import FusedCloud, Scene
+from mudg.core.edit import Motion
+from mudg.data.cloudfile import read_fused
+from mudg.data.edits import EditScript, read_edits
+from mudg.data.edits.records import AssetSource
+from mudg.data.scene import read_scene
+from mudg.models.scene.edited import GROUND_CLASSES, Asset, ground_points
+from mudg.models.scene.model import SceneModel
+from mudg.stages.editing.apply import EGO_FACT, edited_cloud, edited_model, edited_scene, ego_fact, ground_of
+from mudg.stages.editing.assets import asset_from, read_asset
+from mudg.stages.editing.checks import check
+from mudg.stages.editing.plan import Background, EditPlan, EditSources, EditWorld, plan_edits
+from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.fitting.storage import load_model
+
+FACT = "edits"
+"""Fact of an edited fitted scene: the script, its digest, and what its checks found."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EditedDrive:
+    """What a script made of a drive.
+
+    Args:
+        plan: what was done. scene, cloud: edited; None where they were not given.
+        notes: what the reader should know (``checks.check``).
+    """
+
+    script: EditScript
+    plan: EditPlan
+    scene: Scene | None
+    cloud: FusedCloud | None
+    notes: list[dict[str, Any]]
+
+    def model(self, model: SceneModel, keep_ego: bool = False) -> SceneModel:
+        """A fitted scene of this drive, edited.
+
+        Args:
+            keep_ego: note the vehicle's new path in the scene's facts, for those who know the recorded path alone.
+        """
+        sky = None if self.plan.sky is None else self.script.path_of(self.plan.sky.image)
+        made = edited_model(model, self.plan, sky)
+        facts = {**made.facts, FACT: {"script": self.script.canonical(), "notes": self.notes}}
+        if keep_ego and self.plan.moves_ego and self.plan.after.ego is not None:
+            facts[EGO_FACT] = ego_fact(self.plan.after.ego)
+        return replace(made, facts=facts)
+
+
+def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None, cloud: FusedCloud | None = None) -> EditedDrive:
+    """Carry out a script on a drive, but for its fitted scenes (``EditedDrive.model``).
+
+    Args:
+        model: a fit of the drive: its objects are those that a script can name where there is no scene; its ground where there is no cloud.
+
+    Raises:
+        InputError: something in the script that cannot be done here.
+    """
+    ground = ground_of(cloud, model)
+    world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
+    plan = plan_edits(script, world, EditSources(opener(script), lambda name: background_of(find_run(script.path_of(name)), name)))
+    made = None if scene is None else edited_scene(scene, plan)
+    views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
+    notes = check(plan, *views)
+    for note in notes:
+        (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
+    if plan.conditions:
+        log.warn(f"edit: {', '.join(plan.conditions)} noted in the result; renders do not show it yet")
+    return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
+
+
+def background_of(parts: RunParts, name: str) -> Background:
+    """The street of a run.
+
+    Raises:
+        InputError: a fit by itself, of which the path of the vehicle is not known, or one without ground.
+    """
+    if parts.scene is None:
+        raise InputError("of a fit alone it is not known where its street lies", where="run", got=name,
+            expected="a folder made by `mudg run`")  # fmt: skip
+    scene, model = read_scene(parts.scene), load_model(parts.model)
+    ground, cloud = ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
+    if cloud is not None and cloud.semantics is not None:
+        ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
+    if not len(ground):
+        raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
+    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
+
+
+def opener(script: EditScript) -> Callable[[AssetSource], Asset]:
+    """What reads the objects that a script names."""
+
+    def opened(source: AssetSource) -> Asset:
+        if source.file is not None:
+            return read_asset(script.path_of(source.file))
+        return asset_from(find_run(script.path_of(source.run or "")), source.id or "")
+
+    return opened
+
+
+def read_and_digest(path: Path) -> tuple[EditScript, str]:
+    """A script and the digest of it and of what it reads."""
+    script = read_edits(path)
+    return script, script.digest()

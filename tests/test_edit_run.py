@@ -1,0 +1,217 @@
+"""``mudg edit`` on fits and whole runs: what it writes is taken by the other commands, bad scripts leave nothing behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_settings import fit_config
+from toy_world import CAR_SIZE, car_pose, ego_pose, fused_cloud, write_scene
+
+import mudg
+from mudg import cli, verbs
+from mudg.base import geometry, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.bench import run as bench
+from mudg.data.cloudfile import read_fused, write_fused
+from mudg.data.observations import read_observations
+from mudg.data.scene import check_scene, read_image, read_label, read_points, read_scene
+from mudg.stages import edit, fit, fuse, render
+from mudg.stages.config import BenchConfig, EditConfig, FuseConfig, RenderConfig
+
+FRAMES = 4
+LAST_S = 0.3 * (FRAMES - 1)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A folder like that of ``mudg run``."""
+    root = tmp_path_factory.mktemp("run")
+    write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
+    write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
+    config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
+    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    return root
+
+
+def script(folder: Path, text: str, name: str = "edits.yaml") -> Path:
+    store.write_text(folder / name, text)
+    return folder / name
+
+
+def images(folder: Path, name: str = "front_recorded") -> list[torch.Tensor]:
+    seen = read_observations(folder / name)
+    return [seen[i].rgb for i in range(len(seen))]
+
+
+def rendered(scene: Path, model: Path, out: Path, edits: Path | None = None) -> list[torch.Tensor]:
+    return images(render.run(RenderConfig(shifts_m=(0.0,), video=False), scene, model, out, edits=edits))
+
+
+def test_an_edited_fit_renders_as_render_with_edits_does(run: Path, tmp_path: Path) -> None:
+    text = "- move: {id: car, left_m: 1.5, along_m: 1}\n- lane_change: {id: ego, left_m: 0.4, start_s: 0, duration_s: 0.8, ground: false}"
+    edits, model = script(tmp_path, text), run / "fit" / "street_gaussians"
+    made = edit.run(EditConfig(), model, edits, tmp_path / "edited", scene=run / "scene")
+    before = rendered(run / "scene", model, tmp_path / "a")
+    after = rendered(run / "scene", made, tmp_path / "b")
+    on_the_way = rendered(run / "scene", model, tmp_path / "c", edits)
+    for two, three in zip(after, on_the_way, strict=True):
+        assert torch.equal(two, three)
+    assert not torch.equal(before[2], after[2])
+    views = read_observations(tmp_path / "b" / "front_recorded").views
+    old = read_observations(tmp_path / "a" / "front_recorded").views
+    offsets = [(geometry.invert(ego_pose(v.time_s)) @ np.r_[v.center_world, 1])[1] for v in views]
+    assert offsets[0] == pytest.approx(0.0, abs=1e-6)  # along the vehicle's left
+    assert offsets[-1] == pytest.approx(0.4, abs=0.02)
+    assert [v.time_s for v in views] == [v.time_s for v in old]
+    kinds = {note["kind"] for note in store.read_json(made / "edit.json")["notes"]}
+    assert "lateral acceleration" in kinds
+
+
+def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
+    edits = script(tmp_path, "- move: {id: car, along_m: 1, ground: false}")
+    out = edit.run(EditConfig(), run, edits, tmp_path / "edited")
+    old, new = read_scene(run / "scene"), read_scene(out / "scene")
+    assert not [finding for finding in check_scene(out / "scene") if finding.level == "error"]
+    step = geometry.yaw_matrix(0.0, (1.0, 0, 0))
+    assert np.allclose(new.track("car").world_from_object, old.track("car").world_from_object @ step)
+    assert new.source.recipe is None
+    for a, b in zip(old.frames, new.frames, strict=True):
+        differ = (read_image(old, a) != read_image(new, b)).any(-1)
+        assert 0 < differ.mean() < 0.6  # near the car only
+        assert read_label(new, b, "semantics").shape == differ.shape
+        sky = read_label(new, b, "sky")
+        assert np.array_equal(sky, read_label(new, b, "semantics") == ID["sky"])
+    half = CAR_SIZE / 2
+    for a, b in zip(old.sweeps, new.sweeps, strict=True):
+        counts = []
+        for scene, sweep, shift in ((old, a, np.eye(4)), (new, b, step)):
+            pose = car_pose(sweep.time_s) @ shift
+            local = geometry.transform_points(geometry.invert(pose) @ sweep.world_from_lidar, read_points(scene, sweep).xyz)
+            counts.append(int(((np.abs(local) < half + 0.02).all(1) & (local[:, 2] > 0.15 - half[2])).sum()))
+        assert counts[0] == counts[1] > 0  # the points went with the car
+    assert len(rendered(out / "scene", out / "fit" / "street_gaussians", tmp_path / "render")) == FRAMES
+    fused = read_fused(fuse.run(FuseConfig(), out / "scene", tmp_path / "fused"))
+    assert "car" in fused.objects
+    assert read_fused(out / "fuse").objects.keys() == {"car"}
+    again = edit.run(EditConfig(), out, script(tmp_path, "- remove: {ids: [car]}", "more.yaml"), tmp_path / "twice")
+    assert read_scene(again / "scene").tracks == ()
+    assert read_fused(again / "fuse").objects == {}
+
+
+def test_the_vehicle_of_a_run_changes_lanes(run: Path, tmp_path: Path) -> None:
+    edits = script(tmp_path, "- lane_change: {id: ego, left_m: 0.5, start_s: 0, duration_s: 0.9}")
+    out = edit.run(EditConfig(), run, edits, tmp_path / "edited")
+    new = read_scene(out / "scene")
+    assert (geometry.invert(ego_pose(LAST_S)) @ new.ego.pose_at(LAST_S))[1, 3] == pytest.approx(0.5, abs=0.02)
+    again = rendered(out / "scene", out / "fit" / "street_gaussians", tmp_path / "render")
+    for frame, image in zip(new.frames, again, strict=True):  # its images are the renders there
+        assert np.abs(read_image(new, frame) / 255 - image.permute(1, 2, 0).numpy()).max() <= 1 / 255
+
+
+def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:
+    model, out = run / "fit" / "street_gaussians", tmp_path / "out"
+    for text in ("- mve: {id: car}", "- move: {id: nobody}", "- lane_change: {id: car, left_m: 9, start_s: 0, duration_s: 0.2}"):
+        edits = script(tmp_path, text)
+        with pytest.raises(InputError, match="line 1"):
+            edit.run(EditConfig(), model, edits, out)
+        with pytest.raises(InputError, match="line 1"):
+            rendered(run / "scene", model, out, edits)
+        assert not out.exists()
+    with pytest.raises(UsageError, match="input"):
+        edit.run(EditConfig(), run, script(tmp_path, "- remove: {ids: [car]}"), run / "edited")
+    with pytest.raises(InputError, match="nothing that can be edited"):
+        edit.run(EditConfig(), run / "scene", tmp_path / "edits.yaml", out)
+    assert not out.exists()
+
+
+def test_results_are_reused_refused_and_resumed(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    edits, out = script(tmp_path, "- remove: {class: car}"), tmp_path / "out"
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(edit, "write_edited_scene", stop)
+        with pytest.raises(KeyboardInterrupt):
+            edit.run(EditConfig(), run, edits, out)
+    assert (out / "fuse" / "fuse.json").is_file()
+    edit.run(EditConfig(), run, edits, out)
+    whole = edit.run(EditConfig(), run, edits, tmp_path / "whole")
+    assert store.digest(out) == store.digest(whole)
+    stamp = (out / "edit.json").stat().st_mtime_ns
+    edit.run(EditConfig(), run, script(tmp_path, "# the same\n- remove: {class: car}"), out)
+    assert (out / "edit.json").stat().st_mtime_ns == stamp
+    with pytest.raises(UsageError, match="another configuration"):
+        edit.run(EditConfig(), run, script(tmp_path, "- stop: {id: car, at_s: 0.2}"), out)
+    edit.run(EditConfig(), run, tmp_path / "edits.yaml", out, overwrite=True)
+    assert store.read_json(out / "edit.json")["changed"] == ["car"]
+
+
+def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "shelf" / "red.safetensors"
+    assert cli.main(["asset", "export", str(run), "car", "--out", str(file)]) == 0
+    with pytest.raises(UsageError, match="exists"):
+        verbs.export_asset(run, "car", file)
+    with pytest.raises(UsageError, match="no dynamic object"):
+        verbs.export_asset(run, "nobody", tmp_path / "x.safetensors")
+    text = """
+- insert: {asset: {file: shelf/red.safetensors}, id: second, near: {id: ego, at_s: 0, ahead_m: 14, left_m: 2, yaw_deg: 180}}
+- replace: {id: car, by: {run: RUN, id: car}}
+""".replace("RUN", str(run))
+    out = tmp_path / "out"
+    assert cli.main(["edit", str(run), str(script(tmp_path, text)), "--out", str(out), "--quiet"]) == 0
+    assert "edited" in capsys.readouterr().out
+    scene, fused = read_scene(out / "scene"), read_fused(out / "fuse")
+    assert {track.id for track in scene.tracks} == {"car", "second"}
+    assert fused.objects.keys() == {"car", "second"}
+    pose = scene.track("second").pose_at(0.5)
+    assert pose[2, 3] == pytest.approx(CAR_SIZE[2] / 2, abs=0.05)  # on the ground, which is flat
+    assert geometry.yaw_of(pose) == pytest.approx(np.pi, abs=1e-6) or geometry.yaw_of(pose) == pytest.approx(-np.pi, abs=1e-6)
+    kinds = {note["kind"] for note in store.read_json(out / "edit.json")["notes"]}
+    assert "seldom-seen side" in kinds  # the recording saw its back only
+
+
+def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
+    """Its own street put in again changes nothing but the sky's texels."""
+    model = run / "fit" / "street_gaussians"
+    edits = script(tmp_path, f"- background: {{run: {run}}}")
+    made = edit.run(EditConfig(), model, edits, tmp_path / "out", scene=run / "scene", fused=run / "fuse")
+    before, after = (rendered(run / "scene", folder, tmp_path / name) for folder, name in ((model, "a"), (made, "b")))
+    for one, two in zip(before, after, strict=True):
+        assert (one - two).abs().mean() < 0.01
+    with pytest.raises(InputError, match="whole run"):
+        edit.run(EditConfig(), run, edits, tmp_path / "whole")
+    with pytest.raises(InputError, match="where its street lies"):
+        edit.run(EditConfig(), model, script(tmp_path, f"- background: {{run: {model}}}"), tmp_path / "fit", scene=run / "scene")
+    assert not (tmp_path / "whole").exists()
+    assert not (tmp_path / "fit").exists()
+
+
+def test_from_python(run: Path, tmp_path: Path) -> None:
+    fitted = mudg.FittedScene.read(run / "fit" / "street_gaussians")
+    scene = mudg.read_scene(run / "scene")
+    edits = script(tmp_path, "- stop: {id: car, at_s: 0.3}")
+    stopped = fitted.edited(edits, scene)
+    assert stopped.object_pose("car", 0.9)[0, 3] < fitted.object_pose("car", 0.9)[0, 3] - 0.5
+    made = verbs.edit(run / "fit" / "street_gaussians", edits, tmp_path / "out")
+    view = scene.frames[2].view
+    pictures = [s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))]
+    assert np.array_equal(*pictures)
+    assert fitted.export_asset("car", tmp_path / "car.safetensors", scene).is_file()
+
+
+@pytest.mark.slow
+def test_the_benchmark_finds_edits_as_good_as_the_fit(tmp_path: Path) -> None:
+    config = BenchConfig(cities="development", count=1, pose_iterations=60)
+    out = bench.run("edit", config, tmp_path / "out")
+    rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
+    assert rows["remove"]["vehicle"] is None
+    for row in rows.values():
+        assert row["outside"] < 0.03
+        if row["overlap"] is not None:
+            assert row["overlap"] > row["overlap_before"] - 0.05
+            assert row["vehicle"] > row["vehicle_before"] - 3
