@@ -34,7 +34,7 @@ from mudg.core.weather import fog, ground, relight
 from mudg.core.weather.gbuffer import (
     BufferRules,
     GBuffer,
-    HeightMap,
+    OccluderMap,
     Surroundings,
     euclidean_range,
     from_render,
@@ -102,7 +102,7 @@ class Case:
     truth: CityTruth
     light: CityLight
 
-    def gbuffer(self, curve: ToneCurve, heights: HeightMap | None = None) -> GBuffer:
+    def gbuffer(self, curve: ToneCurve, heights: OccluderMap | None = None) -> GBuffer:
         """From the image, exact depth and exact classes."""
         return from_render(
             self.view, curve.decode(self.truth.rgb), self.truth.depth, self.truth.semantics, BufferRules(heights)
@@ -113,7 +113,7 @@ class Case:
         s = self.world.surfaces(self.view)
         return replace(self.gbuffer(curve), normal=s.normal, openness=s.openness, sunlit=s.sunlit)
 
-    def heights(self) -> HeightMap:
+    def heights(self) -> OccluderMap:
         """From depth images of all frames and cameras."""
         parts = []
         for name in self.world.cameras():
@@ -121,7 +121,7 @@ class Case:
                 truth = self.world.render(view, supersample=1)
                 static = ~truth.sky & ((truth.instance == 0) | (view.time_s == self.view.time_s))
                 parts.append(world_points(view, truth.depth)[static])
-        return HeightMap.from_points(np.concatenate(parts), 0.4)
+        return OccluderMap.from_points(np.concatenate(parts), 0.4)
 
 
 def config_of(seed: int, size: tuple[int, int], **changes: object) -> CityConfig:

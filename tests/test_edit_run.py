@@ -71,6 +71,24 @@ def test_an_edited_fit_renders_as_render_with_edits_does(run: Path, tmp_path: Pa
     assert "lateral acceleration" in kinds
 
 
+def test_renders_show_weather_and_light(run: Path, tmp_path: Path) -> None:
+    """Fog of 20 m: colours come nearer to those of the fog, more so far away; depth and classes stay. An edited fit and a script on the
+    way show the same."""
+    edits, model = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
+    config = RenderConfig(shifts_m=(0.0,), video=False)
+    plain = read_observations(render.run(config, run / "scene", model, tmp_path / "plain") / "front_recorded")[1]
+    foggy = read_observations(render.run(config, run / "scene", model, tmp_path / "foggy", edits=edits) / "front_recorded")[1]
+    made = edit.run(EditConfig(), model, edits, tmp_path / "edited", scene=run / "scene")
+    again = read_observations(render.run(config, run / "scene", made, tmp_path / "again") / "front_recorded")[1]
+    assert torch.equal(foggy.rgb, again.rgb) and not torch.equal(foggy.rgb, plain.rgb)
+    assert torch.equal(foggy.depth.nan_to_num(), plain.depth.nan_to_num()) and torch.equal(foggy.semantics, plain.semantics)
+    solid = torch.isfinite(plain.depth[0]) & (plain.depth[0] > 0)
+    far = solid & (plain.depth[0] > plain.depth[0][solid].median())
+    spread = lambda seen, where: float(seen.rgb[:, where].std(1).mean())  # noqa: E731
+    assert spread(foggy, far) < 0.7 * spread(plain, far)
+    assert spread(foggy, far) / spread(plain, far) < spread(foggy, solid & ~far) / spread(plain, solid & ~far)
+
+
 def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
     edits = script(tmp_path, "- move: {id: car, along_m: 1, ground: false}")
     out = edit.run(EditConfig(), run, edits, tmp_path / "edited")

@@ -8,7 +8,9 @@ import pytest
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.weather_settings import Conditions, FogSettings, RainSettings, SnowSettings, WeatherSettings
 from mudg.data.edits import parse_edits, read_edits
+from mudg.stages.editing.weathered import conditions_of
 
 EVERY_VERB = """
 - remove: {ids: [car-017]}
@@ -34,6 +36,8 @@ def test_every_verb_is_understood_and_says_its_defaults() -> None:
     assert script.canonical()[2]["move"]["left_m"] == 0.0
     assert set(script.conditions()) == {"weather", "light", "season"}
     assert script.conditions()["weather"].rain.mm_h == 10
+    asked = conditions_of(script.canonical())
+    assert asked.weather.rain.mm_h == 10 and asked.weather.snow.wind_m_s == (0.5, 0.0)
     assert parse_edits(script.text(), "again").canonical()[0] == script.canonical()[0]
 
 
@@ -86,3 +90,12 @@ def test_the_digest_is_that_of_what_is_said_and_read(tmp_path: Path) -> None:
         store.write_text(tmp_path / "van.safetensors", content)
         found.append(read_edits(file).digest())
     assert found[0] != found[1]
+
+
+def test_a_script_without_settings_asks_for_the_settings_of_weather_and_light() -> None:
+    """The records of a script and the settings of the physics have the same names, limits and defaults."""
+    assert conditions_of(parse_edits("- move: {id: a, left_m: 1}", "e").canonical()) is None
+    assert conditions_of(parse_edits("- weather: {}\n- light: {}", "e").canonical()) == Conditions()
+    whole = conditions_of(parse_edits("- weather: {fog: {}, rain: {}, snow: {}}", "e").canonical())
+    assert whole.weather == WeatherSettings(fog=FogSettings(), rain=RainSettings(), snow=SnowSettings())
+    assert conditions_of(parse_edits("- light: {time: dusk}\n- light: {time: night}", "e").canonical()).light.time == "night"

@@ -24,7 +24,7 @@ from mudg.core import weather
 from mudg.core.weather import fog, ground, noise, relight, tone
 from mudg.core.weather.gbuffer import (
     GBuffer,
-    HeightMap,
+    OccluderMap,
     Surroundings,
     euclidean_range,
     from_render,
@@ -159,7 +159,7 @@ def test_range_is_longer_than_depth_beside_the_axis() -> None:
 def test_a_height_map_sees_a_wall_on_one_side() -> None:
     x, y = np.meshgrid(np.arange(0, 20, 0.25), np.arange(-10, 10, 0.25))
     z = np.where(x > 10, 12.0, 0.0)
-    heights = HeightMap.from_points(np.stack([x, y, z], -1).reshape(-1, 3), 0.5)
+    heights = OccluderMap.from_points(np.stack([x, y, z], -1).reshape(-1, 3), 0.5)
     far, near = np.array([[1.0, 0, 0]]), np.array([[8.5, 0, 0]])
     assert heights.openness(far)[0] == 1  # at 9 m a ray of 60 degrees is 15 m up
     assert heights.openness(near)[0] == pytest.approx(6 / 9)  # three of eight directions lead to the wall

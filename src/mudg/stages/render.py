@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -18,7 +17,7 @@ from mudg.base.config import result_settings
 from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
-from mudg.base.types import Observation, Scene, Trajectory, View
+from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
@@ -30,7 +29,8 @@ from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import RenderConfig
 from mudg.stages.editing.apply import scene_seen_by
-from mudg.stages.editing.carried import carry_out, read_and_digest
+from mudg.stages.editing.carried import FACT, carry_out, read_and_digest
+from mudg.stages.editing.weathered import Drawer, conditions_of, in_conditions
 from mudg.stages.fit import NEAR_M, load_model, render_view
 from mudg.stages.fitting.storage import RADIANCE, kind_of
 from mudg.stages.fitting.views import resized_view
@@ -73,6 +73,8 @@ def run(
     else:
         loaded, fitted = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
+        conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
+        draw = draw if conditions is None else in_conditions(draw, conditions, loaded)
     paths = trajectories(loaded, config)
     try:
         with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
@@ -95,9 +97,6 @@ def _edited(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene,
         return loaded, fitted
     drive = carry_out(script, fitted, loaded)
     return drive.scene or loaded, drive.model(fitted)
-
-
-Drawer = Callable[[View], Observation]
 
 
 def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:

@@ -5,7 +5,7 @@ from mudg.core.weather.drive import DriveFacts, ShownView, drive_facts, edited_v
 from mudg.core.weather.gbuffer import (
     BufferRules,
     GBuffer,
-    HeightMap,
+    OccluderMap,
     Surroundings,
     estimate_surroundings,
     from_render,
@@ -15,6 +15,6 @@ from mudg.core.weather.gbuffer import (
 from mudg.core.weather.tone import FilmicResponse, ToneCurve, curve_of
 
 __all__ = [
-    "BufferRules", "DriveFacts", "FilmicResponse", "GBuffer", "HeightMap", "ShownView", "Surroundings", "ToneCurve", "Weathered", "apply",
+    "BufferRules", "DriveFacts", "FilmicResponse", "GBuffer", "OccluderMap", "ShownView", "Surroundings", "ToneCurve", "Weathered", "apply",
     "curve_of", "drive_facts", "edited_view", "estimate_surroundings", "from_render", "mirror_view", "sun_visibility",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from mudg.base.weather_settings import Conditions
 from mudg.core.weather.apply import Weathered, apply
 from mudg.core.weather.gbuffer import (
     BufferRules,
-    HeightMap,
+    OccluderMap,
     Surroundings,
     estimate_surroundings,
     from_render,
@@ -51,7 +51,7 @@ class DriveFacts:
     """
 
     surroundings: Surroundings
-    heights: HeightMap | None = None
+    heights: OccluderMap | None = None
     smooth_px: int = 2
 
 
@@ -72,7 +72,7 @@ def drive_facts(
     points = [world_points(view, buffer.depth)[~buffer.sky] for view, buffer in pairs]
     around = replace(estimate_surroundings(pairs), path=path)
     xyz = np.concatenate(points)
-    return DriveFacts(around, HeightMap.from_points(xyz, cell_m, least=LEAST_POINTS) if len(xyz) else None)
+    return DriveFacts(around, OccluderMap.from_points(xyz, cell_m, least=LEAST_POINTS) if len(xyz) else None)
 
 
 def edited_view(

@@ -162,16 +162,20 @@ def openness_by_class(classes: NDArray[np.uint8], normal: Image) -> Plane:
     return np.where(classes == ID["sky"], 1.0, share).astype(np.float32)
 
 
+GROUND_SMOOTHING = 12
+
+
 def steadied(normal: Image, classes: NDArray[np.uint8], radius: int) -> Image:
-    """Unit normals f32[H, W, 3], each the mean of those of its class within a square of ``2 radius + 1`` pixels; 0 stays 0."""
+    """Unit normals f32[H, W, 3], each the mean of those of its class within a square of ``2 radius + 1`` pixels, on the ground of
+    ``GROUND_SMOOTHING`` times that radius: under a low sun a ripple of a few degrees would light and shade it. 0 stays 0."""
     if radius == 0:
         return normal
     mean = np.zeros(normal.shape, np.float64)
     for number in np.unique(classes):
-        of_class = classes == number
+        of_class, reach = classes == number, radius * (GROUND_SMOOTHING if number in GROUND_IDS else 1)
         for axis in range(3):
             part = np.where(of_class, normal[..., axis], 0).astype(np.float64)
-            mean[..., axis] += of_class * ndimage.uniform_filter(part, 2 * radius + 1, mode="constant")
+            mean[..., axis] += of_class * ndimage.uniform_filter(part, 2 * reach + 1, mode="constant")
     size = np.linalg.norm(mean, axis=-1, keepdims=True)
     known = normal.any(-1, keepdims=True)
     return np.where(known & (size > 1e-9), mean / np.maximum(size, 1e-9), 0).astype(np.float32)
@@ -187,7 +191,7 @@ class BufferRules:
             2 for the depth of a fitted scene.
     """
 
-    heights: HeightMap | None = None
+    heights: OccluderMap | None = None
     smooth_px: int = 0
 
 
@@ -242,7 +246,7 @@ def open_directions() -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeightMap:
+class OccluderMap:
     """Largest height per cell of the ground plane. Things are solid down to the ground: below a bridge no sky is seen.
 
     Args:
@@ -257,7 +261,7 @@ class HeightMap:
     top_m: NDArray[np.float32]
 
     @classmethod
-    def from_points(cls, xyz: NDArray[np.floating], cell_m: float = 0.5, least: int = 1) -> HeightMap:
+    def from_points(cls, xyz: NDArray[np.floating], cell_m: float = 0.5, least: int = 1) -> OccluderMap:
         """The map of world points [N, 3]; cells with fewer than ``least`` points stay unknown."""
         xyz = xyz[np.isfinite(xyz).all(1)]
         if len(xyz) == 0:
@@ -309,7 +313,7 @@ class HeightMap:
         return np.mean([self.free(xyz, d) for d in open_directions()], axis=0).astype(np.float32)
 
 
-def sun_visibility(gbuffer: GBuffer, view: View, heights: HeightMap, direction: Array) -> Plane:
+def sun_visibility(gbuffer: GBuffer, view: View, heights: OccluderMap, direction: Array) -> Plane:
     """f32[H, W]: 1 where light from a direction f64[3] reaches a surface that faces it, by the height map; 0 in the sky."""
     out = np.zeros(gbuffer.depth.shape, np.float32)
     facing = ~gbuffer.sky & (gbuffer.normal @ np.asarray(direction) > 0)

@@ -24,6 +24,7 @@ from mudg.stages.editing.assets import asset_from, read_asset
 from mudg.stages.editing.checks import check
 from mudg.stages.editing.plan import Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.editing.weathered import conditions_of
 from mudg.stages.fitting.storage import load_model
 
 FACT = "edits"
@@ -76,8 +77,10 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     notes = check(plan, *views)
     for note in notes:
         (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
-    if plan.conditions:
-        log.warn(f"edit: {', '.join(plan.conditions)} noted in the result; renders do not show it yet")
+    if "season" in plan.conditions:
+        log.warn("edit: season is noted in the result; renders do not show it yet")
+    if conditions_of(script.canonical()) is not None and made is not None:
+        log.info("edit: `mudg render` shows weather and light; images, labels and LiDAR of the scene stay as recorded")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
 
 

@@ -1,0 +1,84 @@
+"""Weather and light of an edit script on the views of a fitted scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mudg.base import config as configuration
+from mudg.base.errors import InputError
+from mudg.base.types import EgoPath, Observation, Scene, View
+from mudg.base.weather_settings import Conditions
+from mudg.core.weather import ShownView, drive_facts, edited_view
+from mudg.core.weather.tone import curve_of
+
+WITNESSES: Final = 8
+"""Recorded views by which the light of a drive is estimated, spread over cameras and time."""
+STEP_S: Final = 0.05
+SEED: Final = 0
+"""Drops and flakes are functions of place, time and this seed: the same in every render of a drive."""
+Drawer = Callable[[View], Observation]
+
+
+def conditions_of(script: Sequence[Mapping[str, Any]]) -> Conditions | None:
+    """Weather and light that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it asks for neither."""
+    asked = {verb: settings for edit in script for verb, settings in edit.items() if verb in ("weather", "light")}
+    return configuration.build(Conditions, asked, "edits") if asked else None
+
+
+def in_conditions(draw: Drawer, conditions: Conditions, scene: Scene) -> Drawer:
+    """Views in other weather or light.
+
+    Args:
+        draw: the views as they are, with depth and classes.
+        scene: its recorded views tell the light of the drive, its path where wheels went and how fast the cameras are.
+
+    Returns:
+        What draws a view with the colours of these conditions; depth, classes and confidence stay as they are.
+
+    Raises:
+        InputError: views without depth or classes.
+    """
+    frames = sorted(scene.frames, key=lambda frame: (frame.view.time_s, frame.view.camera.name))
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(WITNESSES, len(frames))).round().astype(int))
+    witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
+    drive = drive_facts(witnesses, curve_of(conditions.response), _driven(scene.ego))
+
+    def drawn(view: View) -> Observation:
+        seen = draw(view)
+        rgb, _ = edited_view(_shown(seen), conditions, SEED, drive, velocity_at(scene.ego, view.time_s))
+        return replace(seen, rgb=torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32)).clamp(0, 1))
+
+    return drawn
+
+
+def _shown(seen: Observation) -> ShownView:
+    if seen.depth is None or seen.semantics is None:
+        raise InputError("weather and light need depth and classes of every view", where=seen.source, got="views without them",
+            remedy="fit a scene with labels, or take weather and light out of the script")  # fmt: skip
+    depth = seen.depth[0].nan_to_num(0.0).numpy().astype(np.float32)
+    return ShownView(seen.view, seen.rgb.permute(1, 2, 0).numpy(), depth, seen.semantics.numpy().astype(np.uint8))
+
+
+def _driven(path: EgoPath) -> NDArray[np.float64]:
+    """x, y and yaw of the vehicle, f64[N, 3]."""
+    poses = path.world_from_ego
+    return np.column_stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
+
+
+def velocity_at(path: EgoPath, time_s: float) -> tuple[float, float, float]:
+    """Velocity of the vehicle along the world's axes, metres per second; that of the nearest moment outside the recording."""
+    first, last = float(path.times_s[0]), float(path.times_s[-1])
+    begin, end = (min(max(time_s + step, first), last) for step in (-STEP_S, STEP_S))
+    if end - begin < 1e-6:
+        begin, end = max(first, end - 2 * STEP_S), min(last, begin + 2 * STEP_S)
+    before, after = path.pose_at(begin), path.pose_at(end)
+    if end - begin < 1e-6 or before is None or after is None:
+        return (0.0, 0.0, 0.0)
+    x, y, z = (after[:3, 3] - before[:3, 3]) / (end - begin)
+    return float(x), float(y), float(z)
