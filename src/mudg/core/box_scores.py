@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,7 +160,8 @@ def agent_ious(agents: Sequence[VisibleAgent], classes: NDArray[np.integer]) -> 
         centre = (agent.outline[2:] + agent.outline[:2]) / 2
         left, top = np.maximum(np.floor(centre - half), 0).astype(int)
         right, bottom = np.minimum(np.ceil(centre + half), (width, height)).astype(int)
-        regions, count = ndimage.label(vehicle[top:bottom, left:right])
+        labelled: Any = ndimage.label(vehicle[top:bottom, left:right])
+        regions, count = labelled
         if not count:
             values.append(0.0)
             continue

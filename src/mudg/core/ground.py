@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +85,7 @@ class HeightMap:
 def _smoothed(heights: Array, cell_m: float) -> Array:
     """Gaps filled as far as `REACH_M`, then a Gaussian blur that only known cells enter."""
     empty = np.isnan(heights)
-    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    nearest: Any = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     filled = heights[tuple(nearest)]
     here = np.indices(heights.shape)
     far = np.linalg.norm(nearest - here, axis=0) * cell_m > REACH_M

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,7 +155,8 @@ def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
     lowest = ndimage.grey_erosion(np.where(road, gray, np.inf), size, mode="constant", cval=np.inf)
     flat = gray - ndimage.grey_dilation(np.where(road, lowest, -np.inf), size, mode="constant", cval=-np.inf)
     found = (flat > CONTRAST) & road
-    regions, count = ndimage.label(found, np.ones((3, 3)))
+    labelled: Any = ndimage.label(found, np.ones((3, 3)))
+    regions, count = labelled
     return found & (np.bincount(regions.ravel(), minlength=count + 1) >= FEWEST_PX)[regions]
 
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -157,8 +158,8 @@ def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
     if not valid.any():
         rows, columns = np.indices(valid.shape)
         return rows, columns
-    rows, columns = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
-    return rows, columns
+    nearest: Any = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    return nearest[0], nearest[1]
 
 
 def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
