@@ -530,3 +530,10 @@ def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:
     assert len(compose(made, 1.0)) == len(toy().table)
     with pytest.raises(InputError, match="path of the vehicle is not known"):
         carry_out(parse_edits("- stop: {id: ego, at_s: 0.5}", "e"), toy())
+
+
+def test_weather_without_classes_is_refused() -> None:
+    bare = toy()
+    bare = replace(bare, classes=(), table=Table({k: v for k, v in bare.table.columns.items() if k != "semantics"}, bare.table.labels))
+    with pytest.raises(InputError, match="classes"):
+        carry_out(parse_edits("- weather: {wet: 0.5}", "e"), bare)

@@ -93,9 +93,12 @@ def test_the_digest_is_that_of_what_is_said_and_read(tmp_path: Path) -> None:
 
 
 def test_a_script_without_settings_asks_for_the_settings_of_weather_and_light() -> None:
-    """The records of a script and the settings of the physics have the same names, limits and defaults."""
     assert conditions_of(parse_edits("- move: {id: a, left_m: 1}", "e").canonical()) is None
     assert conditions_of(parse_edits("- weather: {}\n- light: {}", "e").canonical()) == Conditions()
     whole = conditions_of(parse_edits("- weather: {fog: {}, rain: {}, snow: {}}", "e").canonical())
     assert whole.weather == WeatherSettings(fog=FogSettings(), rain=RainSettings(), snow=SnowSettings())
     assert conditions_of(parse_edits("- light: {time: dusk}\n- light: {time: night}", "e").canonical()).light.time == "night"
+    with pytest.raises(InputError, match=r"weather.snow.wind_m_s"):
+        parse_edits("- weather: {snow: {wind_m_s: [1, 2, 3]}}", "e")
+    with pytest.raises(InputError, match=r"light.headlights"):
+        parse_edits("- light: {headlights: 1}", "e")

@@ -116,7 +116,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     schedule, stops = fit.densify_schedule(config), [3, 4, 9, 10, 11, 12, 21]
     if densify == "gradient":
         schedule = dataclasses.replace(schedule, reset_every=12)
-        monkeypatch.setattr(fit, "densify_schedule", lambda _config: schedule)
+        monkeypatch.setattr(fit, "densify_schedule", lambda *_given: schedule)
         assert [step for step in range(1, 27) if schedule.reset_due(step)] == [12]
     assert [step for step in range(1, 27) if schedule.due(step)] == ([10] if densify == "gradient" else [10, 20])
     assert config.virtual.start * config.iterations == pytest.approx(3.9)

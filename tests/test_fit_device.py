@@ -63,7 +63,7 @@ def world(tmp_path_factory) -> dict[str, Path]:
 def early_densification(monkeypatch):
     """Rounds of both kinds within a few steps."""
 
-    def schedule(config: FitConfig) -> DensifySettings | McmcSettings | None:
+    def schedule(config: FitConfig, *_given: float) -> DensifySettings | McmcSettings | None:
         if config.densify.kind == "mcmc":
             return McmcSettings(2, 4, 2, max_rows=config.densify.max_gaussians)
         return DensifySettings(2, 4, 2, static_gradient=1e-4, max_rows=config.densify.max_gaussians, reset_every=3)
@@ -201,7 +201,7 @@ def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path,
     steps, pixels = Steps(), {SIZE[0] * SIZE[1], 30 * 20}
     config = settings(method, "pretend", densify__kind="none", iterations=5, start__gaussians=60, poses__learn=True, poses__rounds=0,
                       virtual__gaussians=0)  # fmt: skip
-    monkeypatch.setattr(fit, "densify_schedule", lambda _config: None)
+    monkeypatch.setattr(fit, "densify_schedule", lambda *_given: None)
     monkeypatch.setattr(fit, "add_certainty", lambda state, config: None)
     with pretend_device(), transfers() as seen:
         steps.watch(seen, monkeypatch)

@@ -190,3 +190,12 @@ def test_a_raised_drive_is_that_of_a_vertical_shift():
 def test_a_malformed_path_is_refused(name):
     with pytest.raises(UsageError, match="malformed name of a path"):
         trajectory.named(circle(), "front", name)
+
+
+def test_velocity_is_that_between_poses_and_goes_on_outside() -> None:
+    poses = [geometry.yaw_matrix(0.0, (x, 0.0, 0.0)) for x in (0.0, 1.0, 3.0)]
+    path = EgoPath(np.array([0.0, 0.1, 0.2]), np.stack(poses))
+    for time_s, expected in ((-1.0, 10.0), (0.05, 10.0), (0.15, 20.0), (9.0, 20.0)):
+        assert trajectory.velocity(path, time_s) == pytest.approx((expected, 0.0, 0.0))
+    alone = EgoPath(np.array([0.0]), np.stack(poses[:1]))
+    assert trajectory.velocity(alone, 0.0) == (0.0, 0.0, 0.0)

@@ -31,6 +31,7 @@ from mudg.core.weather.gbuffer import (
     mirror_view,
     normals_from_depth,
     openness_by_class,
+    steadied,
     world_points,
     world_rays,
 )
@@ -424,3 +425,12 @@ def test_a_drive_is_edited_image_by_image() -> None:
     assert np.abs(foggy - air)[wall].mean() < 0.5 * np.abs(shown[0].rgb - air)[wall].mean()
     with pytest.raises(InputError, match="estimated from views"):
         weather.drive_facts([], tone.SRGB)
+
+
+def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> None:
+    """Normals that sway by ten degrees over 12 pixels: on the road they become level, on a wall they stay about as they are."""
+    sway = np.broadcast_to(np.radians(10) * np.sin(np.arange(96) * 2 * np.pi / 12), (64, 96))
+    normal = np.stack([np.sin(sway), np.zeros_like(sway), np.cos(sway)], -1).astype(np.float32)
+    found = {name: steadied(normal, np.full((64, 96), ID[name], np.uint8), 2)[16:-16, 24:-24, 0] for name in ("road", "building")}
+    assert np.abs(found["road"]).max() < np.sin(np.radians(1.5))
+    assert np.abs(found["building"]).max() > np.sin(np.radians(6))

@@ -255,7 +255,7 @@ VERBS: dict[str, Verb] = {
         _render,
     ),
     "edit": Verb(
-        "Change a drive as an edit script says: remove, move, insert, replace, change lanes.",
+        "Change a drive as an edit script says: remove, move, insert, change lanes, weather and light.",
         ("mudg edit runs/kitti edits.yaml --out runs/edited",
          "mudg edit runs/mudg_s edits.yaml --scene scenes/city --fused runs/fused --out runs/edited"),
         _edit,

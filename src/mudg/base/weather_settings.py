@@ -8,17 +8,15 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from pydantic import Field
-from pydantic.dataclasses import dataclass
 
-from mudg.base.config import STRICT
+from mudg.base.records import StrictRecord
 
-Wind = tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]]
+Wind = Annotated[tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]], Field(strict=False)]
 LightTime = Literal["as_recorded", "overcast", "dusk", "night"]
 ToneName = Literal["srgb", "gamma", "linear"]
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class FogSettings:
+class FogSettings(StrictRecord):
     """Fog, or haze: extinction that is the same up to a height, or fades with it."""
 
     visibility_m: Annotated[float, Field(ge=5, le=100_000)] = 150.0
@@ -29,8 +27,7 @@ class FogSettings:
     """Upper end of fog that does not fade with height, metres above the ground. It decides how much of the sky is seen."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class RainSettings:
+class RainSettings(StrictRecord):
     """Falling rain. It does not wet the ground: ``WeatherSettings.wet`` does."""
 
     mm_h: Annotated[float, Field(ge=0, le=150)] = 10.0
@@ -41,8 +38,7 @@ class RainSettings:
     """Drops nearer than this are drawn one by one; all others are a veil."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class SnowSettings:
+class SnowSettings(StrictRecord):
     """Snow on the ground and falling snow."""
 
     cover: Annotated[float, Field(ge=0, le=1)] = 0.6
@@ -57,8 +53,7 @@ class SnowSettings:
     """Flakes nearer than this are drawn one by one; all others are a veil."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class WeatherSettings:
+class WeatherSettings(StrictRecord):
     """Weather of an edited drive."""
 
     fog: FogSettings | None = None
@@ -75,8 +70,7 @@ class WeatherSettings:
     """Snow; none = none."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class LightSettings:
+class LightSettings(StrictRecord):
     """Light of an edited drive."""
 
     time: LightTime = "as_recorded"
@@ -93,8 +87,7 @@ class LightSettings:
     """Change of exposure, stops."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class ResponseSettings:
+class ResponseSettings(StrictRecord):
     """How the recording camera turned light into display values. On a driving log this is a guess."""
 
     tone: ToneName = "srgb"
@@ -105,8 +98,7 @@ class ResponseSettings:
     """Exposure time, seconds: length of streaks of rain and snow."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Conditions:
+class Conditions(StrictRecord):
     """Weather, light and camera response of an edited drive."""
 
     weather: WeatherSettings = Field(default_factory=WeatherSettings)

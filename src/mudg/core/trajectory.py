@@ -131,6 +131,17 @@ def named(scene: Scene, camera: str, name: str) -> Trajectory:
     return Trajectory(f"{camera}_{name}", tuple(moved), "shifted")
 
 
+def velocity(path: EgoPath, time_s: float) -> tuple[float, float, float]:
+    """Velocity of the vehicle between the recorded poses around a time, metres per second along the world's axes; outside the
+    recording that of its first or last two poses, 0 with a single one."""
+    if len(path.times_s) < 2:
+        return 0.0, 0.0, 0.0
+    after = int(np.clip(np.searchsorted(path.times_s, time_s), 1, len(path.times_s) - 1))
+    moved_m = path.world_from_ego[after, :3, 3] - path.world_from_ego[after - 1, :3, 3]
+    x, y, z = moved_m / (path.times_s[after] - path.times_s[after - 1])
+    return float(x), float(y), float(z)
+
+
 def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:
     """Poses of a rolling shutter: world_from_cam f64[2, 4, 4] when the first and when the last row (or column) is read.
 

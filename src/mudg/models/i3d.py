@@ -8,7 +8,7 @@ depends on the size and is not symmetric. How frames get to 224x224 is part of t
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -32,7 +32,6 @@ VideoRule = Literal["videogpt", "google", "stylegan-v"]
 * google: squashed to 224x224, bilinear, pixel k of the result at k * in / out. The original FVD.
 * stylegan-v: squashed to 224x224, bilinear, half-pixel centres, no antialiasing.
 """
-VIDEO_RULES: Final[tuple[VideoRule, ...]] = get_args(VideoRule)
 
 _NORM: Final = ("weight", "bias", "running_mean", "running_var")
 

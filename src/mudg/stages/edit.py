@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mudg.base import store
+from mudg.base import log, store
 from mudg.base.config import result_settings
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
@@ -20,6 +20,7 @@ from mudg.data.scene import SCENE_FILES, read_scene
 from mudg.stages.config import EditConfig
 from mudg.stages.editing.carried import EditedDrive, carry_out, read_and_digest
 from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.editing.weathered import conditions_of
 from mudg.stages.editing.written import EditedImages, write_edited_scene
 from mudg.stages.fitting.storage import load_model, model_of_scene, save_model
 
@@ -57,6 +58,8 @@ def run(
     model = load_model(parts.model) if loaded is None else model_of_scene(parts.model, loaded)
     cloud = None if clouds is None else read_fused(clouds)
     drive = carry_out(parsed, model, loaded, cloud)
+    if parts.whole and conditions_of(parsed.canonical()) is not None:
+        log.info("edit: `mudg render` shows weather and light; images and LiDAR of the edited scene stay as recorded")
     if parts.whole and drive.plan.background is not None:
         raise InputError("images and clouds of a whole run cannot get another background", where=str(script),
             remedy=f"edit a fit: mudg edit {parts.model} ... --scene {place}")  # fmt: skip

@@ -233,7 +233,7 @@ def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
     stats, appearance = found.tensors("stats"), Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
     return FitState(
-        model, views, DensifyStats.from_state(stats), densify_schedule(config), found.step, float(found.state["seconds"]),
+        model, views, DensifyStats.from_state(stats), _schedule_of(config), found.step, float(found.state["seconds"]),
         found.state["last"], appearance, 0 if start is None else begun_at(config.iterations),
     )  # fmt: skip
 
@@ -257,7 +257,11 @@ def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewS
     model = recipe_of(config.method).start(scene, cloud, views.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
     stats = DensifyStats.zeros(len(model.table))
-    return FitState(model, views, stats, densify_schedule(config), 0, appearance=_nothing_corrected(config, views))
+    return FitState(model, views, stats, _schedule_of(config), 0, appearance=_nothing_corrected(config, views))
+
+
+def _schedule_of(config: FitConfig) -> DensifySettings | McmcSettings | None:
+    return densify_schedule(config, recipe_of(config.method).last_densified)
 
 
 def continued_state(config: FitConfig, start: StartFit, views: ViewSet, classes: tuple[int, ...]) -> FitState:
@@ -267,7 +271,7 @@ def continued_state(config: FitConfig, start: StartFit, views: ViewSet, classes:
     appearance = continued_appearance(start, _nothing_corrected(config, views))
     log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
     stats, step = DensifyStats.zeros(len(model.table)), begun_at(config.iterations)
-    return FitState(model, views, stats, densify_schedule(config), step, appearance=appearance, begun_at=step)
+    return FitState(model, views, stats, _schedule_of(config), step, appearance=appearance, begun_at=step)
 
 
 def _nothing_corrected(config: FitConfig, views: ViewSet) -> Appearance:

@@ -54,11 +54,12 @@ def run(
     Returns:
         ``out``, finished; an interrupted run continues with the next missing view.
     """
-    refuse_overlap(out, {"scene": scene, "model": model, "edits": edits})
     inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
-    script = None
+    script, named = None, {}
     if edits is not None:
         script, inputs["edits"] = read_and_digest(Path(edits))
+        named = {f"{edits}: {name}": path for name, path in script.files().items()}
+    refuse_overlap(out, {"scene": scene, "model": model, "edits": edits, **named})
     radiance = kind_of(Path(model)) == RADIANCE
     if radiance and (config.remove_tracks or script is not None):
         raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from mudg.base.errors import InputError
 from mudg.base.records import Number, StrictRecord, after, checked_by
+from mudg.base.weather_settings import LightSettings, WeatherSettings
 
 EGO: Final = "ego"
 """The id of the recording vehicle in edit scripts."""
@@ -214,57 +215,6 @@ class SkyEdit(StrictRecord):
     yaw_deg: Number = 0.0
 
 
-class FogEdit(StrictRecord):
-    """Fog: where contrast falls to 5 %; how it thins out with height."""
-
-    visibility_m: Annotated[float, Field(ge=5, le=100_000)] = 150.0
-    height_m: Annotated[float, Field(ge=0, le=2000)] = 0.0
-    top_m: Annotated[float, Field(ge=5, le=5000)] = 300.0
-
-
-Wind = Annotated[list[Annotated[float, Field(ge=-40, le=40)]], Field(min_length=2, max_length=2)]
-
-
-class RainEdit(StrictRecord):
-    """Falling rain."""
-
-    mm_h: Annotated[float, Field(ge=0, le=150)] = 10.0
-    wind_m_s: Wind = Field(default_factory=lambda: [0.0, 0.0])
-    reach_m: Annotated[float, Field(ge=1, le=30)] = 8.0
-
-
-class SnowEdit(StrictRecord):
-    """Snow on the ground, and falling."""
-
-    cover: Share = 0.6
-    mm_h: Annotated[float, Field(ge=0, le=10)] = 0.0
-    tracks: Share = 0.3
-    wind_m_s: Wind = Field(default_factory=lambda: [0.5, 0.0])
-    reach_m: Annotated[float, Field(ge=1, le=30)] = 8.0
-
-
-class WeatherEdit(StrictRecord):
-    """Other weather."""
-
-    fog: FogEdit | None = None
-    recorded_visibility_m: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
-    rain: RainEdit | None = None
-    wet: Share = 0.0
-    puddles: Share = 0.0
-    snow: SnowEdit | None = None
-
-
-class LightEdit(StrictRecord):
-    """Other light."""
-
-    time: Literal["as_recorded", "overcast", "dusk", "night"] = "as_recorded"
-    sun_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    sun_elevation_deg: Annotated[float, Field(ge=-10, le=90)] = 6.0
-    headlights: bool = True
-    lamps: bool = True
-    exposure_ev: Annotated[float, Field(ge=-10, le=10)] = 0.0
-
-
 class SeasonEdit(StrictRecord):
     """Another season."""
 
@@ -274,7 +224,7 @@ class SeasonEdit(StrictRecord):
 VERBS: Final[dict[str, type[StrictRecord]]] = {
     "remove": RemoveEdit, "move": MoveEdit, "stop": StopEdit, "speed": SpeedEdit, "lane_change": LaneChangeEdit, "path": PathEdit,
     "replace": ReplaceEdit, "insert": InsertEdit, "background": BackgroundEdit, "sky": SkyEdit,
-    "weather": WeatherEdit, "light": LightEdit, "season": SeasonEdit,
+    "weather": WeatherSettings, "light": LightSettings, "season": SeasonEdit,
 }  # fmt: skip
 CONDITIONS: Final = ("weather", "light", "season")
 """Verbs that change no geometry."""

@@ -69,6 +69,9 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     Raises:
         InputError: something in the script that cannot be done here.
     """
+    if conditions_of(script.canonical()) is not None and not model.classes:
+        raise InputError("weather and light need the classes of surfaces, and this scene was fitted without", where="weather, light",
+            remedy="fit a scene with labels (`mudg annotate` makes them), or take them out of the script")  # fmt: skip
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
     plan = plan_edits(script, world, EditSources(opener(script), lambda name: background_of(find_run(script.path_of(name)), name)))
@@ -79,8 +82,6 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
         (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
     if "season" in plan.conditions:
         log.warn("edit: season is noted in the result; renders do not show it yet")
-    if conditions_of(script.canonical()) is not None and made is not None:
-        log.info("edit: `mudg render` shows weather and light; images, labels and LiDAR of the scene stay as recorded")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
 
 

@@ -10,16 +10,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mudg.base import config as configuration
 from mudg.base.errors import InputError
 from mudg.base.types import EgoPath, Observation, Scene, View
 from mudg.base.weather_settings import Conditions
+from mudg.core import trajectory
 from mudg.core.weather import ShownView, drive_facts, edited_view
 from mudg.core.weather.tone import curve_of
 
 WITNESSES: Final = 8
 """Recorded views by which the light of a drive is estimated, spread over cameras and time."""
-STEP_S: Final = 0.05
 SEED: Final = 0
 """Drops and flakes are functions of place, time and this seed: the same in every render of a drive."""
 Drawer = Callable[[View], Observation]
@@ -28,7 +27,7 @@ Drawer = Callable[[View], Observation]
 def conditions_of(script: Sequence[Mapping[str, Any]]) -> Conditions | None:
     """Weather and light that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it asks for neither."""
     asked = {verb: settings for edit in script for verb, settings in edit.items() if verb in ("weather", "light")}
-    return configuration.build(Conditions, asked, "edits") if asked else None
+    return Conditions.model_validate(asked) if asked else None
 
 
 def in_conditions(draw: Drawer, conditions: Conditions, scene: Scene) -> Drawer:
@@ -51,7 +50,7 @@ def in_conditions(draw: Drawer, conditions: Conditions, scene: Scene) -> Drawer:
 
     def drawn(view: View) -> Observation:
         seen = draw(view)
-        rgb, _ = edited_view(_shown(seen), conditions, SEED, drive, velocity_at(scene.ego, view.time_s))
+        rgb, _ = edited_view(_shown(seen), conditions, SEED, drive, trajectory.velocity(scene.ego, view.time_s))
         return replace(seen, rgb=torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32)).clamp(0, 1))
 
     return drawn
@@ -69,16 +68,3 @@ def _driven(path: EgoPath) -> NDArray[np.float64]:
     """x, y and yaw of the vehicle, f64[N, 3]."""
     poses = path.world_from_ego
     return np.column_stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
-
-
-def velocity_at(path: EgoPath, time_s: float) -> tuple[float, float, float]:
-    """Velocity of the vehicle along the world's axes, metres per second; that of the nearest moment outside the recording."""
-    first, last = float(path.times_s[0]), float(path.times_s[-1])
-    begin, end = (min(max(time_s + step, first), last) for step in (-STEP_S, STEP_S))
-    if end - begin < 1e-6:
-        begin, end = max(first, end - 2 * STEP_S), min(last, begin + 2 * STEP_S)
-    before, after = path.pose_at(begin), path.pose_at(end)
-    if end - begin < 1e-6 or before is None or after is None:
-        return (0.0, 0.0, 0.0)
-    x, y, z = (after[:3, 3] - before[:3, 3]) / (end - begin)
-    return float(x), float(y), float(z)

@@ -32,6 +32,7 @@ class OmniRecipe(OwnRecipe):
     """See the module's text."""
 
     own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight",)
+    last_densified: ClassVar[float] = 0.5
 
     def start(
         self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig

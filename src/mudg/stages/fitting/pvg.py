@@ -44,6 +44,7 @@ class VibrationRecipe(OwnRecipe):
     boxes = False
     own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "sky_weight")
     unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
+    last_densified: ClassVar[float] = 0.5
 
     def start(
         self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig

@@ -16,7 +16,7 @@ from mudg.base.types import FusedCloud, Gaussians, Render, Scene
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import FitConfig
-from mudg.stages.fitting.schedule import PUBLISHED_STEPS
+from mudg.stages.fitting.schedule import LAST_DENSIFIED, PUBLISHED_STEPS
 from mudg.stages.fitting.start import start_model
 from mudg.stages.fitting.views import StoredView, TrainView
 
@@ -56,6 +56,8 @@ class Recipe:
     own_weights: ClassVar[tuple[str, ...]] = ()
     unfit: ClassVar[tuple[str, ...]] = ()
     """Settings, ``group.field``, that mean nothing to the method and must keep their defaults."""
+    last_densified: ClassVar[float] = LAST_DENSIFIED
+    """Share of the run after which it adds no more Gaussians by gradients."""
 
     def check(self, config: FitConfig, continues: bool) -> None:
         """Refuse settings that the method cannot follow.

@@ -43,6 +43,7 @@ class FieldRecipe(OwnRecipe):
     boxes = False
     own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "ssim_weight")
     unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
+    last_densified: ClassVar[float] = 0.5
 
     def common(self, config: FitConfig) -> FitConfig:
         """See ``Recipe``."""

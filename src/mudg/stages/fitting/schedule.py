@@ -17,8 +17,8 @@ PUBLISHED_STEPS = 30_000
 FIELD_STEPS = 55_000
 """Published steps of the field of ``s3gaussian``, whose rates a shorter run raises in proportion, within bounds: the field starts from
 nothing, and has as far to go."""
-LAST_DENSIFIED = {"pvg": 0.5, "omnire": 0.5, "s3gaussian": 0.5}
-"""Share of the run after which a method no longer densifies; 0.6 for all others."""
+LAST_DENSIFIED = 0.6
+"""Share of the run after which Gaussians are no longer added."""
 LAST_POSE_ROUND = 0.85
 
 
@@ -59,10 +59,10 @@ def appearance_rates(step: int, iterations: int) -> dict[str, float]:
     return {"affine": 2e-3 * gentle, "shift": 1e-3 * gentle, "turn": 1e-4 * gentle}
 
 
-def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None:
+def densify_schedule(config: FitConfig, last: float = LAST_DENSIFIED) -> DensifySettings | McmcSettings | None:
     """The published schedules, scaled to the iterations; None without densification.
 
-    gradient: from 500, every 100, until 0.6 of the run, opacity reset every 3000. mcmc: the same rounds until 0.8.
+    gradient: from 500, every 100, until ``last`` of the run, opacity reset every 3000. mcmc: the same rounds until 0.8.
     """
     total = config.iterations
     every = max(10, min(100, total // 20))
@@ -73,7 +73,7 @@ def densify_schedule(config: FitConfig) -> DensifySettings | McmcSettings | None
         return None
     return DensifySettings(
         start,
-        stop := int(LAST_DENSIFIED.get(config.method, 0.6) * total),
+        stop := int(last * total),
         every,
         max_rows=config.densify.max_gaussians,
         reset_every=3000 if total >= 10_000 else 0,

@@ -19,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mudg.base import seeds, store
 from mudg.base.devices import choose_device
@@ -106,6 +107,37 @@ class SetDistances:
         }
 
 
+@dataclass(frozen=True)
+class EmbeddingFiles:
+    """Embeddings of sets of images by a network, kept in a folder.
+
+    Args:
+        network: images ``[n, 3, h, w]`` -> ``[n, width]``. prepare: an image u8[H, W, 3] as the network wants it. width: of the embedding.
+        key: weights and rules, by which kept files are found. folder: where they lie. device: of the network.
+    """
+
+    network: Callable[[Tensor], Tensor]
+    prepare: Callable[[NDArray[np.uint8]], Tensor]
+    width: int
+    key: str
+    folder: Path
+    device: torch.device
+
+    def of(self, images: ImageSet) -> NDArray[np.float32]:
+        """Embeddings f32[n, width], read from the folder if these very pixels were seen before."""
+        if not images.count:
+            return np.zeros((0, self.width), np.float32)
+        return kept_features(self.folder, self.key, images, (images.count, self.width), lambda: self._computed(images))
+
+    def _computed(self, images: ImageSet) -> NDArray[np.float32]:
+        batches = []
+        for start in range(0, images.count, _BATCH):
+            batch = [self.prepare(images.image(n)) for n in range(start, min(start + _BATCH, images.count))]
+            with torch.no_grad():
+                batches.append(self.network(torch.stack(batch).to(self.device)).cpu().numpy())
+        return np.concatenate(batches)
+
+
 class FeatureFiles:
     """Features of sets of images by FID's network, kept in a folder.
 
@@ -120,22 +152,15 @@ class FeatureFiles:
         self.rule: inception.ResizeRule = rule
         state = read_checkpoint(weights)
         self.sha256, self.source_sha256 = store.sha256_file(weights), source_sha256(weights)
-        self._folder, self._device = folder, device
-        self._network = inception.InceptionFeatures(state, str(weights)).to(device)
+        network = inception.InceptionFeatures(state, str(weights)).to(device)
+        self._files = EmbeddingFiles(
+            lambda batch: network(batch)["2048"], lambda rgb: inception.prepared(rgb, rule), inception.WIDTH,
+            f"Inception {self.sha256} {rule}", folder, device,
+        )  # fmt: skip
 
     def of(self, images: ImageSet) -> NDArray[np.float32]:
-        """Features f32[n, 2048] of a set, read from the folder if these very pixels were seen before."""
-        key = f"Inception {self.sha256} {self.rule}"
-        return kept_features(self._folder, key, images, (images.count, inception.WIDTH), lambda: self._computed(images))
-
-    def _computed(self, images: ImageSet) -> NDArray[np.float32]:
-        batches = []
-        for start in range(0, images.count, _BATCH):
-            numbers = range(start, min(start + _BATCH, images.count))
-            batch = torch.stack([inception.prepared(images.image(number), self.rule) for number in numbers])
-            with torch.no_grad():
-                batches.append(self._network(batch.to(self._device))["2048"].cpu().numpy())
-        return np.concatenate(batches)
+        """Features f32[n, 2048] of a set."""
+        return self._files.of(images)
 
 
 def kept_features(
@@ -210,10 +235,7 @@ class Distributions:
     def _reference(self, sets: TrajectorySets) -> NDArray[np.float32]:
         key = (sets.camera, sets.width, sets.height)
         if key not in self._recorded:
-            images = recorded_images(self._scene, sets)
-            self._recorded[key] = (
-                self._features.of(images) if images.count else np.zeros((0, inception.WIDTH), np.float32)
-            )
+            self._recorded[key] = self._features.of(recorded_images(self._scene, sets))
         return self._recorded[key]
 
     def _note_floor(self, sets: TrajectorySets, reference: NDArray[np.float32]) -> None:

@@ -7,14 +7,12 @@ follow the video, so all views count.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from mudg.base import store
 from mudg.base.devices import choose_device
@@ -28,46 +26,13 @@ from mudg.stages.score_truth import SAME_TIME_S
 from mudg.stages.scoring.distributions import (
     FEATURES_FOLDER,
     FEWEST,
+    EmbeddingFiles,
     ImageSet,
     TrajectorySets,
-    kept_features,
     recorded_images,
 )
 
-_BATCH: Final = 4
-
 Rows = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class EmbeddingFiles:
-    """Embeddings of sets of images by a network, kept in a folder.
-
-    Args:
-        network: images ``[n, 3, h, w]`` -> ``[n, width]``. prepare: an image u8[H, W, 3] as the network wants it. width: of the embedding.
-        key: weights and rules, by which kept files are found. folder: where they lie. device: of the network.
-    """
-
-    network: nn.Module
-    prepare: Callable[[NDArray[np.uint8]], Tensor]
-    width: int
-    key: str
-    folder: Path
-    device: torch.device
-
-    def of(self, images: ImageSet) -> Rows:
-        """Embeddings f32[n, width]."""
-        if not images.count:
-            return np.zeros((0, self.width), np.float32)
-        return kept_features(self.folder, self.key, images, (images.count, self.width), lambda: self._computed(images))
-
-    def _computed(self, images: ImageSet) -> Rows:
-        batches = []
-        for start in range(0, images.count, _BATCH):
-            batch = [self.prepare(images.image(n)) for n in range(start, min(start + _BATCH, images.count))]
-            with torch.no_grad():
-                batches.append(self.network(torch.stack(batch).to(self.device)).cpu().numpy())
-        return np.concatenate(batches)
 
 
 class SetDistance:
