@@ -14,9 +14,9 @@ import pandas_pickles
 import pytest
 
 from mudg.base.errors import InputError
-from mudg.data.importers import plain_pickle
+from mudg.data import plain_pickle
 from mudg.data.importers.pandaset import pandas_frame
-from mudg.data.importers.plain_pickle import NUMPY_MAKERS, Array, as_list, read_pickle
+from mudg.data.plain_pickle import NUMPY_MAKERS, Array, as_list, read_pickle
 
 GOLDEN = Path(__file__).parent / "golden"
 

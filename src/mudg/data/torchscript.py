@@ -2,7 +2,7 @@
 
 ``torch.jit.load`` would take in code from the file. What the networks of the scores need are the tensors alone: the archive is a zip, its
 ``data.pkl`` a pickle that names classes of the program and places in ``data/``. It is read by the interpreter of
-``data/importers/plain_pickle.py``, which runs nothing; classes become plain objects, and the tensors get the names of the attributes that
+``data/plain_pickle.py``, which runs nothing; classes become plain objects, and the tensors get the names of the attributes that
 lead to them.
 """
 
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from mudg.base.errors import InputError
-from mudg.data.importers.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_pickle
+from mudg.data.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_pickle
 
 _STORAGES: Final = {
     "torch.FloatStorage": (torch.float32, 4), "torch.HalfStorage": (torch.float16, 2), "torch.BFloat16Storage": (torch.bfloat16, 2),

@@ -21,7 +21,7 @@ from mudg.base.errors import InputError
 from mudg.data.importers.columns import require_columns
 from mudg.data.importers.common import pose_from_quaternion
 from mudg.data.importers.layout import path_inside
-from mudg.data.importers.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
+from mudg.data.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
 
 Matrix = NDArray[np.float64]
 SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.data.importers.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
+from mudg.data.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
 
 _MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
 MAX_COLUMNS: Final = 1000
