@@ -150,10 +150,11 @@ def _name_and_folder(item: str) -> tuple[str, Path]:
 
 
 def _bench(args: f.Bench) -> dict[str, Any]:
+    from mudg.base import store
     from mudg.bench import run as bench
 
     made = bench.run(args.name, args.settings, args.out, sources=args.sources, overwrite=args.overwrite)
-    return {"bench": made / "bench.json", "text": (made / "bench.md").read_text(encoding="utf-8")}
+    return {"bench": made / "bench.json", "text": store.read_text(made / "bench.md")}
 
 
 def _run(args: f.Run) -> dict[str, Any]:

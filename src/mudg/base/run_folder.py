@@ -376,13 +376,13 @@ def _verified(path: Path, overwrite: bool) -> bool:
 def _refuse_other(
     path: Path, verb: str, config: Mapping[str, Any], inputs: Mapping[str, str], state: Mapping[str, Any]
 ) -> None:
-    import yaml
+    from mudg.base.plain_yaml import parse_yaml
 
     found = [] if state["verb"] == verb else [f"verb {state['verb']!r} instead of {verb!r}"]
     old_inputs = state.get("inputs", {})
     found += [f"input {name!r} changed" for name in inputs if old_inputs.get(name) != inputs[name]]
-    with contextlib.suppress(OSError, yaml.YAMLError):
-        old = yaml.safe_load((path / _SETTINGS).read_text()) or {}
+    with contextlib.suppress(InputError):
+        old = parse_yaml(store.read_bytes(path / _SETTINGS), str(path / _SETTINGS)) or {}
         found += differences(old, {"verb": verb, **json.loads(store.json_text(dict(config)))})
     raise UsageError("the output folder holds the result of another configuration", where=str(path),
         got="; ".join(found[:8]) or "another program version",

@@ -11,12 +11,13 @@ import json
 import math
 import os
 import shutil
+import stat
 import tempfile
 import threading
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,14 +204,58 @@ def read_json(path: Path) -> Any:
     return parse_json(read_bytes(path), str(path))
 
 
-def read_bytes(path: Path) -> bytes:
-    """Read a file; a missing or unreadable one is an InputError that names it."""
+_KINDS = (
+    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)  # fmt: skip
+
+
+def regular(path: Path) -> Path:
+    """``path``, if a regular file is there: others would be waited for, or never end. For libraries that open files themselves.
+
+    Raises:
+        InputError: it is missing, cannot be read, or is a folder, a named pipe, a socket or a device.
+    """
     try:
-        return Path(path).read_bytes()
+        mode = os.stat(path).st_mode
     except FileNotFoundError as error:
         raise InputError("file not found", where=str(path)) from error
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+    if not stat.S_ISREG(mode):
+        got = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
+        raise InputError("not a regular file", where=str(path), got=got, expected="a file on a disk")
+    return path
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file for reading; InputError as in ``regular``."""
+    regular(path)  # a pipe or device is not even opened; the second look is for one that took its place meanwhile
+    try:
+        handle = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
     except OSError as error:
         raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+    if not stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
+        handle.close()
+        raise InputError("not a regular file", where=str(path), expected="a file on a disk")
+    return handle
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file; one that is missing, unreadable or no regular file is an InputError that names it."""
+    with open_file(path) as handle:
+        try:
+            return handle.read()
+        except OSError as error:
+            raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+
+
+def read_text(path: Path) -> str:
+    """Read a UTF-8 text file; InputError as in ``read_bytes``, or if it is not text."""
+    try:
+        return read_bytes(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError("file is not text", where=str(path), got=str(error)) from error
 
 
 def append_line(path: Path, text: str) -> None:
@@ -272,7 +317,7 @@ class ScratchFile:
 def sha256_file(path: Path) -> str:
     """Hex sha256 of a file's bytes."""
     digest = hashlib.sha256()
-    with Path(path).open("rb") as handle:
+    with open_file(path) as handle:
         while block := handle.read(_CHUNK):
             digest.update(block)
     return digest.hexdigest()
