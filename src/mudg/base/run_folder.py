@@ -293,6 +293,7 @@ class RunDir:
         if same and state["state"] == "complete" and _verified(out, overwrite):
             if staged:
                 log.info(f"{output.verb}: {replacement.staging} holds an unfinished replacement of {out}")
+            _drop_lock_of_the_dead(out / _LOCK)
             return cls(out, out, output, key, inputs, complete=True)
         in_the_way = (not same or state["state"] == "complete") and _has_made_something(out)
         if in_the_way and not overwrite:
@@ -308,6 +309,7 @@ class RunDir:
             replacement.begin()
         run = cls(out, work, output, key, inputs)
         if work != out and staged.get("key") == key and _is_finished(work):
+            _drop_lock_of_the_dead(work / _LOCK)
             run._take_place()
             run.complete = True
             return run
@@ -362,6 +364,7 @@ class RunDir:
     def finish(self, summary: Mapping[str, Any] | None = None) -> None:
         """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the place of the
         result that is to be replaced."""
+        remove_files(self.path, [name for name in all_names(self.path) if is_temporary(name)])  # of runs that were killed
         names = [name for name in store.list_files(self.path) if name not in (_LOG, _STATE)]
         own = [name for name in names if name == _SETTINGS or _matches(name, self._output.files)]
         if len(own) < len(names):
@@ -417,6 +420,14 @@ def _refuse_other(
     raise UsageError("the output folder holds the result of another configuration", where=str(path),
         got="; ".join(found[:8]) or "another program version",
         remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
+
+
+def _drop_lock_of_the_dead(lock: Path) -> None:
+    """Remove the lock of a run that was killed after it had finished its work."""
+    owner = _owner(lock) if lock.is_file() else None
+    if owner is not None and owner[1] == socket.gethostname() and not process_alive(owner[0]):
+        with contextlib.suppress(OSError):
+            lock.unlink(missing_ok=True)
 
 
 def _refuse_while_others_work(lock: Path) -> None:
