@@ -498,8 +498,17 @@ def sealed(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """The record of a finished run, with what proves it and the other bookkeeping unaltered: digests of manifest, log and record."""
     log = folder / RUN_LOG
     digests = {"manifest": sha256_file(folder / MANIFEST), "log": sha256_file(log) if log.is_file() else None}
-    record = {**values, "sealed": digests}
+    return with_check({**values, "sealed": digests})
+
+
+def with_check(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record with its own digest as the last entry, ``check``."""
     return {**record, "check": _check(record)}
+
+
+def check_holds(record: Mapping[str, Any]) -> bool:
+    """Whether a record is as ``with_check`` made it; one without a digest, of an earlier version, is taken."""
+    return "check" not in record or record["check"] == _check({name: value for name, value in record.items() if name != "check"})
 
 
 def _check(record: Mapping[str, Any]) -> str:
