@@ -223,3 +223,15 @@ def test_sigterm_stops_like_ctrl_c_with_its_own_code(monkeypatch: pytest.MonkeyP
     before = signal.getsignal(signal.SIGTERM)
     assert cli.main(["doctor"]) == 143
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize(("verb", "flag", "field"), [
+    ("render", "--model", "model"), ("fit", "--fused", "fused"), ("synthesize", "--fused", "fused"), ("score", "--views", "views"),
+])  # fmt: skip
+def test_the_second_input_may_stand_after_the_scene(verb: str, flag: str, field: str) -> None:
+    by_place = cli.parse([verb, "scene", "a=b", "--out", "o"])
+    by_flag = cli.parse([verb, "scene", flag, "a=b", "--out", "o"])
+    assert by_place == by_flag
+    assert "a=b" in str(getattr(by_place, field))
+    with pytest.raises(SystemExit):
+        cli.parse([verb, "scene", "one", "two", "three", flag, "a=b", "--out", "o"])

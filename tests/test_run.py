@@ -14,7 +14,7 @@ import pytest
 from mudg import cli
 from mudg.base import config as configuration
 from mudg.base import store
-from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base.errors import InputError, IntegrityError, NumericsError, UsageError
 from mudg.report import run_report
 from mudg.stages import adapt, annotate, fit, fuse, ingest, render, run, score, synthesize
 from mudg.stages.config import RunConfig, run_preset, with_seed
@@ -200,6 +200,15 @@ def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dic
     run.run_chain(with_seed(RunConfig(), 3), "city", tmp_path / "out", overwrite=True)
     assert verbs["calls"] == CHAIN
     assert all(verbs[label][1]["overwrite"] for label in CHAIN[:-1])
+
+
+def test_an_altered_record_of_a_run_is_not_taken(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    run.run_chain(RunConfig(), "city", tmp_path / "out")
+    record = store.read_json(tmp_path / "out" / "run.json")
+    record["steps"]["fuse"]["seconds"] = 0.125
+    store.write_json(tmp_path / "out" / "run.json", record)
+    with pytest.raises(IntegrityError, match="altered"):
+        run.run_chain(RunConfig(), "city", tmp_path / "out")
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, verbs: dict[str, Any]) -> None:

@@ -185,3 +185,16 @@ def test_errors_carry_all_fields_and_cross_process_boundaries() -> None:
     assert str(again) == text
     codes = [errors.UsageError, errors.InputError, errors.IntegrityError, errors.ResourceError, errors.NumericsError]
     assert [c.exit_code for c in codes] == [2, 3, 4, 5, 6]
+
+
+def test_half_a_line_of_a_log_does_not_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = tmp_path / "log.jsonl"
+    store.append_line(log, '{"a": 1}')
+    log.write_bytes(log.read_bytes() + b'{"b": ' + b"x" * 5000)  # a crash
+    store.append_line(log, '{"c": "\u00e4"}')
+    assert log.read_text(encoding="utf-8") == '{"a": 1}\n{"c": "\u00e4"}\n'
+    (tmp_path / "half").write_bytes(b"no line at all")
+    store.append_line(tmp_path / "half", "1")
+    assert (tmp_path / "half").read_text() == "1\n"
+    with pytest.raises(ResourceError, match="writing failed"):
+        store.append_line(Path("/dev/full"), "x")

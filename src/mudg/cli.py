@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mudg.base import log
-from mudg.base.errors import MudgError, UsageError
+from mudg.base import failures, log, memory
+from mudg.base.errors import ResourceError, UsageError
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
@@ -150,10 +150,11 @@ def _name_and_folder(item: str) -> tuple[str, Path]:
 
 
 def _bench(args: f.Bench) -> dict[str, Any]:
+    from mudg.base import store
     from mudg.bench import run as bench
 
     made = bench.run(args.name, args.settings, args.out, sources=args.sources, overwrite=args.overwrite)
-    return {"bench": made / "bench.json", "text": (made / "bench.md").read_text(encoding="utf-8")}
+    return {"bench": made / "bench.json", "text": store.read_text(made / "bench.md")}
 
 
 def _run(args: f.Run) -> dict[str, Any]:
@@ -181,6 +182,8 @@ class Verb:
     summary: str
     examples: tuple[str, ...]
     call: Callable[[Any], dict[str, Any]]
+    smaller: str = ""
+    """The settings that make its work need less memory."""
 
 
 VERBS: dict[str, Verb] = {
@@ -205,16 +208,19 @@ VERBS: dict[str, Verb] = {
          "mudg ingest custom my_log scenes/mine --cameras front --frames 0:40",
          "mudg ingest kitti --list drives.txt --out scenes --shard 0/4 --jobs 2"),
         _ingest,
+        "smaller images (--resolution; of a city --city.width), fewer --frames, one image at a time (--workers 1)",
     ),
     "annotate": Verb(
         "Add missing labels to a scene: semantics, sky and depth, with confidences.",
         ("mudg annotate scenes/kitti --out scenes/kitti_labelled", "mudg annotate --list scenes --out labelled"),
         _annotate,
+        "one process (--processes 1), or smaller images (mudg ingest --resolution)",
     ),
     "fuse": Verb(
         "Fuse LiDAR and images: a static coloured point cloud, one more per dynamic object.",
         ("mudg fuse scenes/city --out runs/fused", "mudg fuse --list labelled --out fused --jobs 2"),
         _fuse,
+        "larger voxels (--voxel-m), or a shorter log (mudg ingest --frames)",
     ),
     "learn": Verb(
         "Train a diffusion model on generated cities, or fine-tune one on your own logs.",
@@ -222,6 +228,7 @@ VERBS: dict[str, Verb] = {
          "mudg learn --data.scenes runs/kitti --start embedded --optimizer.lr 1e-4 --steps 500 --out runs/tuned",
          "torchrun --nproc-per-node 8 -m mudg learn --compute.parallel fsdp --config recipe.yaml --out runs/mdm"),
         _learn,
+        "smaller clips (--data.width, --data.height), a smaller batch, fewer --compute.workers",
     ),
     "convert": Verb(
         "Convert a published checkpoint to a folder for synthesize, annotate or score.",
@@ -230,17 +237,20 @@ VERBS: dict[str, Verb] = {
          "mudg convert checkpoints --to weights/depthlab",
          "mudg convert i3d_torchscript.pt --to weights/i3d --network i3d"),
         _convert,
+        "a larger --memory-gb, where the machine has it",
     ),
     "adapt": Verb(
         "Adapt the diffusion model to one recorded log, with the log's own photographs.",
         ("mudg adapt scenes/kitti --fused runs/fused --fitted runs/plain --out runs/adapted",
          "mudg synthesize scenes/kitti --fused runs/fused --fitted runs/plain --model runs/adapted/model --out runs/virtual"),
         _adapt,
+        "one process (--processes 1), or smaller images (mudg ingest --resolution)",
     ),
     "synthesize": Verb(
         "Generate dense RGB, depth and semantics on laterally shifted trajectories.",
         ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",),
         _synthesize,
+        "one process (--processes 1), smaller views (--width-px), fewer --cameras and --shifts-m",
     ),
     "fit": Verb(
         "Fit a dynamic 3D Gaussian scene to recorded (and virtual) views.",
@@ -248,11 +258,13 @@ VERBS: dict[str, Verb] = {
          "mudg fit scenes/city --fused runs/fused --observations runs/virtual --out runs/mudg_s",
          "mudg fit scenes/city --fused runs/fused --observations runs/virtual --start-from runs/plain --iterations 1000 --out runs/mudg_s"),
         _fit,
+        "smaller images (mudg ingest --resolution), fewer Gaussians (--start.gaussians, --densify.max-gaussians)",
     ),
     "render": Verb(
         "Render RGB, depth and semantics of a fitted scene on shifted trajectories.",
         ("mudg render scenes/city --model runs/mudg_s --shifts-m 0 3 -3 --out runs/render",),
         _render,
+        "smaller views (--width-px), fewer --cameras",
     ),
     "edit": Verb(
         "Change a drive as an edit script says: remove, move, insert, change lanes, weather and light.",
@@ -269,6 +281,7 @@ VERBS: dict[str, Verb] = {
         "Compare views with ground truth: metrics, tables, error images.",
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
         _score,
+        "smaller views (--width-px), fewer --views",
     ),
     "bench": Verb(
         "Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers.",
@@ -330,22 +343,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         args = parse(words)
         log.set_quiet(args.quiet)
+        if words[0] not in ("doctor", "fuse"):  # they do without torch
+            memory.require_address_space(f"mudg {words[0]}")
         with _sigterm_interrupts():
             result = VERBS[words[0]].call(args)
         code = int(result.pop("exit_code", 0))
         _show(result, as_json=args.json)
         return code
-    except MudgError as error:
-        if debug:
-            raise
-        _complain(f"error: {error}")
-        return error.exit_code
     except KeyboardInterrupt as interrupt:
         _complain(f"stopped. Repeat the same command to resume: mudg {shlex.join(words)}")
         return TERMINATED if isinstance(interrupt, Terminated) else INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        failures.silence(1)
         return 0
+    except Exception as error:
+        told = failures.in_words(error, VERBS[words[0]].smaller if words[0] in VERBS else "")
+        if told is None or debug:
+            raise
+        _complain(f"error: {told}")
+        return told.exit_code
 
 
 def parse(words: Sequence[str]) -> Any:
@@ -364,13 +380,24 @@ def parse(words: Sequence[str]) -> Any:
 
 
 def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError, AttributeError) as error:
+        failures.silence(1)
+        raise ResourceError("the answer cannot be written to standard output", got=str(error),
+            remedy="what was made is complete; repeat the command to see the answer") from error  # fmt: skip
 
 
 def _complain(text: str) -> None:
-    sys.stderr.write(text + "\n")
-    sys.stderr.flush()
+    """A message that cannot be written changes no exit code."""
+    try:
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+    except (OSError, ValueError, AttributeError):  # on a full disk; closed; never opened
+        failures.silence(2)
 
 
 def _show(result: dict[str, Any], *, as_json: bool) -> None:

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from tyro.conf import FlagCreatePairsOff, arg
 
 from mudg.base import config as configuration
+from mudg.base import failures
 from mudg.base.errors import UsageError
 from mudg.stages import config as stage_config
 
@@ -129,7 +130,7 @@ class Adapt(Output):
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory written by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Point clouds written by fuse."""
+    """Point clouds written by fuse. The folder may also stand after SCENE without the flag."""
     fitted: Annotated[Path, arg(metavar="FOLDER")]
     """Gaussian scene written by fit, without virtual views."""
     settings: Annotated[stage_config.AdaptConfig, arg(name="")]
@@ -142,7 +143,7 @@ class Synthesize(Output):
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory written by ingest or annotate."""
     fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Point clouds written by fuse."""
+    """Point clouds written by fuse. The folder may also stand after SCENE without the flag."""
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were
     trained with renders."""
@@ -156,7 +157,7 @@ class Fit(Output):
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory written by ingest or annotate."""
     fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Point clouds written by fuse; required by every method but emernerf."""
+    """Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag."""
     observations: Annotated[tuple[Path, ...], arg(metavar="FOLDER")] = ()
     """Virtual views written by synthesize, in one folder or several; required by method mudg_s."""
     start_from: Annotated[Path | None, arg(metavar="FOLDER")] = None
@@ -172,7 +173,7 @@ class RenderFlags(Output):
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory that the Gaussian scene was fitted to."""
     model: Annotated[Path, arg(metavar="FOLDER")]
-    """Gaussian scene written by fit, or edit."""
+    """Gaussian scene written by fit, or edit. It may also stand after SCENE without the flag."""
     edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     settings: Annotated[stage_config.RenderConfig, arg(name="")]
@@ -219,7 +220,8 @@ class Score(Output):
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
     """Scene directory that the views belong to."""
     views: Annotated[tuple[str, ...], arg(metavar="NAME=FOLDER")]
-    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render."""
+    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE
+    without the flag."""
     fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     settings: Annotated[stage_config.ScoreConfig, arg(name="")]
@@ -321,6 +323,8 @@ class DemoListed(DemoOwn):
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
 
 
+SECOND_INPUTS: dict[str, str] = {"render": "--model", "fit": "--fused", "synthesize": "--fused", "adapt": "--fused", "score": "--views"}
+"""Commands whose second input may also stand right after the scene, without its flag."""
 CHAINS: dict[str, type[Common]] = {"demo": DemoListed, "run": RunListed}
 """Commands that run several steps, with the flags that --help lists. --help-all adds some 200 settings of the steps."""
 
@@ -336,12 +340,18 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
         return _own_help(verb, description)
     if verb in CHAINS:
         words = ["--help" if word == "--help-all" else word for word in words]
+    words = _second_input_named(verb, words)
     flags = FLAGS[verb]
     kind = get_type_hints(flags).get("settings")
     default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(kind, words))
     _explain(flags, {})
     try:
         return tyro.cli(flags, args=list(words), default=default, prog=f"mudg {verb}", description=description)
+    except OSError:
+        if {"-h", "--help"} & set(words):
+            raise
+        failures.silence(2)
+        raise SystemExit(UsageError.exit_code) from None  # what is wrong could not be written, but stays wrong
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"]).replace("_", "-")
@@ -349,6 +359,15 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
             "a flag's value is not valid", where=f"--{field}", expected=first["msg"], got=repr(first.get("input"))[:120],
             remedy=f"see mudg {verb} --help",
         ) from error  # fmt: skip
+
+
+def _second_input_named(verb: str, words: Sequence[str]) -> Sequence[str]:
+    """The second of two words before all flags is the verb's second input: ``render SCENE FIT`` as ``render SCENE --model FIT``."""
+    flag = SECOND_INPUTS.get(verb)
+    given = flag is not None and any(word == flag or word.startswith(f"{flag}=") for word in words)
+    if flag is None or given or len(words) < 2 or any(word.startswith("-") for word in words[:2]):
+        return words
+    return [words[0], flag, *words[1:]]
 
 
 def _own_help(verb: str, description: str) -> Common:

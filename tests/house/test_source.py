@@ -185,6 +185,33 @@ def test_only_the_store_opens_files_for_writing(package_dir: Path) -> None:
     refuse(problems)
 
 
+READS_OF_OTHERS = {"base/memory.py", "base/processes.py", "native/__init__.py", "flags.py"}
+"""Files that read what the system, or this package itself, provides."""
+
+
+def test_only_the_store_opens_files_for_reading(package_dir: Path) -> None:
+    """Where a file should be, a pipe or a device may lie; only the store looks before it opens. And YAML is bounded in one place."""
+    problems = []
+    for name, tree in parsed(package_dir):
+        for call, function in calls(tree):
+            method = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+            if function in ("yaml.safe_load", "yaml.load") and name != "base/plain_yaml.py":
+                problems.append(f"{name}:{call.lineno}: {function} without bounds")
+            if name == "base/store.py" or name in READS_OF_OTHERS:
+                continue
+            modes = [a.value for a in call.args[:2] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            given = [a for a in call.args[:1] if not isinstance(a, ast.Constant)]
+            if (function == "open" or method == "open") and any(re.fullmatch(r"[rbt]+", mode) for mode in modes):
+                problems.append(f"{name}:{call.lineno}: opens a file")
+            if method in ("read_text", "read_bytes") and not dotted(call.func).startswith("store."):
+                problems.append(f"{name}:{call.lineno}: {ast.unparse(call.func)}")
+            if function == "Image.open" and given and not ast.unparse(given[0]).startswith("io.BytesIO"):
+                problems.append(f"{name}:{call.lineno}: opens a picture by its name")
+            if function.endswith("safe_open") and "store.regular" not in ast.unparse(call):
+                problems.append(f"{name}:{call.lineno}: opens a file by its name")
+    refuse(problems)
+
+
 def test_outputs_are_kept_apart_from_inputs(package_dir: Path) -> None:
     """A verb's folder is opened after its inputs were compared with it; ``bench/poses.py`` opens folders of its own result."""
     problems = []
@@ -441,6 +468,9 @@ def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> No
         ("open('x', 'w')\n", test_only_the_store_opens_files_for_writing),
         ("path.open('ab')\n", test_only_the_store_opens_files_for_writing),
         ("path.write_text('x')\n", test_only_the_store_opens_files_for_writing),
+        ("path.read_bytes()\n", test_only_the_store_opens_files_for_reading),
+        ("Image.open(path)\n", test_only_the_store_opens_files_for_reading),
+        ("yaml.safe_load(text)\n", test_only_the_store_opens_files_for_reading),
         ("print(1)\n", test_no_print_in_the_library),
         ("def f(x):\n    return x\n", test_public_functions_are_annotated_and_documented),
         ("class SceneManager:\n    '''d'''\n", test_class_names_say_what_a_thing_is),

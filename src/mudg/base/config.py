@@ -100,14 +100,10 @@ def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> C
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    import yaml  # late, as is the store with its numpy: --help needs neither
+    from mudg.base import store  # late, with its numpy: --help needs neither
+    from mudg.base.plain_yaml import parse_yaml
 
-    from mudg.base import store
-
-    try:
-        content = yaml.safe_load(store.read_bytes(path))
-    except yaml.YAMLError as error:
-        raise InputError("not valid YAML", where=str(path), got=str(error).replace("\n", " ")) from error
+    content = parse_yaml(store.read_bytes(path), str(path))
     if content is None:
         return {}
     if not isinstance(content, dict):

@@ -30,10 +30,16 @@ def _console():
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
+def _say(message: str, style: str | None = None) -> None:
+    """A message that cannot be written (stderr closed, or on a full disk) ends nothing."""
+    with contextlib.suppress(OSError, ValueError):  # ValueError: the stream is closed
+        _console().print(message, markup=False, style=style)
+
+
 def info(message: str) -> None:
     """Say something worth knowing, once, on stderr."""
     if not _quiet:
-        _console().print(message, markup=False)
+        _say(message)
 
 
 def info_once(message: str) -> None:
@@ -45,7 +51,7 @@ def info_once(message: str) -> None:
 
 def warn(message: str) -> None:
     """Say that something is wrong but the work goes on."""
-    _console().print(f"warning: {message}", markup=False, style="yellow")
+    _say(f"warning: {message}", "yellow")
 
 
 class ProgressTask:
@@ -81,7 +87,8 @@ class ProgressTask:
         """Count ``count`` more items as done."""
         self._done += count
         if self._progress is not None and self._id is not None:
-            self._progress.update(self._id, completed=self._done, text=self._text)
+            with contextlib.suppress(OSError, ValueError):
+                self._progress.update(self._id, completed=self._done, text=self._text)
         elif not _quiet and (time.monotonic() - self._last_line_s > 10.0):
             self._last_line_s = time.monotonic()
             info(f"{self._description}: {self._done}/{self._total} {self._text}")
@@ -93,7 +100,8 @@ class ProgressTask:
     def close(self) -> None:
         """Stop drawing."""
         if self._progress is not None:
-            self._progress.stop()
+            with contextlib.suppress(OSError, ValueError):
+                self._progress.stop()
             self._progress = None
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import multiprocessing
+import multiprocessing.process
 import os
 import signal
 import sys
@@ -32,6 +33,7 @@ from typing import Any, TypeVar
 
 from mudg.base import log
 from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsError, ResourceError, UsageError
+from mudg.base.failures import ended_process
 
 Result = TypeVar("Result")
 
@@ -39,6 +41,8 @@ _ERRORS: dict[str, type[MudgError]] = {
     cls.__name__: cls for cls in (UsageError, InputError, IntegrityError, ResourceError, NumericsError)
 }
 _POLL_S = 0.5
+_NOTICED_AFTER = 20
+"""Polls without a result in which a worker is dead, until the pool is given up."""
 GIB = 1 << 30
 
 
@@ -177,17 +181,44 @@ def run_in_processes(
             for index, items in enumerate(arguments):
                 yield index, function(*items)
         return
-    with child_environment(1), process_pool(processes) as pool:
-        futures = {pool.submit(function, *items): index for index, items in enumerate(arguments)}
+    with child_environment(1):
+        pool = process_pool(processes)
         try:
-            for future in concurrent.futures.as_completed(futures):
-                yield futures[future], future.result()
+            futures = {pool.submit(function, *items): index for index, items in enumerate(arguments)}
+            yield from _as_completed(pool, futures)
         except BrokenProcessPool as error:
-            raise ResourceError("a process ended without a word, most likely for want of memory", got=str(error),
-                remedy="take fewer processes, or a machine with more memory; repeat the command to resume") from error  # fmt: skip
-        except BaseException:
+            _kill(pool)
             pool.shutdown(wait=False, cancel_futures=True)
+            raise ended_process(str(error)) from error
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
             raise
+        pool.shutdown()
+
+
+def _as_completed(
+    pool: concurrent.futures.ProcessPoolExecutor, futures: Mapping[concurrent.futures.Future[Result], int]
+) -> Iterator[tuple[int, Result]]:
+    """Results as they come. The pool itself does not notice every death: its own threads can be short of memory, too."""
+    waiting, dead_for = set(futures), 0
+    while waiting:
+        done, waiting = concurrent.futures.wait(waiting, _POLL_S, concurrent.futures.FIRST_COMPLETED)
+        for future in done:
+            yield futures[future], future.result()
+        dead_for = dead_for + 1 if not done and any(not one.is_alive() for one in _members(pool)) else 0
+        if dead_for > _NOTICED_AFTER:
+            raise BrokenProcessPool("a worker is gone")
+
+
+def _members(pool: concurrent.futures.ProcessPoolExecutor) -> list[multiprocessing.process.BaseProcess]:
+    return list((getattr(pool, "_processes", None) or {}).values())
+
+
+def _kill(pool: concurrent.futures.ProcessPoolExecutor) -> None:
+    """End what is left of a broken pool: nobody waits for a worker that may never answer."""
+    for process in _members(pool):
+        with contextlib.suppress(OSError, ValueError):
+            process.kill()
 
 
 def process_pool(processes: int) -> concurrent.futures.ProcessPoolExecutor:

@@ -27,12 +27,14 @@ from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageErr
 from mudg.base.processes import process_alive
 from mudg.base.replacement import Replacement, all_names, remove_files
 
-_STATE, _SETTINGS, _LOCK, _LOG = "run.json", "run.yaml", "lock", "log.jsonl"
+_STATE, _SETTINGS, _LOCK, _LOG = store.RUN_STATE, "run.yaml", "lock", store.RUN_LOG
 _BEGUN = frozenset({_STATE, _SETTINGS, _LOCK})
 """What a run folder holds before anything is made."""
 _BOOKKEEPING = _BEGUN | {_LOG, store.MANIFEST}
 _TEMPORARY = re.compile(r"\..+\.([a-z0-9_]{8}\.part(\..*)?|\d+-\d+\.part)")
 """Names under which files and scenes are written before they get their own; a killed run leaves some."""
+_LONGEST_NAME, _LONGEST_PATH = 230, 3800
+"""Bytes: what file systems take (255 and 4096), less what temporary names and files inside the folder add."""
 
 
 # inputs and outputs apart ---------------------------------------------------------------------------------------------
@@ -55,6 +57,8 @@ def refuse_overlap(out: Path | str, inputs: Mapping[str, Path | str | None]) -> 
 
 def refuse_overlaps(outs: Sequence[Path | str], inputs: Mapping[str, Path | str | None]) -> None:
     """``refuse_overlap`` for many outputs; every input may be read for each of them."""
+    for out in outs:
+        _refuse_impossible(out)
     lines_out = {str(out): _line_of(Path(out)) for out in outs}
     heads_out = {line[0]: out for out, line in lines_out.items()}
     heads_in: dict[object, tuple[str, Path | str]] = {}
@@ -70,6 +74,23 @@ def refuse_overlaps(outs: Sequence[Path | str], inputs: Mapping[str, Path | str 
         for head in line:
             if head in heads_in:
                 _refuse("lies in", out, *heads_in[head])
+
+
+def _refuse_impossible(out: Path | str) -> None:
+    """UsageError for a path under which no folder can be made, whatever is on the disk."""
+    text = str(out)
+    if "\0" in text:
+        raise UsageError("the output's name holds a zero byte", where=repr(text)[:200])
+    real = os.path.realpath(text)
+    longest = max(len(os.fsencode(part)) for part in (*Path(text).parts, Path(real).name, "."))
+    if longest > _LONGEST_NAME or len(os.fsencode(real)) > _LONGEST_PATH:
+        raise UsageError(
+            "the output's name is too long", where=f"{text[:120]}...", got=f"{longest} and {len(os.fsencode(real))} bytes",
+            expected=f"names of at most {_LONGEST_NAME} bytes, paths of at most {_LONGEST_PATH}", remedy="choose a shorter --out",
+        )  # fmt: skip
+    above = next((one for one in Path(real).parents if os.path.lexists(one)), None)
+    if above is not None and not above.is_dir():
+        raise UsageError("the output lies below something that is no folder", where=text, got=str(above), remedy="choose another --out")
 
 
 def _refuse(relation: str, out: str, name: str, given: Path | str) -> None:
@@ -140,7 +161,8 @@ def run_state(folder: Path) -> dict[str, Any]:
     )
     if not folder.is_dir():
         if os.path.lexists(folder):
-            raise refused
+            raise UsageError("the output is no folder", where=str(folder), got=_what_is(folder),
+                remedy="choose the name of a folder that does not exist yet")  # fmt: skip
         return {}
     if not (folder / _STATE).is_file():
         if any(not is_temporary(entry.name) and not _is_lock(entry) for entry in folder.iterdir()):
@@ -150,10 +172,16 @@ def run_state(folder: Path) -> dict[str, Any]:
         state = store.read_json(folder / _STATE)
     except InputError as error:
         raise refused from error
-    known = isinstance(state, dict) and state.get("schema") == 1
+    known = isinstance(state, dict) and state.get("schema") in (1, store.RUN_SCHEMA)
     if not known or not all(isinstance(state.get(name), str) for name in ("verb", "key", "state")):
         raise refused
     return state
+
+
+def _what_is(path: Path) -> str:
+    if path.is_symlink() and not path.exists():
+        return f"a link that leads nowhere: {os.readlink(path)}"
+    return "a file" if path.is_file() else "a device, pipe or socket"
 
 
 def _is_lock(path: Path) -> bool:
@@ -202,7 +230,8 @@ def _is_finished(folder: Path) -> bool:
         if run_state(folder).get("state") != "complete":
             return False
         store.verify_manifest(folder)
-    except (UsageError, IntegrityError):
+        store.verify_record(folder)
+    except (UsageError, InputError, IntegrityError):
         return False
     return True
 
@@ -264,6 +293,7 @@ class RunDir:
         if same and state["state"] == "complete" and _verified(out, overwrite):
             if staged:
                 log.info(f"{output.verb}: {replacement.staging} holds an unfinished replacement of {out}")
+            _drop_lock_of_the_dead(out / _LOCK)
             return cls(out, out, output, key, inputs, complete=True)
         in_the_way = (not same or state["state"] == "complete") and _has_made_something(out)
         if in_the_way and not overwrite:
@@ -279,6 +309,7 @@ class RunDir:
             replacement.begin()
         run = cls(out, work, output, key, inputs)
         if work != out and staged.get("key") == key and _is_finished(work):
+            _drop_lock_of_the_dead(work / _LOCK)
             run._take_place()
             run.complete = True
             return run
@@ -302,10 +333,10 @@ class RunDir:
 
         seconds = self.seconds_before() + time.monotonic() - self._started_s
         values = {
-            "schema": 1, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state, "seconds": round(seconds, 3),
-            "files": list(self._output.files), "environment": environment(), "summary": dict(summary),
+            "schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state,
+            "seconds": round(seconds, 3), "files": list(self._output.files), "environment": environment(), "summary": dict(summary),
         }  # fmt: skip
-        store.write_json(self.path / _STATE, values)
+        store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
 
     def seconds_before(self) -> float:
         """Seconds that earlier, interrupted runs of this same key have taken."""
@@ -333,6 +364,7 @@ class RunDir:
     def finish(self, summary: Mapping[str, Any] | None = None) -> None:
         """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the place of the
         result that is to be replaced."""
+        remove_files(self.path, [name for name in all_names(self.path) if is_temporary(name)])  # of runs that were killed
         names = [name for name in store.list_files(self.path) if name not in (_LOG, _STATE)]
         own = [name for name in names if name == _SETTINGS or _matches(name, self._output.files)]
         if len(own) < len(names):
@@ -364,6 +396,7 @@ def _has_made_something(folder: Path) -> bool:
 def _verified(path: Path, overwrite: bool) -> bool:
     try:
         store.verify_manifest(path)
+        store.verify_record(path)
     except IntegrityError as error:
         if overwrite:
             return False
@@ -376,17 +409,25 @@ def _verified(path: Path, overwrite: bool) -> bool:
 def _refuse_other(
     path: Path, verb: str, config: Mapping[str, Any], inputs: Mapping[str, str], state: Mapping[str, Any]
 ) -> None:
-    import yaml
+    from mudg.base.plain_yaml import parse_yaml
 
     found = [] if state["verb"] == verb else [f"verb {state['verb']!r} instead of {verb!r}"]
     old_inputs = state.get("inputs", {})
     found += [f"input {name!r} changed" for name in inputs if old_inputs.get(name) != inputs[name]]
-    with contextlib.suppress(OSError, yaml.YAMLError):
-        old = yaml.safe_load((path / _SETTINGS).read_text()) or {}
+    with contextlib.suppress(InputError):
+        old = parse_yaml(store.read_bytes(path / _SETTINGS), str(path / _SETTINGS)) or {}
         found += differences(old, {"verb": verb, **json.loads(store.json_text(dict(config)))})
     raise UsageError("the output folder holds the result of another configuration", where=str(path),
         got="; ".join(found[:8]) or "another program version",
         remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
+
+
+def _drop_lock_of_the_dead(lock: Path) -> None:
+    """Remove the lock of a run that was killed after it had finished its work."""
+    owner = _owner(lock) if lock.is_file() else None
+    if owner is not None and owner[1] == socket.gethostname() and not process_alive(owner[0]):
+        with contextlib.suppress(OSError):
+            lock.unlink(missing_ok=True)
 
 
 def _refuse_while_others_work(lock: Path) -> None:

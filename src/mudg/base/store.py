@@ -11,12 +11,13 @@ import json
 import math
 import os
 import shutil
+import stat
 import tempfile
 import threading
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MANIFEST = "manifest.json"
+RUN_STATE, RUN_LOG, RUN_SCHEMA = "run.json", "log.jsonl", 2
+"""Record and log of the run that made a folder, and the record's schema (1: of an earlier version, without seal)."""
 _MAX_JSON_BYTES = 512 * 1024 * 1024
 _CHUNK = 1 << 20
 
@@ -86,6 +89,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     path = Path(path)
     _make_parent(path)
     with disk_errors("cannot write here", path):
+        if path.exists() and not path.is_file():  # a device would be replaced by a file
+            raise ResourceError("cannot write here", where=str(path), got="not a regular file", remedy="choose another --out")
         fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
     os.close(fd)
     temporary = Path(name)
@@ -203,21 +208,91 @@ def read_json(path: Path) -> Any:
     return parse_json(read_bytes(path), str(path))
 
 
-def read_bytes(path: Path) -> bytes:
-    """Read a file; a missing or unreadable one is an InputError that names it."""
+_KINDS = (
+    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)  # fmt: skip
+
+
+def regular(path: Path) -> Path:
+    """``path``, if a regular file is there: others would be waited for, or never end. For libraries that open files themselves.
+
+    Raises:
+        InputError: it is missing, cannot be read, or is a folder, a named pipe, a socket or a device.
+    """
     try:
-        return Path(path).read_bytes()
+        mode = os.stat(path).st_mode
     except FileNotFoundError as error:
         raise InputError("file not found", where=str(path)) from error
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+    if not stat.S_ISREG(mode):
+        got = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
+        raise InputError("not a regular file", where=str(path), got=got, expected="a file on a disk")
+    return path
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file for reading; InputError as in ``regular``."""
+    regular(path)  # a pipe or device is not even opened; the second look is for one that took its place meanwhile
+    try:
+        handle = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
     except OSError as error:
         raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+    if not stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
+        handle.close()
+        raise InputError("not a regular file", where=str(path), expected="a file on a disk")
+    return handle
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file; one that is missing, unreadable or no regular file is an InputError that names it."""
+    with open_file(path) as handle:
+        try:
+            return handle.read()
+        except OSError as error:
+            raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+
+
+def read_text(path: Path) -> str:
+    """Read a UTF-8 text file; InputError as in ``read_bytes``, or if it is not text."""
+    try:
+        return read_bytes(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError("file is not text", where=str(path), got=str(error)) from error
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append one line to a log. A crash can lose the last line, never an earlier one."""
+    """Append one line to a log. A crash or a full disk can lose the last line, never an earlier one; half a line does not stay.
+
+    Raises:
+        ResourceError: it cannot be written; the log is as before.
+    """
     _make_parent(path)
-    with Path(path).open("a", encoding="utf-8") as handle:
-        handle.write(text.rstrip("\n") + "\n")
+    with _writing(path), Path(path).open("ab+", buffering=0) as handle:
+        end = _end_of_lines(handle)
+        left = memoryview((text.rstrip("\n") + "\n").encode())
+        try:
+            while left:
+                left = left[handle.write(left) :]
+        except OSError:
+            handle.truncate(end)
+            raise
+
+
+def _end_of_lines(handle: BinaryIO) -> int:
+    """Where the last whole line ends; half a line behind it, left by a crash, is cut off."""
+    end = size = handle.seek(0, os.SEEK_END)
+    while end:
+        start = max(0, end - 4096)
+        handle.seek(start)
+        block = handle.read(end - start)
+        end = start + block.rfind(b"\n") + 1
+        if b"\n" in block:
+            break
+    if end < size:
+        handle.truncate(end)
+    return end
 
 
 class ScratchFile:
@@ -272,7 +347,7 @@ class ScratchFile:
 def sha256_file(path: Path) -> str:
     """Hex sha256 of a file's bytes."""
     digest = hashlib.sha256()
-    with Path(path).open("rb") as handle:
+    with open_file(path) as handle:
         while block := handle.read(_CHUNK):
             digest.update(block)
     return digest.hexdigest()
@@ -419,14 +494,74 @@ def verify_manifest(folder: Path) -> str:
     return sha256_file(path)
 
 
+def sealed(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The record of a finished run, with what proves it and the other bookkeeping unaltered: digests of manifest, log and record."""
+    log = folder / RUN_LOG
+    digests = {"manifest": sha256_file(folder / MANIFEST), "log": sha256_file(log) if log.is_file() else None}
+    return with_check({**values, "sealed": digests})
+
+
+def with_check(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record with its own digest as the last entry, ``check``."""
+    return {**record, "check": _check(record)}
+
+
+def check_holds(record: Mapping[str, Any]) -> bool:
+    """Whether a record is as ``with_check`` made it; one without a digest, of an earlier version, is taken."""
+    return "check" not in record or record["check"] == _check({name: value for name, value in record.items() if name != "check"})
+
+
+def _check(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json_text(record, indent=None).encode()).hexdigest()
+
+
+def verify_record(folder: Path) -> None:
+    """Check the bookkeeping of a run folder: that the run is finished, and its record, log and manifest are as it wrote them.
+
+    Nothing is checked where no record lies (foreign folders, copies), and only the state of records of earlier versions.
+
+    Raises:
+        InputError: the run is not finished. IntegrityError: something was altered or is missing.
+    """
+    path = folder / RUN_STATE
+    if not path.is_file():
+        return
+    try:
+        record = read_json(path)
+        if "asked" in record:
+            return  # a chain of runs, whose record tells what was done, and is no result
+        state, schema = record["state"], record["schema"]
+        check, digests = (record.pop("check"), record["sealed"]) if (state, schema) == ("complete", RUN_SCHEMA) else ("", {})
+        intact = check == (_check(record) if digests else "")
+    except (InputError, KeyError, TypeError, AttributeError) as error:
+        raise IntegrityError("the record of a run is damaged", where=str(path), got=str(error).split("\n")[0],
+            remedy="make the result again in another folder") from error  # fmt: skip
+    if not intact:
+        raise IntegrityError("the record of a run was altered after it was written", where=str(path))
+    if state != "complete":
+        raise InputError("this folder holds an unfinished result", where=str(folder), got=f"state {state!r}",
+            remedy="repeat the command that makes it: it resumes")  # fmt: skip
+    for name, expected in {MANIFEST: digests.get("manifest", ""), RUN_LOG: digests.get("log")}.items():
+        file = folder / name
+        if expected is not None and not file.is_file():
+            raise IntegrityError("a file of a finished result is missing", where=str(file))
+        if expected and sha256_file(file) != expected:
+            raise IntegrityError("a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}...")
+
+
 def digest(path: Path) -> str:
-    """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest."""
+    """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest.
+
+    Raises:
+        InputError: nothing is there, or an unfinished result. IntegrityError: a finished result or its bookkeeping was altered.
+    """
     path = Path(path)
     if not path.exists():
         remedy = "repeat the command that wrote it: it was stopped while it replaced it" if retired_path(path).exists() else ""
         raise InputError("no such file or folder", where=str(path), remedy=remedy)
     if path.is_file():
         return sha256_file(path)
+    verify_record(path)
     if (path / MANIFEST).is_file():
         return verify_manifest(path)
     total = hashlib.sha256()

@@ -17,11 +17,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.errors import UsageError
+from mudg.base.errors import InputError, UsageError
+from mudg.base.plain_yaml import parse_yaml
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
@@ -196,8 +195,8 @@ def variant_of(text: str, plain: FitConfig) -> Row:
         if not (separator and colon and field and _NAME.fullmatch(name)):
             raise UsageError("malformed variant", where="--variant", expected="NAME=FIELD:VALUE,FIELD:VALUE", got=text)
         try:
-            fields[field.strip()] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            fields[field.strip()] = parse_yaml(value, field)
+        except InputError as error:
             raise UsageError("malformed value", where=f"--variant {name}: {field}", got=value) from error
     changed = configuration.load(FitConfig, plain, overrides=configuration.nested(fields))
     return Row(name, f"{name}: {rest}", changed)

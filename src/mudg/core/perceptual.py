@@ -29,6 +29,14 @@ def _unit(features: Tensor) -> Tensor:
     return torch.where(there, features / length, 0.0)
 
 
+def distance_places(features: Tensor, target: Tensor, channel_weights: Tensor | None = None) -> Tensor:
+    """Squared difference at every place of one stage ``[h, w]``: of features ``[C, h, w]``, brought to length 1, and unit features."""
+    squared = (_unit(features) - target) ** 2
+    if channel_weights is not None:
+        squared = squared * channel_weights.view(-1, 1, 1)
+    return squared.sum(0)
+
+
 def lpips_distance(
     prediction: Sequence[Tensor],
     target_units: Sequence[Tensor],
@@ -61,10 +69,7 @@ def lpips_distance(
         if features.shape != target.shape:
             raise InputError("features of two images differ in shape", where=f"stage {stage}",
                 expected=str(tuple(target.shape)), got=str(tuple(features.shape)))  # fmt: skip
-        squared = (_unit(features) - target) ** 2
-        if channel_weights is not None:
-            squared = squared * channel_weights[stage].view(-1, 1, 1)
-        places = squared.sum(0)
+        places = distance_places(features, target, None if channel_weights is None else channel_weights[stage])
         if weight is None:
             total = total + places.mean()
             continue

@@ -64,7 +64,7 @@ def _tensor(storage: Any, offset: Any, size: Any, stride: Any, *_more: Any) -> P
 
 def is_torchscript(path: Path) -> bool:
     """Whether a file is a TorchScript archive."""
-    if not zipfile.is_zipfile(path):
+    if not path.is_file() or not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()

@@ -16,8 +16,11 @@ The bank is differentiable, deterministic, and costs about as much as SSIM.
 
 from __future__ import annotations
 
+import itertools
+import math
 import threading
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 import torch
@@ -27,7 +30,7 @@ from torch import Tensor, nn
 from mudg.base.errors import InputError
 from mudg.core.metrics import Pair
 from mudg.core.native_ops import box_mean
-from mudg.core.perceptual import lpips_distance, unit_features
+from mudg.core.perceptual import distance_places, lpips_distance, unit_features
 from mudg.models.mdm.codec import PatchCodec
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
@@ -88,10 +91,18 @@ class CodecFeatures(nn.Module):
     """
 
     SIZES: Final = 3
+    STEP: Final = 8
+    """Rows of the image that become one row of the smallest features."""
 
     def __init__(self, codec: PatchCodec) -> None:
         super().__init__()
         self.codec = codec
+
+    @property
+    def reach_rows(self) -> int:
+        """Rows of the image above and below a row that its features depend on, rounded up to ``STEP``: one convolution and two per
+        block, at the smallest size."""
+        return self.STEP * (2 + 2 * len(self.codec.blocks))
 
     def forward(self, rgb: Tensor) -> list[Tensor]:
         """Features of one image; sides that are no multiple of 8 are padded by repeating their last pixels."""
@@ -111,6 +122,9 @@ class CodecFeatures(nn.Module):
         return features
 
 
+WHOLE_PIXELS: Final = 2_500_000
+"""Images of up to this many pixels (1920 x 1280 is just below) are compared in one piece."""
+BAND_PIXELS: Final = 600_000
 LpipsTrunk = Literal["alex", "vgg", "squeeze"]
 LpipsInput = Literal["correct", "unscaled"]
 
@@ -268,6 +282,45 @@ def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], wher
     return found.float()
 
 
+@dataclass(frozen=True)
+class _Band:
+    """Rows of a large image whose features are made together.
+
+    Args:
+        begins, ends: rows that count. above, below: rows that are read besides, for features at the border to be as in the whole.
+    """
+
+    begins: int
+    ends: int
+    above: int
+    below: int
+
+    def features(self, network: CodecFeatures, rgb: Tensor) -> list[Tensor]:
+        """The features of the rows that count, per stage ``[C, h, w]``."""
+        made = network(rgb[:, self.begins - self.above : self.ends + self.below])
+        rows = self.ends - self.begins + self.above + self.below
+        places = [_places(stage.shape[-2], rows, network.STEP) for stage in made]
+        counted = _padded(self.ends - self.begins, network.STEP)
+        return [f[:, self.above // p :][:, : counted // p] for f, p in zip(made, places, strict=True)]
+
+
+def _places(count: int, rows: int, step: int) -> int:
+    """Rows of the image, padded to a multiple of ``step``, that one row of features stands for."""
+    return _padded(rows, step) // count
+
+
+def _padded(rows: int, step: int) -> int:
+    return rows + -rows % step
+
+
+def _bands(height: int, width: int, network: CodecFeatures) -> list[_Band]:
+    """An image cut so that the features of one band need about 300 MB."""
+    step, reach = network.STEP, network.reach_rows
+    rows = max(step, BAND_PIXELS // width // step * step)
+    cuts = [*range(0, height, rows), height]
+    return [_Band(a, b, min(a, reach), min(height - b, reach)) for a, b in itertools.pairwise(cuts)]
+
+
 class PerceptualDistance:
     """``lpips_distance`` of a pair's colours in the features of a network; threads may call it.
 
@@ -285,6 +338,9 @@ class PerceptualDistance:
         """The distance, or None where colour is missing."""
         if pair.rgb is None or pair.truth_rgb is None:
             return None
+        height, width = pair.rgb.shape[-2:]
+        if height * width > WHOLE_PIXELS and isinstance(self._features, CodecFeatures):
+            return self._in_bands(self._features, pair.rgb, pair.truth_rgb, pair.mask)
         with torch.no_grad():
             if getattr(self._known, "image", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))
@@ -292,3 +348,27 @@ class PerceptualDistance:
             made, mask = self._features(pair.rgb.to(self._device)), None if pair.mask is None else pair.mask.to(self._device)
             distance = lpips_distance(made, self._known.features, mask, self._weights, over_weight=True)
             return float(distance)
+
+    @torch.no_grad()
+    def _in_bands(self, network: CodecFeatures, rgb: Tensor, truth: Tensor, mask: Tensor | None) -> float:
+        """The distance of large images, of which no machine should hold all features at once: sums over bands of rows."""
+        sums: list[list[float]] = []
+        shares: dict[tuple[int, int], Tensor] = {}
+        height, width = rgb.shape[-2:]
+        for band in _bands(height, width, network):
+            made, true = (band.features(network, image.to(self._device)) for image in (rgb, truth))
+            for stage, (features, target) in enumerate(zip(made, unit_features(true), strict=True)):
+                places = distance_places(features, target)
+                per_row = _places(features.shape[-2], band.ends - band.begins, network.STEP)
+                if mask is None:
+                    share = places.new_ones(())
+                else:
+                    size = (_padded(height, network.STEP) // per_row, features.shape[-1])
+                    if size not in shares:
+                        shares[size] = F.adaptive_avg_pool2d(mask.to(self._device, torch.float32), size)[0]
+                    share = shares[size][band.begins // per_row :][: features.shape[-2]]
+                if stage == len(sums):
+                    sums.append([0.0, 0.0])
+                sums[stage][0] += float((places * share).double().sum())
+                sums[stage][1] += float(share.expand_as(places).double().sum())
+        return sum(distance / weight if weight else math.nan for distance, weight in sums) / len(sums)

@@ -68,7 +68,7 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     scores = store.read_json(out / "score" / "metrics.json")
     ledger = store.read_json(out / "run.json")
     settings = out / "run.yaml"
-    text = settings.read_text(encoding="utf-8") if settings.is_file() else ""
+    text = store.read_text(settings) if settings.is_file() else ""
     columns = list(_folders(out, scores))
     store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt")))
     return out / "report.html"
@@ -79,7 +79,7 @@ def _adaptation(folder: Path) -> Adaptation | None:
     if not (folder / store.MANIFEST).is_file():
         return None
     names = (("Before", "before.png"), ("After", "after.png"))
-    pictures = [(title, _data_uri("image/png", (folder / name).read_bytes())) for title, name in names]
+    pictures = [(title, _data_uri("image/png", store.read_bytes(folder / name))) for title, name in names]
     return Adaptation(store.read_json(folder / "adapt.json"), pictures)
 
 

@@ -270,11 +270,16 @@ def markdown(document: Mapping[str, Any]) -> str:
         of_flag = {f: ", ".join(m["title"] for m in absent if WEIGHT_FLAGS.get(m["name"], "") == f) for f in flags}
         lines.append(f"* Not computed: {'; '.join(f'{titles} ({flag})' if flag else titles for flag, titles in of_flag.items())}.")
     for trajectory in document["trajectories"]:
-        rows = [
-            [title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in names)]
-            for r in document["results"] if r["trajectory"] == trajectory["name"]
-        ]  # fmt: skip
-        lines += ["", f"## {trajectory['name']}", "", *markdown_table(["method", "views", *names], rows)]
+        results = [r for r in document["results"] if r["trajectory"] == trajectory["name"]]
+        unknown = [n for n in names if results and all(r["values"].get(n) == NO_TRUTH for r in results)]
+        shown = [n for n in names if n not in unknown]
+        rows = [[title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in shown)] for r in results]
+        lines += ["", f"## {trajectory['name']}", ""]
+        if any(isinstance(r["values"].get(n), float) for r in results for n in shown):
+            lines += markdown_table(["method", "views", *shown], rows)
+            lines += ["", f"No truth here for {', '.join(unknown)}."] if unknown else []
+        else:
+            lines.append("Nothing to score against: there is no truth here.")
         lines += [*_lines_of_sets(document, trajectory["name"]), *_lines_of_anchors(document, trajectory["name"])]
     return "\n".join(lines) + "\n"
 

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg import native
-from mudg.base import log, processes, store
-from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base import failures, log, processes, store
+from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import refuse_overlaps
 from mudg.data.scene.schema import NAME_PATTERN
 
@@ -271,7 +271,10 @@ def _child(connection: Connection, work: Work, entry: Entry, folder: Path, overw
             work(entry, folder, True)  # what an earlier failure left of another state of the source
         reused = before != "" and before == _finished(folder)
         connection.send_bytes(json.dumps(["reused" if reused else "done", _contents(folder), ""]).encode())
-    except MudgError as error:
+    except Exception as failed:
+        error = failures.in_words(failed)
+        if error is None:
+            raise
         parts = (
             error.what,
             error.where,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import shutil
 import sys
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mudg.base import memory
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     scene = read_scene(path)
     first = scene.frames[0].view.camera
     size = cost.SceneSize(len(scene.frames), len(scene.frames_of(first.name)), first.width, first.height)
-    devices = {"cpu": _free_bytes()}
+    devices = {"cpu": memory.free_bytes()}
     if torch.cuda.is_available():
         devices["cuda"] = torch.cuda.mem_get_info()[0]
     records: dict[str, Any] = {}
@@ -122,13 +122,6 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
             for name, one in found.items()
         }  # fmt: skip
     return records, lines
-
-
-def _free_bytes() -> int:
-    """Memory that programs can still ask for; 0 where the system does not say."""
-    table = Path("/proc/meminfo")
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", table.read_text(), re.MULTILINE) if table.is_file() else None
-    return 1024 * int(found[1]) if found else 0
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
@@ -149,9 +142,9 @@ def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
 
 def _machine() -> dict[str, str]:
     rows = {"system": f"{platform.system()} {platform.release()} {platform.machine()}", "processors": _processors()}
-    memory = _memory_bytes()
-    if memory:
-        rows["memory"] = f"{memory / 2**30:.1f} GiB"
+    total = _memory_bytes()
+    if total:
+        rows["memory"] = f"{total / 2**30:.1f} GiB"
     free = shutil.disk_usage(Path.cwd()).free
     rows["free disk here"] = f"{free / 2**30:.1f} GiB"
     return rows

@@ -74,9 +74,9 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path
     else:
         scene = _make(kind, config, source, folder.path)
         if kind not in (CITY, _SCENE):
-            for finding in scene_check.check_records(scene):
-                if finding.level == "warning":
-                    log.warn(f"ingest: {finding.where}: {finding.message}")
+            warnings = [finding for finding in scene_check.check_records(scene) if finding.level == "warning"]
+            for line in scene_check.folded(warnings, f"mudg doctor {folder.out}"):
+                log.warn(f"ingest: {line}")
     held_out = sum(split == "test" for split in scene.split.values())
     log.info(
         f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "

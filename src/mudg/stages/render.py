@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import torch
 
-from mudg.base import log, store
+from mudg.base import log, memory, store
 from mudg.base.config import result_settings
 from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
+from mudg.base.palette import CLASSES
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
@@ -37,6 +40,8 @@ from mudg.stages.fitting.views import resized_view
 from mudg.stages.radiance.pictures import observe
 from mudg.stages.radiance.storage import load_field
 
+VIEW_BYTES: Final = 4 * (3 + 1 + 1 + len(CLASSES))
+"""Bytes per pixel that drawing a view needs at least: colour, depth, coverage and shares of the classes."""
 _OUTPUT = VerbOutput("render", 1, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
@@ -77,6 +82,7 @@ def run(
         conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
         draw = draw if conditions is None else in_conditions(draw, conditions, loaded)
     paths = trajectories(loaded, config)
+    _require_memory(paths)
     try:
         with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
             for path in paths:
@@ -88,6 +94,13 @@ def run(
         raise
     folder.finish({"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)})
     return folder.path
+
+
+def _require_memory(paths: Sequence[Trajectory]) -> None:
+    """ResourceError where one view of a trajectory cannot fit into memory."""
+    camera = max((view.camera for path in paths for view in path.views), key=lambda one: one.width * one.height)
+    pixels, asked = camera.width * camera.height, f"a view of {camera.width} x {camera.height} pixels"
+    memory.require(pixels * VIEW_BYTES, asked, "smaller views (--width-px)")
 
 
 def _edited(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene, SceneModel]:

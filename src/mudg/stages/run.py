@@ -14,7 +14,7 @@ from typing import Any
 
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError
 from mudg.base.run_folder import is_temporary, refuse_overlap
 from mudg.base.versions import environment, version
 from mudg.stages.config import FitConfig, RunConfig, with_device
@@ -320,6 +320,9 @@ class _Ledger:
         try:
             content = store.read_json(path)
             if content["asked"]["verb"] == "run":
+                if not store.check_holds(content):
+                    raise IntegrityError("the record of the run was altered after it was written", where=str(path),
+                        remedy="choose another --out, or restore the file")  # fmt: skip
                 return content
         except (InputError, KeyError, TypeError):
             pass
@@ -364,10 +367,8 @@ class _Ledger:
 
     def save(self, state: str) -> None:
         """Write OUT/run.json."""
-        store.write_json(
-            self._out / "run.json",
-            {
-                "schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests,
-                "report": self._report, "environment": environment(),
-            },  # fmt: skip
-        )
+        record = {
+            "schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests,
+            "report": self._report, "environment": environment(),
+        }  # fmt: skip
+        store.write_json(self._out / "run.json", store.with_check(record))

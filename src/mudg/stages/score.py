@@ -8,7 +8,7 @@ errors/*.png and, where FID is computed, features/.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +24,7 @@ from mudg.base import config as configuration
 from mudg.base import log, palette, store
 from mudg.base.devices import choose_device
 from mudg.base.errors import UsageError
-from mudg.base.processes import computed_ahead
+from mudg.base.processes import computed_ahead, one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project, view_metrics
@@ -34,7 +34,7 @@ from mudg.core.view_facts import ViewFacts
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_scene
-from mudg.models.featnets import CodecFeatures, LpipsTrunk, PerceptualDistance
+from mudg.models.featnets import WHOLE_PIXELS, CodecFeatures, LpipsTrunk, PerceptualDistance
 from mudg.models.mdm import files as mdm_files
 from mudg.report import score_tables
 from mudg.stages.config import ScoreConfig
@@ -227,7 +227,7 @@ def _score(
         return _measured(trajectory, reference, number, {m: {k: of[k] for k in wanted[number] if k in of} for m, of in sums.items()})
 
     threads = native.threads()
-    with native.one_thread(), contextlib.ExitStack() as stack:
+    with native.one_thread() if _is_small(trajectory) else contextlib.nullcontext(), contextlib.ExitStack() as stack:
         truths = fills = None
         exact = reference.truth.exact
         if not reference.truth.stored and (exact or all(frame is not None for frame in trajectory.frames)):
@@ -236,7 +236,7 @@ def _score(
             )
         if reference.baseline is not None:
             fills = stack.enter_context(ObservationWriter(out / BASELINE / trajectory.name, trajectory.name, BASELINE))
-        for number, made in enumerate(computed_ahead(measure, len(trajectory.views), threads)):
+        for number, made in enumerate(_in_order(measure, trajectory, threads)):
             if fills is not None:
                 fills.add(made.seen[BASELINE])
             if number in counted:
@@ -259,6 +259,19 @@ def _score(
          "details": view_metrics.details(of), "truth": {k: v for k, v in anchors.items() if not isinstance(v, str)}}
         for name, of in sums.items()
     ]  # fmt: skip
+
+
+def _in_order(measure: Callable[[int], MeasuredView], trajectory: ScoredTrajectory, threads: int) -> Iterator[MeasuredView]:
+    """The measured views of a trajectory in order; of large ones, no two are in memory at the same time."""
+    if _is_small(trajectory):
+        yield from computed_ahead(measure, len(trajectory.views), threads)
+        return
+    with one_torch_thread():
+        yield from map(measure, range(len(trajectory.views)))
+
+
+def _is_small(trajectory: ScoredTrajectory) -> bool:
+    return all(view.camera.width * view.camera.height <= WHOLE_PIXELS for view in trajectory.views)
 
 
 def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequence[int]) -> list[set[str]]:

@@ -188,7 +188,6 @@ def make_trajectory(
     state = folder / "state"
     first, tail = _read_state(state)
     fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
-    sheet: list[np.ndarray] = []
     every = max(1, len(path) // 5)
     with ObservationWriter(folder, path.name, FREEVS if config.condition == FREEVS else SOURCE) as writer:
         done = spans[first - 1].stop if first else 0
@@ -208,13 +207,15 @@ def make_trajectory(
                     numbers = (fit.scale, fit.shift_m, fit.residual_before, fit.residual)
                     fits[f"{index:06d}"] = [round(x, 5) if math.isfinite(x) else None for x in numbers]
                 if index >= done and index % every == 0:
-                    sheet.append(_sheet_row(condition, sample, index - span.start))
+                    row = {"row": _sheet_row(condition, sample, index - span.start)}
+                    store.write_safetensors(state / f"row{index:06d}.safetensors", row)
             done, tail = span.stop, sample.latents
             store.write_json(state / FITS, fits)
             store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
             (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
-        if sheet:
-            store.write_image(folder / "overview.png", np.concatenate(sheet))
+        rows = [store.read_safetensors(file)["row"] for file in sorted(state.glob("row*.safetensors"))]
+        if rows:
+            store.write_image(folder / "overview.png", np.concatenate(rows))
         if fits:
             store.write_json(folder / FITS, fits)
         shutil.rmtree(state, ignore_errors=True)

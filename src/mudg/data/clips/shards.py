@@ -128,7 +128,7 @@ def clips_in(folder: Path, city: int) -> int:
 
 def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
     try:
-        return safe_open(str(path), "numpy")
+        return safe_open(str(store.regular(path)), "numpy")
     except (SafetensorError, OSError) as error:
         raise InputError("a shard of training clips is missing or damaged", where=str(path), got=str(error),
             remedy="delete it; it is made again") from error  # fmt: skip

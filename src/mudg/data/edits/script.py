@@ -8,17 +8,16 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import yaml
 from pydantic import ValidationError
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.plain_yaml import parse_yaml
 from mudg.base.records import first_problem, place
 from mudg.data.edits.records import CONDITIONS, VERBS, files_of
-
-LARGEST_BYTES: Final = 4_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,15 +106,8 @@ def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScr
     Args:
         where: name of the file for messages. folder: what its paths are relative to.
     """
-    if len(text) > LARGEST_BYTES:
-        raise InputError("this is no edit script: it is too large", where=where, expected=f"at most {LARGEST_BYTES} bytes")
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        entries = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark is not None else ""
-        raise InputError("not valid YAML", where=f"{where}{line}", got=str(getattr(error, "problem", error) or error)) from error
+    entries = parse_yaml(text, where)
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
     if not isinstance(root, yaml.SequenceNode) or not entries:
         raise InputError("an edit script is a list of edits", where=where, expected="lines such as `- remove: {ids: [car-003]}`",
             got="nothing" if entries in (None, []) else type(entries).__name__)  # fmt: skip

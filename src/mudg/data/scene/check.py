@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -17,6 +18,7 @@ from mudg.data.scene.labels import read_label
 from mudg.data.scene.read import load_scene, read_image, read_points
 
 Level = Literal["error", "warning", "note"]
+_EXAMPLES: Final = 3
 _LEVELS: Final = ("error", "warning", "note")
 
 MAX_SPEED_M_S: Final = 70.0
@@ -44,6 +46,26 @@ class Finding:
 
 
 Findings = Iterator[Finding]
+
+
+def folded(findings: Sequence[Finding], rest: str) -> list[str]:
+    """A line per finding; many that say the same of different things become one line with their number and three examples.
+
+    Args:
+        rest: the command that lists them all.
+    """
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for finding in findings:
+        kind = finding.where.split(" ")[0], re.sub(r"[\d.]*\d", "#", finding.message)
+        groups.setdefault(kind, []).append(finding)
+    lines = []
+    for same in groups.values():
+        if len(same) <= _EXAMPLES:
+            lines += [f"{finding.where}: {finding.message}" for finding in same]
+        else:
+            examples = ", ".join(finding.where for finding in same[:_EXAMPLES])
+            lines.append(f"{len(same)} times: {examples} and others: {same[0].message} (all of them: {rest})")
+    return lines
 
 
 def _warning(where: str, message: str) -> Finding:

@@ -151,7 +151,7 @@ class ZipFiles:
     @staticmethod
     def _index(root: str) -> dict[str, _ZipEntry]:
         try:
-            with zipfile.ZipFile(root) as archive:
+            with zipfile.ZipFile(store.regular(Path(root))) as archive:
                 infos = archive.infolist()
         except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
             raise InputError(
@@ -179,7 +179,7 @@ class ZipFiles:
     def _raw(self, ref: str) -> bytes:
         entry, where = self._entries[ref], f"{self.root}: {ref}"
         try:
-            with open(self.root, "rb") as handle:
+            with store.open_file(Path(self.root)) as handle:
                 handle.seek(entry.header_offset)
                 header = handle.read(30)
                 if len(header) != 30 or header[:4] != b"PK\x03\x04":

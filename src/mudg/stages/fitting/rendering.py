@@ -20,6 +20,9 @@ DRAWING: Final = "drawing"
 """Fact of a fitted scene: settings of ``RasterConfig`` that it was fitted with and that change its pictures; not there: the usual ones."""
 Rendered = TypeVar("Rendered")
 
+_ROWS: Final = 128
+"""Rows of an image whose classes are found together."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedCondition:
@@ -122,7 +125,8 @@ def _observed(model: SceneModel, render: Render, view: View, sky_below_alpha: fl
     depth = torch.where(covered, render.depth, torch.nan)
     semantics = None
     if render.extra is not None:
-        channel = composite_semantics(model, render.extra, render.alpha).argmax(0)
+        rows = zip(render.extra.split(_ROWS, 1), render.alpha.split(_ROWS, 1), strict=True)  # no copy of all classes at once
+        channel = torch.cat([composite_semantics(model, extra, alpha).argmax(0) for extra, alpha in rows])
         semantics = torch.tensor(model.classes).to(channel.device, non_blocking=True)[channel]
         if model.sky is not None:
             semantics = torch.where(covered[0], semantics, palette.ID["sky"])

@@ -193,7 +193,7 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
 def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420) -> None:
     """Draw the loss terms over the steps, both axes logarithmic, from the lines of log.jsonl."""
     points: dict[str, dict[int, float]] = {}
-    for line in log_file.read_text().splitlines():
+    for line in store.read_text(log_file).splitlines():
         entry = json.loads(line)
         if "total" in entry and "step" in entry:
             for name in ("total", "rgb", "depth", "semantics"):

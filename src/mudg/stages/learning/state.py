@@ -185,8 +185,8 @@ class RowFiles:
     def _open(self, path: Path) -> Any:
         if path not in self._files:
             try:
-                self._files[path] = safe_open(str(path), "pt")
-            except (SafetensorError, OSError) as error:
+                self._files[path] = safe_open(str(store.regular(path)), "pt")
+            except (SafetensorError, InputError, OSError) as error:
                 raise IntegrityError("a file of a checkpoint is damaged", where=str(path), got=str(error)) from error
         return self._files[path]
 

@@ -6,6 +6,7 @@ No detector is part of the program. Images are named ``METHOD/TRAJECTORY/000003`
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -245,7 +246,7 @@ def read_mask(path: Path) -> NDArray[np.uint8]:
     if not path.is_file():
         raise InputError("a lane mask is missing", where=str(path), expected="one mask for each scored view")
     try:
-        with Image.open(path) as picture:
+        with Image.open(io.BytesIO(store.read_bytes(path))) as picture:
             return np.asarray(picture.convert("L"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError("a lane mask cannot be decoded", where=str(path), got=str(error)) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -37,7 +38,7 @@ def looks_like_custom(source: Path) -> bool:
     index = source / INDEX
     if not index.is_file():
         return False
-    with index.open("rb") as handle:
+    with store.open_file(index) as handle:
         return b'"mudg-log"' in handle.read(4096)
 
 
@@ -157,7 +158,7 @@ def pose_of(ego: EgoPath, record: LogItem) -> NDArray[np.float64]:
 def refuse_grey(path: Path) -> None:
     """Refuse grey images, which ``decode_image`` would take: in a log of colour cameras they are a mistake."""
     try:
-        with Image.open(path, formats=("PNG", "JPEG")) as image:
+        with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG", "JPEG")) as image:
             mode = image.mode
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return  # decode_image says better what is wrong

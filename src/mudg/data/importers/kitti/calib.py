@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import Camera
 from mudg.data.importers.common import rigid_pose, rigid_rotation
-from mudg.data.importers.kitti.poses import read_text
 
 Matrix = NDArray[np.float64]
 PIXEL_CENTRE_PX = 0.5
@@ -88,7 +88,7 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
     The colon after the key is optional (some benchmark files leave it out for ``R_rect`` and ``Tr_velo_cam``).
     """
     table: dict[str, NDArray[np.float64]] = {}
-    for line in read_text(path).splitlines():
+    for line in store.read_text(path).splitlines():
         match = re.match(r"\s*([A-Za-z][\w]*)\s*:?\s+(.*)$", line)
         if match is None:
             continue

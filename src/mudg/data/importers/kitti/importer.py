@@ -30,7 +30,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
+from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Source, Track
@@ -116,7 +116,7 @@ def looks_like_kitti(source: Path) -> bool:
     record = source / "info.json"
     if not record.is_file() or not any(path.suffix == ".bin" for path in source.iterdir()):
         return False
-    with record.open("rb") as handle:
+    with store.open_file(record) as handle:
         return b'"CAM2"' in handle.read(1 << 16)
 
 

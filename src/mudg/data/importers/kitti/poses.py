@@ -20,17 +20,9 @@ EARTH_RADIUS_M = 6378137.0
 _OXTS_VALUES = 30
 
 
-def read_text(path: Path) -> str:
-    """A UTF-8 text file."""
-    try:
-        return store.read_bytes(path).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError("file is not text", where=str(path), got=str(error)) from error
-
-
 def read_lines(path: Path) -> list[str]:
     """Non-empty lines of a text file."""
-    return [line for line in read_text(path).splitlines() if line.strip()]
+    return [line for line in store.read_text(path).splitlines() if line.strip()]
 
 
 def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDArray[np.float64]:

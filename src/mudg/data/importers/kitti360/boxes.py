@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation
 
@@ -101,7 +102,7 @@ def _objects(path: Path) -> Iterator[ElementTree.Element]:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError("box file is too large", where=str(path), expected=f"<= {MAX_FILE_BYTES} bytes")
-        with path.open("rb") as handle:
+        with store.open_file(path) as handle:
             while chunk := handle.read(_CHUNK):
                 _refuse_entities(tail + chunk, str(path), first=not tail)
                 tail = chunk[-16:]

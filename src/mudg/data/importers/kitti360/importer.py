@@ -25,6 +25,7 @@ looks along the lens' axis and is 90 degrees wide and high, with the lens' own r
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -368,7 +369,7 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
 def _grey(path: Path) -> NDArray[Any]:
     """A PNG of one channel, u8 or u16 [H, W]."""
     try:
-        with Image.open(path, formats=("PNG",)) as image:
+        with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
                 raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}",
                     expected="8 or 16 bits")  # fmt: skip

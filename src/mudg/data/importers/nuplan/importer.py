@@ -26,6 +26,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
@@ -67,7 +68,7 @@ def looks_like_nuplan(source: Path) -> bool:
 def _is_database(path: Path) -> bool:
     if path.suffix != ".db":
         return False
-    with path.open("rb") as handle:
+    with store.open_file(path) as handle:
         return handle.read(len(_SQLITE)) == _SQLITE
 
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
+from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import EgoPath, Scene, Source
@@ -36,7 +36,7 @@ def looks_like_info_frame(source: Path) -> bool:
     if not path.is_file() or path.stat().st_size > _MAX_RECOGNISED_BYTES:
         return False
     try:
-        meta = json.loads(path.read_bytes())["metainfo"]
+        meta = json.loads(store.read_bytes(path))["metainfo"]
     except (ValueError, KeyError, TypeError, OSError):
         return False
     return isinstance(meta, dict) and str(meta.get("dataset", meta.get("DATASET", ""))).lower() == "nuscenes"

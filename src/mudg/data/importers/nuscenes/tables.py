@@ -1,6 +1,7 @@
 """The tables of a nuScenes release: JSON arrays of flat records, read one record at a time.
 
 The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each). What an
+import os
 import needs of them is one scene, so records are found by the value of one field while the file passes through a
 buffer of a few megabytes; only matching records become Python objects.
 """
@@ -14,6 +15,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
+from mudg.base import store
 from mudg.base.errors import InputError
 
 _BUFFER_BYTES: Final = 1 << 22
@@ -116,13 +118,10 @@ def _no_constant(name: str) -> Any:
 
 
 def _open(path: Path) -> BinaryIO:
-    try:
-        return path.open("rb")
-    except FileNotFoundError as error:
+    if not path.exists():
         raise InputError("table is missing", where=str(path),
-            remedy="unpack the release's metadata archive, which holds all tables") from error  # fmt: skip
-    except OSError as error:
-        raise InputError("table cannot be read", where=str(path), got=str(error)) from error
+            remedy="unpack the release's metadata archive, which holds all tables")  # fmt: skip
+    return store.open_file(path)
 
 
 def _start_of_array(file: BinaryIO, path: Path, buffer_bytes: int) -> bytes:

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.data.importers.columns import arrow_files, require_columns
 from mudg.data.importers.waymo import records
@@ -213,7 +214,7 @@ class ParquetTable:
         with arrow_files(path):
             from pyarrow.parquet import ParquetFile
 
-            self._file = ParquetFile(path, buffer_size=_STREAM_BYTES, pre_buffer=False, page_checksum_verification=True)
+            self._file = ParquetFile(store.regular(path), buffer_size=_STREAM_BYTES, pre_buffer=False, page_checksum_verification=True)
         self._names = set(self._file.schema_arrow.names)
         counts = [self._file.metadata.row_group(n).num_rows for n in range(self._file.num_row_groups)]
         self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])

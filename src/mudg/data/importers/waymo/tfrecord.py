@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
+from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.data.importers.waymo import records
 from mudg.data.importers.waymo.messages import CONTEXT, FRAME, parse_message
@@ -113,7 +113,7 @@ def record_places(path: Path) -> Iterator[RecordPlace]:
         InputError: not a TFRecord file, cut off, a damaged header, or a length that no record has.
     """
     try:
-        with path.open("rb") as file:
+        with store.open_file(path) as file:
             size = file.seek(0, 2)
             offset, number = 0, 0
             while offset < size:
@@ -203,7 +203,7 @@ class TfrecordLog:
                 expected="records" + (f" {first} to {end - 1}" if end is not None else ""), got="none")  # fmt: skip
         frames: list[FrameRecord] = []
         context = b""
-        with path.open("rb") as file, log.task("checking records", len(places)) as bar:
+        with store.open_file(path) as file, log.task("checking records", len(places)) as bar:
             for place in places:
                 where = f"{path}: record {place.number} at byte {place.offset}"
                 message = parse_message(read_record(file, path, place), FRAME, where)
@@ -263,7 +263,7 @@ class TfrecordLog:
         return None
 
     def _message(self, frame: FrameRecord) -> dict[str, Any]:
-        with self._path.open("rb") as file:
+        with store.open_file(self._path) as file:
             return parse_message(read_record(file, self._path, self._places[frame.number]), FRAME, frame.where)
 
 

@@ -1,0 +1,234 @@
+"""Kills and full disks at every point of every verb: the repeated command ends in the result of an undisturbed run, to the bit."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from faults import contents, failing, in_child, killed, points
+from test_nothing_is_lost import HISTORY, VERBS, quick_bench, world  # noqa: F401
+
+from mudg.base import store
+from mudg.base.errors import ResourceError
+from mudg.base.replacement import Replacement
+from mudg.base.run_folder import RunDir, VerbOutput
+
+OUTPUT = VerbOutput("small", 1, ("*.txt", "rows/*.txt"))
+SWEPT = [name for name in VERBS if name not in ("learn", "bench", "film")]
+"""Verbs that do their work in this process; ``learn`` has its own tests of kills, the others write through the same store."""
+
+
+@pytest.fixture(autouse=True)
+def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed process loses nothing that the system has; only a power failure would."""
+    monkeypatch.setattr(os, "fsync", lambda _fd: None)
+    monkeypatch.setattr(os, "sync", lambda: None)
+
+
+def small_run(out: Path, value: int = 1, *, overwrite: bool = False) -> Path:
+    """A verb in small: files, a log, sub-folders; it continues where it stopped."""
+    run = RunDir.open(out, OUTPUT, {"value": value}, {}, overwrite)
+    if run.complete:
+        return run.reused()
+    for number in range(3):
+        path = run.path / "rows" / f"{number}.txt"
+        if not path.exists():
+            store.write_text(path, f"{value} {number}")
+        run.log(step=number)
+    store.write_text(run.path / "out.txt", f"{value}")
+    run.finish()
+    return run.out
+
+
+def never(_number: int, _name: str) -> None: ...
+
+
+def counted(work: Callable[[], Any], root: Path) -> list[str]:
+    root.mkdir(exist_ok=True)
+    with points(never, root) as found:
+        work()
+    return found
+
+
+def leftovers(folder: Path) -> list[str]:
+    """What no finished run leaves beside its result."""
+    return [path.name for path in folder.iterdir() if ".part" in path.name]
+
+
+# ---- the store and the run folder ----------------------------------------------------------------------------------------
+
+
+EVERY = pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.slow)])
+"""Sweep over every fifth point, in the slow set over all."""
+
+
+@EVERY
+def test_a_small_run_killed_at_every_point_is_repeated_to_the_same_bytes(tmp_path: Path, step: int) -> None:
+    whole = contents(small_run(tmp_path / "whole"))
+    total = len(counted(lambda: small_run(tmp_path / "x" / "counted"), tmp_path / "x"))
+    assert total > 20
+    for number in range(1, total + 1, step):
+        place = tmp_path / f"kill{number}"
+        place.mkdir()
+        assert in_child(lambda place=place: small_run(place / "out"), killed(number), place) == -9
+        small_run(place / "out")
+        assert contents(place / "out") == whole, f"after a kill at point {number}"
+        assert not leftovers(place)
+        shutil.rmtree(place)
+
+
+@EVERY
+def test_a_replacement_killed_at_every_point_is_never_lost(tmp_path: Path, step: int) -> None:
+    """Old or new, whole, is there at any moment; somebody else's file always is; the repeated command ends in the new one."""
+    new = contents(small_run(tmp_path / "whole", 2)) | {"mine.md": b"mine"}
+
+    def replaced(place: Path) -> Path:
+        small_run(place / "out", 1)
+        (place / "out" / "mine.md").write_text("mine")
+        return place
+
+    probe = replaced(tmp_path / "probe")
+    total = len(counted(lambda: small_run(probe / "out", 2, overwrite=True), probe))
+    for number in range(1, total + 1, step):
+        place = replaced(tmp_path / f"kill{number}")
+        assert in_child(lambda place=place: small_run(place / "out", 2, overwrite=True), killed(number), place) == -9
+        standing = [f for f in (place / "out", Replacement.at(place / "out").retired) if (f / "manifest.json").is_file()]
+        assert any(_verifies(folder) for folder in standing), f"nothing whole after a kill at point {number}"
+        small_run(place / "out", 2, overwrite=True)
+        assert contents(place / "out") == new, f"after a kill at point {number}"
+        assert not leftovers(place)
+
+
+def _verifies(folder: Path) -> bool:
+    store.verify_manifest(folder)
+    return True
+
+
+@EVERY
+@pytest.mark.parametrize("code", [errno.ENOSPC, pytest.param(errno.EIO, marks=pytest.mark.slow)])
+def test_a_full_or_broken_disk_at_every_write_leaves_what_resumes(tmp_path: Path, code: int, step: int) -> None:
+    whole = contents(small_run(tmp_path / "whole"))
+    total = len(counted(lambda: small_run(tmp_path / "x" / "counted"), tmp_path / "x"))
+    said: list[str] = []
+    for number in range(1, total + 1, step):
+        place = tmp_path / f"full{number}"
+        place.mkdir()
+        try:
+            with points(failing(number, code), place):
+                small_run(place / "out")
+        except (ResourceError, OSError) as error:
+            said.append(str(error))
+        small_run(place / "out")
+        assert contents(place / "out") == whole, f"after a failure at point {number}"
+        assert not leftovers(place)
+    assert len(said) > 15 / step and all(os.strerror(code) in words for words in said)
+
+
+# ---- every verb ----------------------------------------------------------------------------------------------------------
+
+
+def same_result(name: str, out: Path, whole: Path) -> None:
+    """Equal to the bit, but for what shows how a run went."""
+    history = HISTORY.get(name, set()) | {"manifest.json"} if name in HISTORY else set()
+    found, wanted = (
+        {n: c for n, c in contents(folder).items() if n not in history and Path(n).name != "state.json"} for folder in (out, whole)
+    )
+    assert found.keys() == wanted.keys()
+    assert [n for n in found if found[n] != wanted[n] and n != "manifest.json"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SWEPT)
+def test_a_verb_killed_at_any_point_is_repeated_to_the_same_bytes(name: str, world: dict[str, Path], tmp_path: Path) -> None:  # noqa: F811
+    given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
+
+    def work(out: Path) -> Any:
+        return VERBS[name].call(given, out, 1, False)
+
+    work(tmp_path / "whole")
+    found = counted(lambda: work(tmp_path / "x" / "counted"), tmp_path / "x")
+    chosen = sorted(random.Random(name).sample(range(1, len(found) + 1), min(len(found), 24)))
+    for number in chosen:
+        place = tmp_path / f"kill{number}"
+        place.mkdir()
+        assert in_child(lambda place=place: work(place / "out"), killed(number), place) == -9, found[number - 1]
+        work(place / "out")
+        same_result(name, place / "out", tmp_path / "whole")
+        assert not leftovers(place), found[number - 1]
+        shutil.rmtree(place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SWEPT)
+def test_a_verb_on_a_full_disk_resumes_when_there_is_space(name: str, world: dict[str, Path], tmp_path: Path) -> None:  # noqa: F811
+    given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
+    VERBS[name].call(given, tmp_path / "whole", 1, False)
+    found = counted(lambda: VERBS[name].call(given, tmp_path / "x" / "counted", 1, False), tmp_path / "x")
+    said: list[str] = []
+    for number in sorted(random.Random(name).sample(range(1, len(found) + 1), min(len(found), 8))):
+        place = tmp_path / f"full{number}"
+        place.mkdir()
+        try:
+            with points(failing(number), place):
+                VERBS[name].call(given, place / "out", 1, False)
+        except (ResourceError, OSError) as error:
+            said.append(str(error))
+        VERBS[name].call(given, place / "out", 1, False)
+        same_result(name, place / "out", tmp_path / "whole")
+    assert all("No space left" in words for words in said)
+
+
+# ---- soak ----------------------------------------------------------------------------------------------------------------
+
+
+def open_files() -> set[str]:
+    """What this process holds open."""
+    folder, found = Path("/proc/self/fd"), set()
+    for one in list(folder.iterdir()) if folder.is_dir() else []:
+        try:
+            found.add(os.readlink(one))
+        except OSError:
+            continue
+    return found
+
+
+def children() -> list[str]:
+    listed = Path(f"/proc/self/task/{threading.get_native_id()}/children")
+    return listed.read_text().split() if listed.is_file() else []
+
+
+@pytest.mark.slow
+def test_two_hundred_runs_with_kills_leak_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scratch = tmp_path / "tmp"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    rng = random.Random(18)
+    total = len(counted(lambda: small_run(tmp_path / "x" / "counted"), tmp_path / "x"))
+    whole = {value: contents(small_run(tmp_path / f"whole{value}", value)) for value in (1, 2)}
+    files, threads, processes = open_files(), threading.active_count(), children()
+    place = tmp_path / "soak"
+    place.mkdir()
+    value = 1
+    for _ in range(200):
+        value = rng.choice((1, 2))
+        if rng.random() < 0.6:
+            in_child(lambda value=value: small_run(place / "out", value, overwrite=True), killed(rng.randint(1, 2 * total)), place)
+        else:
+            small_run(place / "out", value, overwrite=True)
+            assert contents(place / "out") == whole[value]
+            assert not (place / "out" / "lock").exists()
+    small_run(place / "out", 3 - value, overwrite=True)
+    small_run(place / "out", value, overwrite=True)
+    assert contents(place / "out") == whole[value]
+    assert sorted(os.listdir(place)) == ["out"]
+    assert os.listdir(scratch) == []
+    assert threading.active_count() == threads and children() == processes
+    assert {f for f in open_files() if str(tmp_path) in f} <= files

@@ -1,0 +1,160 @@
+"""Files that would never end, or grow when read: pipes, devices and sockets where files should be, and YAML that multiplies."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+
+import kitti_folders
+import pytest
+import write_custom
+from toy_scene import ToyStreet
+
+from mudg import cli
+from mudg.base import store
+from mudg.base.errors import InputError, MudgError
+from mudg.base.plain_yaml import DEEPEST, parse_yaml
+from mudg.data.edits.script import parse_edits
+from mudg.stages import ingest
+from mudg.stages.config import IngestConfig
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+
+
+@contextmanager
+def ends_within(seconds: float) -> Iterator[None]:
+    """Fail instead of waiting for ever."""
+
+    def late(_number: int, _frame: FrameType | None) -> None:
+        raise AssertionError(f"still waiting after {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+# ---- the store ---------------------------------------------------------------------------------------------------------
+
+
+def test_only_regular_files_are_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "nowhere").symlink_to("gone")
+    (tmp_path / "folder").mkdir()
+    with socket.socket(socket.AF_UNIX) as made, suppress(OSError):
+        made.bind(str(tmp_path / "socket"))
+    cases = {"pipe": "a named pipe", "link": "a named pipe", "folder": "a folder", "loop": "levels of symbolic"}
+    cases |= {"nowhere": "not found", "gone": "not found"}
+    cases |= {"socket": "a socket"} if (tmp_path / "socket").exists() else {}
+    with ends_within(5):
+        for name, words in cases.items():
+            for read in (store.read_bytes, store.read_json, store.sha256_file, store.open_file, store.regular, store.read_safetensors):
+                with pytest.raises(InputError, match=words) as refused:
+                    read(tmp_path / name)
+                assert str(tmp_path / name) in refused.value.where
+        with pytest.raises(InputError, match="a device"):
+            store.read_bytes(Path("/dev/zero"))
+    (tmp_path / "file").write_bytes(b"content")
+    (tmp_path / "good").symlink_to("file")
+    assert store.read_bytes(tmp_path / "good") == b"content"
+
+
+@pytest.mark.parametrize("words", [
+    ["fuse", "SCENE", "--out", "OUT", "--config", "PIPE"], ["fuse", "PIPE", "--out", "OUT"], ["fuse", "--list", "PIPE", "--out", "OUT"],
+    ["doctor", "PIPE"], ["ingest", "PIPE", "OUT"], ["edit", "FIT", "PIPE", "--out", "OUT"], ["run", "PIPE", "--out", "OUT"],
+], ids=" ".join)  # fmt: skip
+def test_the_command_line_waits_for_no_pipe(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(tmp_path / "PIPE")
+    (tmp_path / "FIT").mkdir()
+    with ends_within(20):
+        code = cli.main([str(tmp_path / word) if word.isupper() else word for word in words])
+    assert code in (2, 3), capsys.readouterr().err
+    assert "Traceback" not in capsys.readouterr().err
+
+
+# ---- logs --------------------------------------------------------------------------------------------------------------
+
+
+def replaced_one_by_one(folder: Path) -> Iterator[str]:
+    """One file of each kind and place is a pipe, then itself again."""
+    seen = set()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        kind = (path.parent, path.suffix, path.stem if not path.stem.isdigit() else "")
+        if kind in seen:
+            continue
+        seen.add(kind)
+        path.rename(folder.parent / "kept")
+        os.mkfifo(path)
+        yield path.relative_to(folder).as_posix()
+        path.unlink()
+        (folder.parent / "kept").rename(path)
+
+
+@pytest.mark.parametrize("kind", ["custom", "kitti"])
+def test_no_import_waits_for_a_pipe(kind: str, tmp_path: Path) -> None:
+    if kind == "kitti":
+        log = kitti_folders.write_raw_drive(tmp_path / "in" / "day")
+    else:
+        street = ToyStreet(times=[0.0, 0.1])
+        log = write_custom.write_log(street.write(tmp_path / "street", width=24, height=16, labels=False), tmp_path / "in" / "day")
+    refused = []
+    for name in replaced_one_by_one(tmp_path / "in"):
+        with ends_within(20):
+            try:
+                ingest.run(IngestConfig(format=kind, workers=1, contact_sheet=False), log, tmp_path / "out", overwrite=True)
+            except MudgError:
+                refused.append(name)
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    assert refused
+
+
+# ---- YAML --------------------------------------------------------------------------------------------------------------
+
+
+MULTIPLYING = "x0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"x{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 9)
+)
+HOSTILE = {
+    "nested": ("a: " + "[" * 3000 + "]" * 3000, "nested too deeply"),
+    "nested by lines": ("\n".join(" " * n + "a:" for n in range(1000)), "nested too deeply"),
+    "multiplied by aliases": (MULTIPLYING, "too many values"),
+    "containing itself": ("a: &x [*x]", "contains itself"),
+    "large": ("a: " + "x" * 5_000_000, "too large"),
+    "an alias of nothing": ("a: *x", "not valid YAML"),
+    "a date that does not exist": ("a: 2026-13-45", "not valid YAML"),
+    "bytes that are no text": (b"a: \xff\xfe\x00", "not valid YAML"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_yaml_is_refused_at_once(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, words = HOSTILE[name]
+    with ends_within(10):
+        with pytest.raises(InputError, match=words):
+            parse_yaml(text, "here")
+        with pytest.raises(InputError, match=words):
+            parse_edits(text.encode() if isinstance(text, str) else text, "edits.yaml", tmp_path)
+        (tmp_path / "c.yaml").write_bytes(text.encode() if isinstance(text, str) else text)
+        assert cli.main(["fuse", "scene", "--out", str(tmp_path / "out"), "--config", str(tmp_path / "c.yaml")]) == 3
+    said = capsys.readouterr().err
+    assert words in said and str(tmp_path / "c.yaml") in said
+
+
+def test_plain_yaml_with_aliases_is_read() -> None:
+    deep = "a: " + "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)
+    assert parse_yaml("a: &x {b: [1, 2]}\nc: *x\nd: {<<: *x, e: 3}", "here") == {
+        "a": {"b": [1, 2]}, "c": {"b": [1, 2]}, "d": {"b": [1, 2], "e": 3},
+    }  # fmt: skip
+    assert parse_yaml(deep, "here")
+    assert parse_yaml("", "here") is None

@@ -1,0 +1,68 @@
+"""Large images: compared in bands of rows, with the result of the whole; views that cannot fit are refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from mudg.base.errors import ResourceError
+from mudg.base.types import Camera, Trajectory, View
+from mudg.core.metrics import Pair
+from mudg.models import featnets
+from mudg.models.featnets import CodecFeatures, PerceptualDistance
+from mudg.models.mdm.codec import CodecConfig, PatchCodec
+from mudg.stages import render
+
+
+def pair_of(height: int, width: int, *, masked: bool) -> Pair:
+    noise = torch.Generator().manual_seed(4)
+    made, truth = torch.rand(2, 3, height, width, generator=noise).unbind(0)
+    mask = (torch.rand(1, height, width, generator=noise) > 0.3) if masked else None
+    return Pair(made, None, None, truth, None, None, None, mask=mask)
+
+
+def small_distance() -> PerceptualDistance:
+    torch.manual_seed(1)
+    codec = PatchCodec(CodecConfig(decoder_width=8, decoder_blocks=2))
+    for block in codec.blocks:  # as after training: a fresh block adds nothing
+        torch.nn.init.normal_(block.conv2.weight, std=0.1)
+    return PerceptualDistance(CodecFeatures(codec.eval()))
+
+
+@pytest.mark.parametrize(("height", "width"), [(136, 40), (133, 29), (40, 24), (201, 16)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_bands_give_the_distance_of_the_whole(height: int, width: int, masked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, distance = pair_of(height, width, masked=masked), small_distance()
+    whole = distance(pair)
+    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
+    for rows in (8, 24, 64, 1000):
+        monkeypatch.setattr(featnets, "BAND_PIXELS", rows * width)
+        assert distance(pair) == pytest.approx(whole, rel=2e-6)
+
+
+def test_bands_are_not_the_whole_without_what_lies_around_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test above would notice a border that is too thin."""
+    pair, distance = pair_of(136, 40, masked=False), small_distance()
+    whole = distance(pair)
+    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
+    monkeypatch.setattr(featnets, "BAND_PIXELS", 24 * 40)
+    monkeypatch.setattr(CodecFeatures, "reach_rows", 16)
+    assert distance(pair) != pytest.approx(whole, rel=2e-6)
+
+
+def test_nothing_that_counts_has_no_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
+    pair = pair_of(40, 24, masked=False)
+    empty = Pair(pair.rgb, None, None, pair.truth_rgb, None, None, None, mask=torch.zeros(1, 40, 24, dtype=torch.bool))
+    assert math.isnan(small_distance()(empty))
+
+
+def test_a_view_that_cannot_fit_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera("front", 1_000_000, 562_500, 8e5, 8e5, 5e5, 2.8e5)
+    path = Trajectory("front", (View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.0),), None)
+    monkeypatch.setattr(render.memory, "free_bytes", lambda: 64 << 30)
+    with pytest.raises(ResourceError, match="1000000 x 562500 pixels needs more memory") as refused:
+        render._require_memory([path])
+    assert "TiB" in refused.value.expected and refused.value.got == "64.0 GiB free" and "--width-px" in refused.value.remedy
