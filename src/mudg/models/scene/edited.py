@@ -18,6 +18,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
+from mudg.core import harmonics
 from mudg.core.edit import Motion
 from mudg.core.quaternions import left_product_matrix
 from mudg.core.table import Table
@@ -146,6 +147,9 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
     turn = torch.from_numpy(geometry.quaternion_from_matrix(geometry.invert(pose))).float().to(model.device)
     columns["means"][rows] = torch.from_numpy(local[inside].astype(np.float32)).to(model.device)
     columns["quats"][rows] = columns["quats"][rows] @ left_product_matrix(turn).T
+    if model.sh_degree > 0 and not model.harmonics_in_world:
+        box_from_world = harmonics.mixing(torch.from_numpy(pose[:3, :3].T.copy()), model.sh_degree).to(model.device)
+        columns["sh_rest"][rows] = harmonics.turned(columns["sh_rest"][rows], box_from_world)
     owner = table.labels["node"].clone()
     owner[rows] = len(model.nodes)
     node = RigidNode(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object)

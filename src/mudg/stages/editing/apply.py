@@ -24,7 +24,7 @@ from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.models.scene.sky import SkyNode
-from mudg.stages.editing.plan import Actor, EditPlan
+from mudg.stages.editing.plan import Actor, Background, EditPlan
 
 EGO_FACT: Final = "edited_ego"
 """Fact of a fitted scene that was edited by itself: the vehicle's path, keys as rows [time, 16 numbers of the pose]."""
@@ -104,8 +104,23 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
     for name in sorted(standing - set(objects)):
         static, objects[name] = _cut_points(static, _track(name, plan.before.actors[name]))
     objects = {name: points for name, points in objects.items() if name not in plan.removed}
+    if plan.background is not None:
+        static = _other_street(*plan.background)
+        objects = {name: points for name, points in objects.items() if name not in standing}
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
     return FusedCloud(static, objects, cloud.colors)
+
+
+def _other_street(other: Background, world_from_other: NDArray[np.float64]) -> PointCloud:
+    """The static points of another run at their place in this one.
+
+    Raises:
+        UsageError: it has none.
+    """
+    if other.points is None:
+        raise UsageError("the other run has no fused points", remedy="name a folder made by `mudg run`")
+    xyz = geometry.transform_points(world_from_other, other.points.xyz.astype(np.float64))
+    return replace(other.points, xyz=xyz.astype(np.float32))
 
 
 def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointCloud]:

@@ -100,7 +100,7 @@ def background_of(parts: RunParts, name: str) -> Background:
         ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
     if not len(ground):
         raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
-    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
+    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground, cloud)
 
 
 def opener(script: EditScript) -> Callable[[AssetSource], Asset]:

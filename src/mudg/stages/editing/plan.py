@@ -17,7 +17,7 @@ import numpy as np
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
-from mudg.base.types import Scene
+from mudg.base.types import PointCloud, Scene
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
 from mudg.core.ground import HeightMap
@@ -34,11 +34,12 @@ OpenAsset = Callable[[AssetSource], Asset]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Another street: its fit, the path of its vehicle, and points f32[N, 3] of its ground."""
+    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground, and its fused points, if they are known."""
 
     model: SceneModel
     ego: Motion
     ground_xyz: np.ndarray
+    points: PointCloud | None = None
 
 
 @dataclass(frozen=True, slots=True)
