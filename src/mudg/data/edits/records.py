@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from mudg.base.errors import InputError
 from mudg.base.records import Number, StrictRecord, after, checked_by
-from mudg.base.weather_settings import LightSettings, WeatherSettings
+from mudg.base.weather_settings import LightSettings, SeasonSettings, WeatherSettings
 
 EGO: Final = "ego"
 """The id of the recording vehicle in edit scripts."""
@@ -215,16 +215,10 @@ class SkyEdit(StrictRecord):
     yaw_deg: Number = 0.0
 
 
-class SeasonEdit(StrictRecord):
-    """Another season."""
-
-    leaves: Literal["autumn", "bare"]
-
-
 VERBS: Final[dict[str, type[StrictRecord]]] = {
     "remove": RemoveEdit, "move": MoveEdit, "stop": StopEdit, "speed": SpeedEdit, "lane_change": LaneChangeEdit, "path": PathEdit,
     "replace": ReplaceEdit, "insert": InsertEdit, "background": BackgroundEdit, "sky": SkyEdit,
-    "weather": WeatherSettings, "light": LightSettings, "season": SeasonEdit,
+    "weather": WeatherSettings, "light": LightSettings, "season": SeasonSettings,
 }  # fmt: skip
 CONDITIONS: Final = ("weather", "light", "season")
 """Verbs that change no geometry."""

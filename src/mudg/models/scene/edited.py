@@ -282,20 +282,20 @@ def matched_light(asset: Asset, model: SceneModel) -> tuple[Asset, NDArray[np.fl
     here = road_color(model)
     if here is None or asset.road_rgb is None:
         return asset, np.ones(3)
-    gain = (_linear(here) / np.maximum(_linear(np.asarray(asset.road_rgb)), 1e-4)).clip(0.25, 4.0)
+    gain = (linear_of(here) / np.maximum(linear_of(np.asarray(asset.road_rgb)), 1e-4)).clip(0.25, 4.0)
     shown = 0.5 + SH_C0 * asset.columns["sh_dc"].double().numpy()
-    lit = torch.from_numpy((_display(_linear(shown) * gain) - 0.5) / SH_C0).float()
+    lit = torch.from_numpy((display_of(linear_of(shown) * gain) - 0.5) / SH_C0).float()
     return replace(asset, columns={**asset.columns, "sh_dc": lit}), gain
 
 
-def _linear(display: NDArray[np.float64]) -> NDArray[np.float64]:
+def linear_of(display: NDArray[np.float64]) -> NDArray[np.float64]:
     """sRGB display values to linear light; negative values become 0."""
     v = np.maximum(display, 0.0)
     return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
 
 
-def _display(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of ``_linear``."""
+def display_of(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of ``linear_of``."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 

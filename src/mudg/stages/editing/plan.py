@@ -17,7 +17,7 @@ import numpy as np
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
-from mudg.base.types import PointCloud, Scene
+from mudg.base.types import PointCloud, Scene, View
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
 from mudg.core.ground import HeightMap
@@ -118,6 +118,8 @@ class EditPlan:
         sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
         conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
+        views: recorded ones, which say what nobody saw of the street; none where there is no scene.
+        repairs: whether the street is closed where an object is gone (``models/scene/uncovered.py``).
     """
 
     before: EditWorld
@@ -130,6 +132,8 @@ class EditPlan:
     conditions: dict[str, Any] = field(default_factory=dict)
     notes: list[dict[str, Any]] = field(default_factory=list)
     moves_ego: bool = False
+    views: tuple[View, ...] = ()
+    repairs: bool = True
 
     def changed(self, name: str, motion: Motion) -> Motion:
         """The path of an actor of the recording with all that is done to it."""
