@@ -170,8 +170,15 @@ class PlaceNear(StrictRecord):
     yaw_deg: Number = 0.0
 
 
+class SunPlace(StrictRecord):
+    """Where the recorded sun stands: degrees counter-clockwise from world x, and above the horizon."""
+
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)]
+    elevation_deg: Annotated[float, Field(ge=10, le=90)]
+
+
 class InsertEdit(StrictRecord):
-    """Add an object, on a ``path`` or ``near`` something."""
+    """Add an object, on a ``path`` or ``near`` something; with ``sun``, its shadow lies where that casts it."""
 
     asset: AssetSource
     id: ActorName | None = None
@@ -180,6 +187,7 @@ class InsertEdit(StrictRecord):
     near: PlaceNear | None = None
     ground: bool = True
     shadow: Share = 0.6
+    sun: SunPlace | None = None
     match_light: bool = True
 
     @model_validator(mode="after")

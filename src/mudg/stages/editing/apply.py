@@ -56,7 +56,7 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
         actor = plan.after.actors[name]
         model = edited.with_asset(model, asset, name, actor.motion, actor.label)
         if insertion.shadow > 0:
-            model = edited.with_shadow(model, name, insertion.shadow)
+            model = edited.with_shadow(model, name, insertion.shadow, insertion.sun)
     if sky is not None and plan.sky is not None:
         model = replace(model, sky=panorama(sky, plan.sky.yaw_deg, model))
     model.sort_rows()

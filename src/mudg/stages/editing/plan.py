@@ -100,11 +100,13 @@ class EditWorld:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Insertion:
-    """An object that is put in: what it is; how dark its contact shadow is; whether it takes the light of the scene."""
+    """An object that is put in: what it is; how dark its shadow is; whether it takes the light of the scene; the direction f64[3] towards
+    the sun that casts its shadow, or None."""
 
     asset: Asset
     shadow: float
     match_light: bool
+    sun: np.ndarray | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -286,7 +288,7 @@ def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
         motion = paths.along_points(points, height, ground, _floor(world))
     else:
         motion = _near(world, given.near, height, ground)
-    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light)
+    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light, None if given.sun is None else _toward(given.sun))
     plan.after = replace(world, actors={**world.actors, name: Actor(given.class_ or asset.label, asset.size_m, motion)})
 
 
@@ -420,6 +422,12 @@ def _change(plan: EditPlan, name: str, change: Change) -> None:
     if name not in plan.inserted:
         plan.changes.setdefault(name, []).append(change)
     plan.after = replace(plan.after, actors={**plan.after.actors, name: replace(plan.after.actors[name], motion=made)})
+
+
+def _toward(sun: Any) -> np.ndarray:
+    """Unit vector f64[3] towards the sun."""
+    azimuth, elevation = math.radians(sun.azimuth_deg), math.radians(sun.elevation_deg)
+    return np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
 
 
 def _three(size_m: Any) -> tuple[float, float, float]:
