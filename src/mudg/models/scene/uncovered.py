@@ -136,22 +136,34 @@ def _unseen_ground(one: Hidden, seen_ground: Array) -> Array:
 
 def _swept(one: Hidden, means: Array, still: Rows) -> Rows:
     """Rows of the background within the space that a moving box swept, above the ground."""
-    found = np.zeros(len(means), bool)
     half = np.array(one.size_m) / 2
+    rows = np.flatnonzero(still & _near(one, means[:, :2], 0.0))
+    inside = np.zeros(len(rows), bool)
     for pose in one.poses:
-        local = geometry.transform_points(geometry.invert(pose), means)
-        found |= (np.abs(local) <= half).all(1) & (local[:, 2] > FLOOR_M - half[2])
-    return found & still
+        local = geometry.transform_points(geometry.invert(pose), means[rows])
+        inside |= (np.abs(local) <= half).all(1) & (local[:, 2] > FLOOR_M - half[2])
+    found = np.zeros(len(means), bool)
+    found[rows[inside]] = True
+    return found
+
+
+def _near(one: Hidden, xy: Array, margin_m: float) -> Rows:
+    """Which places may lie within a distance of one of an object's boxes."""
+    reach, at = float(np.linalg.norm(one.size_m)) / 2 + margin_m, one.poses[:, :2, 3]
+    return ((xy >= at.min(0) - reach) & (xy <= at.max(0) + reach)).all(1)
 
 
 def _beside(one: Hidden, xy: Array) -> Array:
-    """Horizontal distance f64[N] of places from the nearest of an object's boxes; 0 below them."""
-    nearest = np.full(len(xy), np.inf)
+    """Horizontal distance f64[N] of places from the nearest of an object's boxes; 0 below them, infinite far away."""
+    rows = np.flatnonzero(_near(one, xy, SHADOW_M + AROUND_M))
+    nearest, near = np.full(len(xy), np.inf), xy[rows]
+    apart = np.full(len(rows), np.inf)
     half = np.array(one.size_m[:2]) / 2
     for pose in one.poses:
         yaw = geometry.yaw_of(pose)
         turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        nearest = np.minimum(nearest, np.linalg.norm(np.maximum(np.abs((xy - pose[:2, 3]) @ turn) - half, 0), axis=1))
+        apart = np.minimum(apart, np.linalg.norm(np.maximum(np.abs((near - pose[:2, 3]) @ turn) - half, 0), axis=1))
+    nearest[rows] = apart
     return nearest
 
 
