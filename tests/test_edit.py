@@ -399,6 +399,24 @@ def test_a_contact_shadow_darkens_the_ground_by_its_strength() -> None:
     assert ratio.max() <= 1.01
 
 
+def test_a_directed_shadow_lies_where_the_sun_casts_it() -> None:
+    """A sun at 45 degrees in the direction +y: the shadow reaches one height of the box to the right, however the box is turned."""
+    length, width, height = SIZE
+    for yaw in (0.0, 0.7):
+        local = geometry.yaw_matrix(-yaw)[:3, :3] @ np.array([0.0, 1.0, 1.0]) / math.sqrt(2)
+        xy, share = edited._covered(np.array(SIZE), local)
+        world = xy @ geometry.yaw_matrix(yaw)[:2, :2].T
+        half = (width * math.cos(yaw) + length * abs(math.sin(yaw))) / 2
+        dark = world[share > 0.9]
+        assert dark[:, 1].min() == pytest.approx(-half - height, abs=0.8) and dark[:, 1].max() < half + 0.3
+        assert -half - height - 0.5 < world[:, 1].min()
+    xy, share = edited._covered(np.array(SIZE), np.array([0.0, 0.0, 1.0]))
+    still = edited._covered(np.array(SIZE), None)
+    assert abs(share.sum() - still[1].sum()) < 0.1 * still[1].sum()  # straight above: the contact shadow
+    with pytest.raises(InputError, match="elevation_deg"):
+        parse_edits("- insert: {asset: {file: a}, near: {ahead_m: 9}, sun: {azimuth_deg: 0, elevation_deg: 2}}", "e")
+
+
 def test_inserting_replacing_and_colliding() -> None:
     model = toy()
     asset = edited.asset_of(model, "car-1", [math.pi])

@@ -15,11 +15,15 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
+from mudg.core import harmonics as core_harmonics
 from mudg.core import native_ops, quaternions
+from mudg.core.raster import torch_twin
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.raster.request import harmonics
 from mudg.core.table import Table, torch_adam_columns
 from mudg.models.scene import initial, motion, nodes
 from mudg.models.scene import model as scene_model
+from mudg.models.scene.bezier import BezierNode
 from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
@@ -184,7 +188,9 @@ def test_composed_rotations_turn_the_axes_with_the_box():
 
 def test_colour_bands():
     scene = model(degree=2)
-    assert torch.equal(harmonics(compose(scene, 0.3)), torch.cat([scene.table["sh_dc"], scene.table["sh_rest"]], 1))
+    both = torch.cat([scene.table["sh_dc"], scene.table["sh_rest"]], 1)
+    assert torch.equal(harmonics(compose(scene, 0.3))[:5], both[:5])  # those of objects turn with them
+    assert torch.equal(harmonics(compose(replace(scene, harmonics_in_world=True), 0.3)), both)
     lowest = compose(model(), 0.3)
     assert lowest.sh.shape == (12, 1, 3)
     assert lowest.sh_rest is None
@@ -618,3 +624,52 @@ def test_colours_over_time_of_older_scenes_are_refused():
     older = {**groups, "gaussians": {**groups["gaussians"], "partial.sh_time": torch.zeros(7, 4, 3)}}
     with pytest.raises(InputError, match=r"not supported any more[\s\S]*fit it again"):
         SceneModel.from_state(values, older)
+
+
+# ---- colours that depend on the direction of view ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_turned_harmonics_are_those_of_the_turned_direction(degree: int) -> None:
+    g = torch.Generator().manual_seed(degree)
+    turn = torch.from_numpy(pose(0, 0, 0, 0.8, 0.4)[:3, :3])
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=g, dtype=torch.float64), dim=1)
+    sh = torch.randn(1, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64)
+    matrix = core_harmonics.mixing(turn, degree)
+    both = torch.cat([sh[:, :1], core_harmonics.turned(sh[:, 1:], matrix.double())], 1)
+    seen, own = (torch_twin.sh_colors(h.expand(50, -1, -1), d, degree) for h, d in ((both, directions), (sh, directions @ turn)))
+    assert torch.allclose(seen, own, atol=1e-6)
+    assert torch.allclose(matrix @ matrix.T, torch.eye(len(matrix)), atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+@pytest.mark.parametrize("kind", [RigidNode, nodes.DeformableNode, BezierNode])
+def test_an_object_and_a_camera_that_turn_together_show_the_same_picture(backend: str, kind: type[RigidNode]) -> None:
+    made = columns(40, 7, degree=3)
+    made["means"] *= 0.5
+    made["sh_rest"] *= 0.3
+    extra = {"curve": torch.zeros(40, 4, 3)} if kind is BezierNode else {}
+
+    def picture(place: np.ndarray, world_axes: bool = False) -> torch.Tensor:
+        still = kind("car", "car", (4, 2, 1.5), np.array([0.0, 1.0]), np.stack([place, place]))
+        table = Table({**made, **extra}, {"node": torch.ones(40, dtype=torch.int32)})
+        scene = SceneModel(table, (StaticNode(), still), None, (0, 10, 13), 3, {}, harmonics_in_world=world_axes)
+        camera = Camera("front", 32, 24, 30.0, 30.0, 16.0, 12.0)
+        behind = geometry.from_rotation_translation(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (-6, 0, 0.5))
+        return rasterize(compose(scene, 0.4), View(camera, place @ behind, 0.4), RasterConfig(backend=backend)).rgb.detach()
+
+    here, there = np.eye(4), pose(3, -2, 1, 2.1, 0.3)
+    assert (picture(here) - picture(there)).abs().max() < 2e-4
+    assert (picture(here, True) - picture(there, True)).abs().max() > 0.05  # as older scenes show them
+
+
+def test_scenes_say_in_which_frame_their_harmonics_are() -> None:
+    values, groups = model(degree=2).state()
+    assert values["harmonics"] == "node" and "harmonics" not in model().state()[0]
+    older = SceneModel.from_state({name: value for name, value in values.items() if name != "harmonics"}, groups)
+    assert older.harmonics_in_world and older.state()[0]["harmonics"] == "world"
+    rest = compose(older, 0.3).sh_rest
+    assert rest is not None and torch.equal(rest, older.table["sh_rest"])  # drawn as it was fitted
+    assert not SceneModel.from_state(values, groups).harmonics_in_world
+    with pytest.raises(InputError, match="frame of a scene's"):
+        SceneModel.from_state({**values, "harmonics": "moon"}, groups)

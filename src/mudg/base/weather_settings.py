@@ -1,4 +1,4 @@
-"""Settings of weather, light and camera response for edited drives. Torch-free; ``mudg.core.weather`` applies them.
+"""Settings of weather, light, season and camera response for edited drives. Torch-free; ``mudg.core.weather`` applies them.
 
 Names and units are those of an edit script. The defaults change nothing.
 """
@@ -87,6 +87,15 @@ class LightSettings(StrictRecord):
     """Change of exposure, stops."""
 
 
+class SeasonSettings(StrictRecord):
+    """Another season: colours of green leaves and grass. Shapes stay."""
+
+    leaves: Literal["autumn", "bare"]
+    """What becomes of leaves: the colours of autumn, or those of twigs."""
+    amount: Annotated[float, Field(ge=0, le=1)] = 1.0
+    """How far: 0 = as recorded."""
+
+
 class ResponseSettings(StrictRecord):
     """How the recording camera turned light into display values. On a driving log this is a guess."""
 
@@ -99,11 +108,13 @@ class ResponseSettings(StrictRecord):
 
 
 class Conditions(StrictRecord):
-    """Weather, light and camera response of an edited drive."""
+    """Weather, light, season and camera response of an edited drive."""
 
     weather: WeatherSettings = Field(default_factory=WeatherSettings)
     """Weather."""
     light: LightSettings = Field(default_factory=LightSettings)
     """Light."""
+    season: SeasonSettings | None = None
+    """Season; none = as recorded."""
     response: ResponseSettings = Field(default_factory=ResponseSettings)
     """Camera response."""

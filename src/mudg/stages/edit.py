@@ -1,17 +1,17 @@
 """edit: a drive changed as a script says -> an edited fit, or an edited run that every other command takes like any other.
 
 of a fit:              OUT/model.json ... (as ``fit`` writes)
-of a ``mudg run``:     OUT/scene  OUT/fuse  OUT/fit/<method>
+of a ``mudg run``:     OUT/scene  OUT/fuse  OUT/fit/<method>  OUT/lidar.json what became of LiDAR returns
 of both:               OUT/edits.yaml the script with all defaults   OUT/edit.json what was done, collisions, seldom-seen sides
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from mudg.base import log, store
 from mudg.base.config import result_settings
-from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.raster.place import drawing_device
@@ -21,12 +21,12 @@ from mudg.stages.config import EditConfig
 from mudg.stages.editing.carried import EditedDrive, carry_out, read_and_digest
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.editing.weathered import conditions_of
-from mudg.stages.editing.written import EditedImages, write_edited_scene
+from mudg.stages.editing.written import DriveChange, EditedImages, write_edited_scene
 from mudg.stages.fitting.storage import load_model, model_of_scene, save_model
 
 _MODEL = ("model.json", "gaussians.safetensors", "nodes.safetensors")
 _OUTPUT = VerbOutput("edit", 1, (
-    "edits.yaml", "edit.json", *_MODEL, *below("fit/*", _MODEL), *below("scene", (*SCENE_FILES, store.MANIFEST)),
+    "edits.yaml", "edit.json", "lidar.json", *_MODEL, *below("fit/*", _MODEL), *below("scene", (*SCENE_FILES, store.MANIFEST)),
     *below("fuse", ("static.safetensors", "objects/*.safetensors", "fuse.json")),
 ))  # fmt: skip
 
@@ -61,16 +61,19 @@ def run(
     if parts.whole and conditions_of(parsed.canonical()) is not None:
         log.info("edit: `mudg render` shows weather and light; images and LiDAR of the edited scene stay as recorded")
     if parts.whole and drive.plan.background is not None:
-        raise InputError("images and clouds of a whole run cannot get another background", where=str(script),
-            remedy=f"edit a fit: mudg edit {parts.model} ... --scene {place}")  # fmt: skip
+        log.info("edit: all pixels of the edited images are renders; its scene has no LiDAR sweeps, for nobody measured that street")
     made = drive.model(model, keep_ego=not parts.whole)
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
+    changed: dict[str, Any] = {
+        "changed": list(drive.plan.changes), "removed": drive.plan.removed, "inserted": list(drive.plan.inserted)
+    }  # fmt: skip
     try:
         if parts.whole and loaded is not None and cloud is not None:
-            images = EditedImages(model.to(device), made.to(device), config, drive.plan.moves_ego)
-            _write_run(drive, parts, loaded, images, folder.path)
+            everywhere = drive.plan.moves_ego or drive.plan.background is not None
+            images = EditedImages(model.to(device), made.to(device), config, everywhere)
+            changed["lidar"] = _write_run(drive, parts, loaded, images, folder.path)
         else:
             save_model(made, folder.path)
     except KeyboardInterrupt:
@@ -78,7 +81,6 @@ def run(
         raise
     store.write_text(folder.path / "edits.yaml", parsed.text())
     conditions = {verb: settings.model_dump(mode="json") for verb, settings in drive.plan.conditions.items()}
-    changed = {"changed": list(drive.plan.changes), "removed": drive.plan.removed, "inserted": list(drive.plan.inserted)}
     store.write_json(folder.path / "edit.json", {
         "schema": 1, "digest": digest, **changed, "ego": drive.plan.moves_ego, "conditions": conditions, "notes": drive.notes,
     })  # fmt: skip
@@ -86,18 +88,20 @@ def run(
     return folder.path
 
 
-def _write_run(drive: EditedDrive, parts: RunParts, scene: Scene, images: EditedImages, out: Path) -> None:
-    """Scene, clouds and fits of an edited run; what an interrupted one finished is kept."""
+def _write_run(drive: EditedDrive, parts: RunParts, scene: Scene, images: EditedImages, out: Path) -> dict[str, int]:
+    """Scene, clouds and fits of an edited run; what an interrupted one finished is kept. Returns what became of LiDAR returns."""
     edited, cloud = drive.scene, drive.cloud
     if edited is None or cloud is None:  # both were given
-        return
+        return {}
     if not (out / "fuse" / "fuse.json").is_file():
         write_fused(out / "fuse", cloud, _report_of(parts, cloud))
     if not (out / "scene" / "scene.json").is_file():
-        write_edited_scene(scene, edited, drive.plan, images, out / "scene")
+        counts = write_edited_scene(scene, DriveChange(drive.plan, edited, cloud), images, out / "scene").record()
+        store.write_json(out / "lidar.json", {"schema": 1, **counts})
     for name, path in parts.fits.items():
         if not (out / "fit" / name / "model.json").is_file():
             save_model(images.after if path == parts.model else drive.model(load_model(path)), out / "fit" / name)
+    return {name: int(value) for name, value in store.read_json(out / "lidar.json").items() if name != "schema"}
 
 
 def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:

@@ -25,6 +25,7 @@ from mudg.core.weather.gbuffer import (
     world_points,
     world_rays,
 )
+from mudg.core.weather.season import in_season
 from mudg.core.weather.tone import ToneCurve
 
 Array = NDArray[np.float64]
@@ -67,6 +68,8 @@ def apply(
     weather, confidence = settings.weather, np.ones(gbuffer.depth.shape, np.float32)
     if weather.recorded_visibility_m > 0:
         gbuffer, confidence = _without_haze(gbuffer, view, weather.recorded_visibility_m, light)
+    if settings.season is not None:
+        gbuffer = in_season(gbuffer, view, settings.season, seed)
     if settings.light.time != "as_recorded":
         gbuffer, light, sure = _in_new_light(gbuffer, view, light, settings.light)
         confidence = confidence * sure

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from mudg.base.errors import InputError
 from mudg.base.records import Number, StrictRecord, after, checked_by
-from mudg.base.weather_settings import LightSettings, WeatherSettings
+from mudg.base.weather_settings import LightSettings, SeasonSettings, WeatherSettings
 
 EGO: Final = "ego"
 """The id of the recording vehicle in edit scripts."""
@@ -170,8 +170,15 @@ class PlaceNear(StrictRecord):
     yaw_deg: Number = 0.0
 
 
+class SunPlace(StrictRecord):
+    """Where the recorded sun stands: degrees counter-clockwise from world x, and above the horizon."""
+
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)]
+    elevation_deg: Annotated[float, Field(ge=10, le=90)]
+
+
 class InsertEdit(StrictRecord):
-    """Add an object, on a ``path`` or ``near`` something."""
+    """Add an object, on a ``path`` or ``near`` something; with ``sun``, its shadow lies where that casts it."""
 
     asset: AssetSource
     id: ActorName | None = None
@@ -180,6 +187,7 @@ class InsertEdit(StrictRecord):
     near: PlaceNear | None = None
     ground: bool = True
     shadow: Share = 0.6
+    sun: SunPlace | None = None
     match_light: bool = True
 
     @model_validator(mode="after")
@@ -215,16 +223,10 @@ class SkyEdit(StrictRecord):
     yaw_deg: Number = 0.0
 
 
-class SeasonEdit(StrictRecord):
-    """Another season."""
-
-    leaves: Literal["autumn", "bare"]
-
-
 VERBS: Final[dict[str, type[StrictRecord]]] = {
     "remove": RemoveEdit, "move": MoveEdit, "stop": StopEdit, "speed": SpeedEdit, "lane_change": LaneChangeEdit, "path": PathEdit,
     "replace": ReplaceEdit, "insert": InsertEdit, "background": BackgroundEdit, "sky": SkyEdit,
-    "weather": WeatherSettings, "light": LightSettings, "season": SeasonEdit,
+    "weather": WeatherSettings, "light": LightSettings, "season": SeasonSettings,
 }  # fmt: skip
 CONDITIONS: Final = ("weather", "light", "season")
 """Verbs that change no geometry."""

@@ -142,7 +142,7 @@ class BezierNode(RigidNode):
         if placement is None:
             return None
         means = self._center(time_s) + self.offsets_at(rows, float(self.path.tau_at(time_s)))
-        return replace(rows, means=means, quats=rows.quats @ placement[2])
+        return replace(rows, means=means, quats=rows.quats @ placement[2], sh_rest=self._colors_turned(rows.sh_rest, time_s))
 
     def offsets_at(self, rows: NodeRows, tau: float) -> Tensor:
         """Where Gaussians are beside the centre of the object at a parameter of the curve, ``[n, 3]`` metres in the world."""

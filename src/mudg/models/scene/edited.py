@@ -18,6 +18,8 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
+from mudg.core import harmonics
+from mudg.core.beams import met_box
 from mudg.core.edit import Motion
 from mudg.core.quaternions import left_product_matrix
 from mudg.core.table import Table
@@ -146,6 +148,9 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
     turn = torch.from_numpy(geometry.quaternion_from_matrix(geometry.invert(pose))).float().to(model.device)
     columns["means"][rows] = torch.from_numpy(local[inside].astype(np.float32)).to(model.device)
     columns["quats"][rows] = columns["quats"][rows] @ left_product_matrix(turn).T
+    if model.sh_degree > 0 and not model.harmonics_in_world:
+        box_from_world = harmonics.mixing(torch.from_numpy(pose[:3, :3].T.copy()), model.sh_degree).to(model.device)
+        columns["sh_rest"][rows] = harmonics.turned(columns["sh_rest"][rows], box_from_world)
     owner = table.labels["node"].clone()
     owner[rows] = len(model.nodes)
     node = RigidNode(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object)
@@ -278,20 +283,20 @@ def matched_light(asset: Asset, model: SceneModel) -> tuple[Asset, NDArray[np.fl
     here = road_color(model)
     if here is None or asset.road_rgb is None:
         return asset, np.ones(3)
-    gain = (_linear(here) / np.maximum(_linear(np.asarray(asset.road_rgb)), 1e-4)).clip(0.25, 4.0)
+    gain = (linear_of(here) / np.maximum(linear_of(np.asarray(asset.road_rgb)), 1e-4)).clip(0.25, 4.0)
     shown = 0.5 + SH_C0 * asset.columns["sh_dc"].double().numpy()
-    lit = torch.from_numpy((_display(_linear(shown) * gain) - 0.5) / SH_C0).float()
+    lit = torch.from_numpy((display_of(linear_of(shown) * gain) - 0.5) / SH_C0).float()
     return replace(asset, columns={**asset.columns, "sh_dc": lit}), gain
 
 
-def _linear(display: NDArray[np.float64]) -> NDArray[np.float64]:
+def linear_of(display: NDArray[np.float64]) -> NDArray[np.float64]:
     """sRGB display values to linear light; negative values become 0."""
     v = np.maximum(display, 0.0)
     return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
 
 
-def _display(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of ``_linear``."""
+def display_of(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of ``linear_of``."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
@@ -336,24 +341,26 @@ def _with_rows(model: SceneModel, node: RigidNode, columns: Mapping[str, Tensor]
 # -- contact shadows -----------------------------------------------------------------------------------------------------
 
 
-def with_shadow(model: SceneModel, name: str, strength: float) -> SceneModel:
+def with_shadow(model: SceneModel, name: str, strength: float, sun: NDArray[np.float64] | None = None) -> SceneModel:
     """A copy in which an object darkens the ground that it stands on.
 
     Under an overcast sky the ground below a box loses the share of light that the box covers. Black flat Gaussians at the bottom of
     the box, in its frame and so with it at all times, take away ``strength`` of the light below it, less towards the edge, which is
-    as wide as `SHADOW_BLUR` of the box's height. They carry no class and hardly any depth of their own.
+    as wide as `SHADOW_BLUR` of the box's height. Where the sun shines, so does the ground from which the box hides it. They carry no
+    class and hardly any depth of their own.
 
     Args:
         strength: share of the (linear) light that is missing below the middle of the box.
+        sun: direction f64[3] of the world towards the sun, above the ground; None = none. The shadow turns with the object: it is right
+            for the heading in the middle of its path.
     """
     node = model.dynamic_object(name)
     index, (length, width, height) = model.nodes.index(node), node.size_m
-    xy = np.stack(np.meshgrid(*(_centres(side) for side in (length, width)), indexing="ij"), -1).reshape(-1, 2)
+    toward = None if sun is None else node.corrected_keys(slice(len(node.times_s) // 2, len(node.times_s) // 2 + 1))[0, :3, :3].T @ sun
+    xy, share = _covered(np.array([length, width, height]), toward)
     spread = SHADOW_STEP_M
     # Overlapping Gaussians of opacity a on a grid of step s and spread s pass exp(-2 pi a) of the light, nearly.
     dark = 1 - (1 - strength) ** (1 / 2.2)  # in display values
-    edge = np.minimum(np.array([length, width]) / 2 - np.abs(xy) + SHADOW_BLUR * height, 2 * SHADOW_BLUR * height + 1e-6)
-    share = (edge / (2 * SHADOW_BLUR * height + 1e-6)).clip(0, 1).prod(1)
     opacity = (-np.log(np.maximum(1 - dark * share, 1e-3)) / (2 * np.pi)).clip(1e-4, 0.95)
     count = len(xy)
     flat = np.column_stack([xy, np.full(count, -height / 2 + SHADOW_LIFT_M)]).astype(np.float32)
@@ -368,6 +375,31 @@ def with_shadow(model: SceneModel, name: str, strength: float) -> SceneModel:
     made = replace(made, nodes=model.nodes)
     made.sort_rows()
     return made
+
+
+def _covered(size: NDArray[np.float64], sun: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places f64[n, 2] of the ground around a box, in its frame, and how much of their light it takes f64[n]; with the direction towards
+    the sun there, the larger of what it takes of the sky's and of the sun's."""
+    length, width, height = size
+    blur = SHADOW_BLUR * height
+    if sun is None:
+        axes = [_centres(side) for side in (length, width)]
+    else:
+        reach = np.abs(sun[:2]) * height / sun[2]
+        axes = [_centres(2 * side) for side in size[:2] / 2 + reach + blur]
+    xy = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    edge = np.minimum(np.array([length, width]) / 2 - np.abs(xy) + blur, 2 * blur + 1e-6)
+    share = (edge / (2 * blur + 1e-6)).clip(0, 1).prod(1)
+    if sun is None:
+        return xy, share
+    around = np.array([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]]) * blur
+    hidden = np.zeros(len(xy))
+    beam = (sun / np.linalg.norm(sun))[None]
+    for x, y in around:
+        place = np.column_stack([xy + [x, y], np.full(len(xy), -height / 2)])
+        hidden += [np.isfinite(met_box(beam, geometry.from_rotation_translation(np.eye(3), -at), size)[0]) for at in place]
+    share = np.maximum(share, hidden / len(around))
+    return xy[share > 0], share[share > 0]
 
 
 def _centres(side_m: float) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ Columns of the table (raw, unactivated):
     quats [N, 4]      (w, x, y, z), any length
     log_scales [N, 3] natural logarithm of metres
     logits [N]        opacity = sigmoid
-    sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0)
+    sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0) of directions in the node's own frame
     semantics [N, C]  class logits of the classes in ``SceneModel.classes``
 
 and those that a kind of node needs (``vibration.py``, ...), which its ``at_time`` gets as ``NodeRows.own``.
@@ -66,6 +66,8 @@ class SceneModel:
         sh_degree: of the colour columns.
         facts: JSON values kept with the model (method, scene id, ...).
         colors: how the cameras of the log show the Gaussians' colours, which are common ones.
+        harmonics_in_world: whether ``sh_rest`` of objects is of directions in the world, as scenes were fitted before it was of
+            their own frame. Such colours do not turn with the object.
     """
 
     table: Table
@@ -75,6 +77,7 @@ class SceneModel:
     sh_degree: int
     facts: dict[str, Any] = field(default_factory=dict)
     colors: CameraColors = SAME_COLORS
+    harmonics_in_world: bool = False
     _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -173,6 +176,8 @@ class SceneModel:
             tensors |= {f"{index}/{name}": value for name, value in own.items()}
         tensors.setdefault("none", torch.zeros(1))
         values = {"nodes": nodes, "classes": list(self.classes), "sh_degree": self.sh_degree, "facts": self.facts}
+        if self.sh_degree > 0:
+            values["harmonics"] = "world" if self.harmonics_in_world else "node"
         if self.colors.to_common:
             values["camera_colors"] = self.colors.record()
         return values, {"gaussians": self.table.state(), "nodes": tensors}
@@ -205,7 +210,10 @@ class SceneModel:
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
         colors = CameraColors.of_record(values["camera_colors"]) if "camera_colors" in values else SAME_COLORS
-        return cls(table, tuple(nodes), sky, classes, int(values["sh_degree"]), dict(values["facts"]), colors)
+        degree, axes = int(values["sh_degree"]), values.get("harmonics", "world")
+        if axes not in ("world", "node"):
+            raise InputError("unknown frame of a scene's spherical harmonics", where="harmonics", expected="node or world", got=str(axes))
+        return cls(table, tuple(nodes), sky, classes, degree, dict(values["facts"]), colors, degree > 0 and axes == "world")
 
 
 def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussians:
@@ -221,6 +229,9 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
     blocks = zip(*(column.split(counts) for column in (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)))
     own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
     given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
+    if model.sh_degree > 0 and not model.harmonics_in_world:
+        all_rows = replace(all_rows, sh_rest=table["sh_rest"])
+        given = [replace(rows, sh_rest=rest) for rows, rest in zip(given, table["sh_rest"].split(counts))]
     found = []
     for node, rows in zip(model.nodes, given):
         now = node.at_time(rows, time_s)
@@ -238,7 +249,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
         scales=torch.exp(table["log_scales"]),
         opacity=column("opacity"),
         sh=column("sh_dc"),
-        sh_rest=table["sh_rest"] if model.sh_degree > 0 else None,
+        sh_rest=None if model.sh_degree == 0 else table["sh_rest"] if model.harmonics_in_world else column("sh_rest"),
         extra=table["semantics"] if semantics and model.classes else None,
         node=table.labels["node"],
     )

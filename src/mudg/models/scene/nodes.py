@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Self
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from mudg.base import geometry
 from mudg.base.types import Track
+from mudg.core import harmonics
 from mudg.core.quaternions import left_product_matrix, rotation_matrix, slerp
 from mudg.core.table import Table
 from mudg.models.scene import motion
@@ -49,6 +51,8 @@ class NodeRows:
         opacity: f32[n] in [0, 1].
         sh_dc: f32[n, 1, 3], the constant band of the colour.
         own: raw columns of the table, f32[n, ...], that only some kind of node knows (the moment at which a Gaussian shows, say).
+        sh_rest: f32[n, K - 1, 3], the bands of the colour that depend on the direction of view, or None. Like the places: directions
+            are those of the node's frame before ``Node.at_time``, of the world after it.
     """
 
     means: Tensor
@@ -56,6 +60,7 @@ class NodeRows:
     opacity: Tensor
     sh_dc: Tensor
     own: Mapping[str, Tensor] = field(default_factory=dict)
+    sh_rest: Tensor | None = None
 
 
 class StaticNode:
@@ -120,6 +125,7 @@ class RigidNode:
         count = len(self.times_s)
         self.offsets = offsets or Table({"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)})
         self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
+        self._mixings: dict[tuple[float, int], Tensor] = {}
         self._copied: tuple[Tensor, Tensor] | None = None
         self._quats = torch.from_numpy(np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])).float()
         self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
@@ -210,6 +216,7 @@ class RigidNode:
         for name, move in (("shift", shift_m), ("yaw", yaw_rad)):
             self.offsets[name].add_(torch.from_numpy(move).float().to(self.offsets.device))
         self._placements.clear()
+        self._mixings.clear()
         self._copied = None
 
     def settle(self) -> None:
@@ -243,7 +250,21 @@ class RigidNode:
         if placement is None:
             return None
         position, rotation_t, product_t = placement
-        return replace(rows, means=torch.addmm(position, rows.means, rotation_t), quats=rows.quats @ product_t)
+        means = torch.addmm(position, rows.means, rotation_t)
+        return replace(rows, means=means, quats=rows.quats @ product_t, sh_rest=self._colors_turned(rows.sh_rest, time_s))
+
+    def _colors_turned(self, rest: Tensor | None, time_s: float) -> Tensor | None:
+        """Bands of the colour that depend on the direction of view, from the directions of the box to those of the world."""
+        if rest is None or rest.shape[1] == 0:
+            return rest
+        key = time_s, math.isqrt(rest.shape[1] + 1) - 1
+        if key not in self._mixings:
+            with torch.no_grad():
+                pose = self.pose_at(time_s)
+                if pose is None:
+                    return rest
+                self._mixings[key] = harmonics.mixing(rotation_matrix(pose[1]), key[1]).to(rest.device)
+        return harmonics.turned(rest, self._mixings[key])
 
     def _placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
         """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``, where the rows are;
@@ -271,7 +292,7 @@ class RigidNode:
         if self.offsets.device == device:
             return self
         there = copy.copy(self)
-        there.offsets, there._placements, there._copied = self.offsets.to(device), {}, None
+        there.offsets, there._placements, there._mixings, there._copied = self.offsets.to(device), {}, {}, None
         return there
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:

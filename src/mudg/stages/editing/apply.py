@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +24,8 @@ from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.models.scene.sky import SkyNode
-from mudg.stages.editing.plan import Actor, EditPlan
+from mudg.models.scene.uncovered import MOST_VIEWS, Hidden, without_traces
+from mudg.stages.editing.plan import Actor, Background, EditPlan
 
 EGO_FACT: Final = "edited_ego"
 """Fact of a fitted scene that was edited by itself: the vehicle's path, keys as rows [time, 16 numbers of the pose]."""
@@ -42,6 +43,8 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
     for name in without_nodes if plan.background is None else ():  # else it is gone with the street
         model = _cut_out(model, name, plan)
     model = model.without_nodes([name for name in plan.removed if name in model.node_names()])
+    if plan.background is None and plan.repairs:
+        model = without_traces(model, [hidden_by(plan.before.actors[name], plan.views) for name in (*plan.changes, *plan.removed)])
     if plan.background is not None:
         other, pose = plan.background
         model = edited.with_background(model, other.model, pose)
@@ -53,11 +56,24 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
         actor = plan.after.actors[name]
         model = edited.with_asset(model, asset, name, actor.motion, actor.label)
         if insertion.shadow > 0:
-            model = edited.with_shadow(model, name, insertion.shadow)
+            model = edited.with_shadow(model, name, insertion.shadow, insertion.sun)
     if sky is not None and plan.sky is not None:
         model = replace(model, sky=panorama(sky, plan.sky.yaw_deg, model))
     model.sort_rows()
     return model
+
+
+def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:
+    """What recorded views say of the street around an object; at most `MOST_VIEWS` of them, spread over the drive."""
+    there = sorted((view for view in views if actor.motion.pose_at(view.time_s) is not None), key=lambda view: view.time_s)
+    which = np.unique(np.linspace(0, len(there) - 1, min(MOST_VIEWS, len(there))).round().astype(int))
+    chosen = [there[int(index)] for index in which] if there else []
+    slopes = [[v.camera.width / (2 * v.camera.fx), v.camera.height / (2 * v.camera.fy)] for v in chosen]
+    poses = [pose for v in chosen if (pose := actor.motion.pose_at(v.time_s)) is not None]
+    shows = [geometry.invert(v.world_from_cam) for v in chosen]
+    return Hidden(
+        actor.size_m, np.array(poses), np.array([v.center_world for v in chosen]), np.array(shows), np.array(slopes), actor.moves
+    )
 
 
 def _cut_out(model: SceneModel, name: str, plan: EditPlan) -> SceneModel:
@@ -104,8 +120,23 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
     for name in sorted(standing - set(objects)):
         static, objects[name] = _cut_points(static, _track(name, plan.before.actors[name]))
     objects = {name: points for name, points in objects.items() if name not in plan.removed}
+    if plan.background is not None:
+        static = _other_street(*plan.background)
+        objects = {name: points for name, points in objects.items() if name not in standing}
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
     return FusedCloud(static, objects, cloud.colors)
+
+
+def _other_street(other: Background, world_from_other: NDArray[np.float64]) -> PointCloud:
+    """The static points of another run at their place in this one.
+
+    Raises:
+        UsageError: it has none.
+    """
+    if other.points is None:
+        raise UsageError("the other run has no fused points", remedy="name a folder made by `mudg run`")
+    xyz = geometry.transform_points(world_from_other, other.points.xyz.astype(np.float64))
+    return replace(other.points, xyz=xyz.astype(np.float32))
 
 
 def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointCloud]:

@@ -70,18 +70,18 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
         InputError: something in the script that cannot be done here.
     """
     if conditions_of(script.canonical()) is not None and not model.classes:
-        raise InputError("weather and light need the classes of surfaces, and this scene was fitted without", where="weather, light",
+        raise InputError("weather, light and season need the classes of surfaces, and this scene was fitted without",
+            where="weather, light, season",
             remedy="fit a scene with labels (`mudg annotate` makes them), or take them out of the script")  # fmt: skip
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
     plan = plan_edits(script, world, EditSources(opener(script), lambda name: background_of(find_run(script.path_of(name)), name)))
+    plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
     made = None if scene is None else edited_scene(scene, plan)
     views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
     notes = check(plan, *views)
     for note in notes:
         (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
-    if "season" in plan.conditions:
-        log.warn("edit: season is noted in the result; renders do not show it yet")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
 
 
@@ -100,7 +100,7 @@ def background_of(parts: RunParts, name: str) -> Background:
         ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
     if not len(ground):
         raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
-    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
+    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground, cloud)
 
 
 def opener(script: EditScript) -> Callable[[AssetSource], Asset]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
-from mudg.base.types import Scene
+from mudg.base.types import PointCloud, Scene, View
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
 from mudg.core.ground import HeightMap
@@ -34,11 +34,12 @@ OpenAsset = Callable[[AssetSource], Asset]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Another street: its fit, the path of its vehicle, and points f32[N, 3] of its ground."""
+    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground, and its fused points, if they are known."""
 
     model: SceneModel
     ego: Motion
     ground_xyz: np.ndarray
+    points: PointCloud | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +100,13 @@ class EditWorld:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Insertion:
-    """An object that is put in: what it is; how dark its contact shadow is; whether it takes the light of the scene."""
+    """An object that is put in: what it is; how dark its shadow is; whether it takes the light of the scene; the direction f64[3] towards
+    the sun that casts its shadow, or None."""
 
     asset: Asset
     shadow: float
     match_light: bool
+    sun: np.ndarray | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -117,6 +120,8 @@ class EditPlan:
         sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
         conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
+        views: recorded ones, which say what nobody saw of the street; none where there is no scene.
+        repairs: whether the street is closed where an object is gone (``models/scene/uncovered.py``).
     """
 
     before: EditWorld
@@ -129,6 +134,8 @@ class EditPlan:
     conditions: dict[str, Any] = field(default_factory=dict)
     notes: list[dict[str, Any]] = field(default_factory=list)
     moves_ego: bool = False
+    views: tuple[View, ...] = ()
+    repairs: bool = True
 
     def changed(self, name: str, motion: Motion) -> Motion:
         """The path of an actor of the recording with all that is done to it."""
@@ -281,7 +288,7 @@ def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
         motion = paths.along_points(points, height, ground, _floor(world))
     else:
         motion = _near(world, given.near, height, ground)
-    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light)
+    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light, None if given.sun is None else _toward(given.sun))
     plan.after = replace(world, actors={**world.actors, name: Actor(given.class_ or asset.label, asset.size_m, motion)})
 
 
@@ -415,6 +422,12 @@ def _change(plan: EditPlan, name: str, change: Change) -> None:
     if name not in plan.inserted:
         plan.changes.setdefault(name, []).append(change)
     plan.after = replace(plan.after, actors={**plan.after.actors, name: replace(plan.after.actors[name], motion=made)})
+
+
+def _toward(sun: Any) -> np.ndarray:
+    """Unit vector f64[3] towards the sun."""
+    azimuth, elevation = math.radians(sun.azimuth_deg), math.radians(sun.elevation_deg)
+    return np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
 
 
 def _three(size_m: Any) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""Weather and light of an edit script on the views of a fitted scene."""
+"""Weather, light and season of an edit script on the views of a fitted scene."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ Drawer = Callable[[View], Observation]
 
 
 def conditions_of(script: Sequence[Mapping[str, Any]]) -> Conditions | None:
-    """Weather and light that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it asks for neither."""
-    asked = {verb: settings for edit in script for verb, settings in edit.items() if verb in ("weather", "light")}
+    """Weather, light and season that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it asks for none."""
+    asked = {verb: settings for edit in script for verb, settings in edit.items() if verb in ("weather", "light", "season")}
     return Conditions.model_validate(asked) if asked else None
 
 

@@ -1,0 +1,51 @@
+"""Edits of a recorded drive: the lead car of KITTI's 2011_09_26 taken away and moved. Pictures stay in the test's folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fit_settings import fit_config
+
+from mudg.base import geometry, store
+from mudg.data.scene import check_scene, read_image, read_points, read_scene
+from mudg.stages import edit, fit, fuse, ingest
+from mudg.stages.config import EditConfig, FuseConfig, IngestConfig
+
+pytestmark = pytest.mark.slow
+LEAD = "0"
+
+
+@pytest.fixture(scope="module")
+def drive(shared_data: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kitti")
+    ingest.run(IngestConfig(resolution="320", contact_sheet=False), shared_data("kitti_2011_09_26"), root / "scene")
+    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
+    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    return root
+
+
+@pytest.mark.parametrize("text", [f'- remove: {{ids: ["{LEAD}"]}}', f'- move: {{id: "{LEAD}", along_m: 5, left_m: 1}}'])
+def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str) -> None:
+    store.write_text(tmp_path / "e.yaml", text)
+    out = edit.run(EditConfig(), drive, tmp_path / "e.yaml", tmp_path / "out")
+    assert not [finding for finding in check_scene(out / "scene") if finding.level == "error"]
+    old, new = read_scene(drive / "scene"), read_scene(out / "scene")
+    for a, b in zip(old.frames, new.frames, strict=True):
+        assert (read_image(old, a) != read_image(new, b)).any(-1).mean() < 0.5
+    lead = old.track(LEAD)
+    for a, b in zip(old.sweeps, new.sweeps, strict=True):
+        before, after = read_points(old, a), read_points(new, b)
+        pose = lead.pose_at(a.time_s)
+        assert pose is not None
+        here = np.linalg.norm(geometry.transform_points(geometry.invert(pose) @ a.world_from_lidar, before.xyz)[:, :2], axis=1)
+        azimuth = np.arctan2(before.xyz[:, 1], before.xyz[:, 0])
+        beside = (here > 12) & (np.abs(azimuth) > 0.5)
+        kept = {tuple(p) for p in after.xyz}
+        assert all(tuple(p) in kept for p in before.xyz[beside][::50])  # outside of the edit beams stay bit for bit
+    became = store.read_json(out / "lidar.json")
+    assert became["cleared"] > 100 and became["on_ground"] > 0
+    assert (became["on_objects"] > 20) == text.startswith("- move")
