@@ -60,7 +60,6 @@ from mudg.stages.fitting.continued import (
     whole_run,
 )
 from mudg.stages.fitting.finite import FiniteCheck
-from mudg.stages.fitting.together import side_by_side_calls
 from mudg.stages.fitting.kept import chosen_ahead, keep, recorded_bytes, scratch_folder, virtual_bytes
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
@@ -73,6 +72,7 @@ from mudg.stages.fitting.rendering import render_view as render_view
 from mudg.stages.fitting.schedule import appearance_rates, densify_schedule, learning_rates, pose_round_due
 from mudg.stages.fitting.storage import load_model as load_model
 from mudg.stages.fitting.storage import save_appearance, save_model
+from mudg.stages.fitting.together import side_by_side_calls
 from mudg.stages.fitting.trust import unseen_maps, unseen_rows
 from mudg.stages.fitting.views import (
     StoredView,
