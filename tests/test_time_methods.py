@@ -20,6 +20,7 @@ from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
 from mudg.core import losses, metrics
+from mudg.core.hex_planes import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.data.cloudfile import write_fused
@@ -27,7 +28,7 @@ from mudg.models.scene import densify, nodes
 from mudg.models.scene.bezier import BezierNode, bernstein, distance_change, fit_path
 from mudg.models.scene.deformed import DeformationField, DeformedNode
 from mudg.models.scene.flat_network import FlatNetwork, waves
-from mudg.models.scene.hexplane import HexPlaneNode, PlaneSizes, plane_smoothness
+from mudg.models.scene.hexplane import HexPlaneNode, plane_smoothness
 from mudg.models.scene.hexplane import moving_rows as hexplane_moving
 from mudg.models.scene.initial import columns_from_points
 from mudg.models.scene.model import SceneModel, compose
@@ -228,7 +229,7 @@ def field_in_float64() -> HexPlaneNode:
 def test_planes_agree_with_a_plain_loop():
     node, g = field_in_float64(), torch.Generator().manual_seed(5)
     places = torch.rand(7, 4, generator=g).double() * 2.4 - 1.2
-    planes = [(axes, plane.detach().numpy()) for axes, plane in node.planes()]
+    planes = [(axes, plane.detach().permute(2, 0, 1).numpy()) for axes, plane in node.planes()]
     assert [plane.shape for _, plane in planes] == [(2, 3, 3)] * 3 + [(2, 4, 3)] * 3 + [(2, 6, 6)] * 3 + [(2, 4, 6)] * 3
     expected = np.ones((7, 4))
     for index, (axes, plane) in enumerate(planes):
@@ -283,8 +284,8 @@ def test_the_losses_of_s3gaussian_by_hand():
     node = HexPlaneNode.fresh([0, 0, 0, 0], [1, 1, 1, 1], PlaneSizes(1, 1, 3, 3, 2), 1)
     with torch.no_grad():
         for axes, plane in node.planes():
-            bent = torch.tensor([0.0, 1.0, 0.0]).view(1, 3, 1).expand(1, 3, 3)
-            plane.copy_(bent if axes in ((0, 1), (0, 3)) else torch.ones(1, 3, 3))
+            bent = torch.tensor([0.0, 1.0, 0.0]).view(3, 1, 1).expand(3, 3, 1)
+            plane.copy_(bent if axes in ((0, 1), (0, 3)) else torch.ones(3, 3, 1))
     space, time, flat = plane_smoothness(node)
     assert (space.item(), time.item(), flat.item()) == pytest.approx((4.0, 4.0, 2 / 3))
 
