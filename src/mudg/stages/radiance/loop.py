@@ -48,7 +48,7 @@ FALLS_AT, FALL = (0.25, 0.5, 0.75, 0.9), 0.33
 SIGHT_M, SIGHT_HALVES = 6.0, 0.2
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 DYNAMIC_RISE = (0.1, 0.5)
-"""Shares of the run between which the weight of the dynamic density grows; from the first step on it would empty that field for good."""
+"""Shares of the run between which the weight of the dynamic density grows. From the first step on it would empty that field."""
 LOG_EVERY = 20
 
 

@@ -26,8 +26,8 @@ FULL_FLOW_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (camera z of the median, metres), opacity and share of what moves ``[H, W]``; flow to the
-    next time step ``[3, H, W]`` in metres, of what moves."""
+    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (of the median, along z, metres), opacity and share of what moves ``[H, W]``;
+    flow to the next time step ``[3, H, W]`` in metres, of what moves."""
 
     rgb: Tensor
     depth: Tensor
