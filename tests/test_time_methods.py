@@ -16,7 +16,7 @@ from pretend_device import pretend_device
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
-from mudg.base.errors import UsageError
+from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
 from mudg.core import losses, metrics
@@ -28,7 +28,7 @@ from mudg.models.scene import densify, nodes
 from mudg.models.scene.bezier import BezierNode, bernstein, distance_change, fit_path
 from mudg.models.scene.deformed import DeformationField, DeformedNode
 from mudg.models.scene.flat_network import FlatNetwork, waves
-from mudg.models.scene.hexplane import HexPlaneNode, plane_smoothness
+from mudg.models.scene.hexplane import SHORT_GAIN, HexPlaneNode, plane_smoothness
 from mudg.models.scene.hexplane import moving_rows as hexplane_moving
 from mudg.models.scene.initial import columns_from_points
 from mudg.models.scene.model import SceneModel, compose
@@ -266,6 +266,18 @@ def test_the_field_moves_and_recolors_what_lies_in_its_box():
     assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in (*columns, means)])
     seen = node.seen_by(view_at(0.6, camera())).asked(torch.tensor([[1.0, 1, 0.5], [-2, 2, 0.5]]).double())
     assert set(seen.tolist()) <= {0, 1}
+
+
+def test_features_of_a_short_run_begin_near_one_and_the_factor_is_kept():
+    sizes = PlaneSizes(4, 2, 5, 3, 2)
+    places = torch.rand(400, 4, generator=torch.Generator().manual_seed(7)) * 2 - 1
+    plain, short = (HexPlaneNode.fresh([0, 0, 0, 0], [1, 1, 1, 1], sizes, 1, gain) for gain in (1.0, SHORT_GAIN))
+    assert torch.allclose(short.features(places), 37.037 * plain.features(places), rtol=1e-4)
+    assert float(short.features(places).detach().mean()) == pytest.approx(1.0, abs=0.3)
+    facts, tensors = short.state()
+    assert torch.equal(HexPlaneNode.from_state(facts, tensors).features(places), short.features(places))
+    with pytest.raises(InputError, match="earlier version"):
+        HexPlaneNode.from_state({name: value for name, value in facts.items() if name != "gain"}, tensors)
 
 
 def test_what_is_far_from_the_frustum_is_not_asked():
