@@ -75,8 +75,10 @@ def _of_renders(
     recorded image that was warped there: it is the picture that is repaired."""
     if sources.render_at is None:
         raise UsageError("this condition needs renders of a fitted scene", got="repair")
-    rules = replace(sources.rules, images_per_view=1)
-    made = build_conditions(sources.cloud, sources.tracks, views, sources.recorded, rules, kept, sources.render_at)
+    rules, static = replace(sources.rules, images_per_view=1), sources.cloud.static
+    labels = None if static.semantics is None else static.semantics[:0]
+    empty = FusedCloud(replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors)
+    made = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
 
     def bare(given: Condition) -> Condition:
         shown = given.renders
