@@ -65,7 +65,7 @@ class HexplaneConfig:
     space: int = Field(default=64, ge=2)
     """Cells along x, y and z of the smallest planes."""
     time: int = Field(default=25, ge=2)
-    """Cells along the time."""
+    """Cells along the time, at most; no more than one for two frames."""
     width: int = Field(default=64, ge=1)
     """Width of the networks."""
 
