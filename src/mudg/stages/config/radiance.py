@@ -34,9 +34,10 @@ class RadianceConfig:
     """Distance of the farthest sample, in metres, above 200."""
     static_grid: GridSizes = (8, 2, 16, 1024, 17)
     """Grid of the static field, in space."""
-    dynamic_grid: GridSizes = (8, 2, 32, 1024, 16)
-    """Grid of the dynamic field, in space and time."""
-    flow_grid: GridSizes = (8, 2, 16, 512, 15)
+    dynamic_grid: GridSizes = (8, 2, 8, 256, 17)
+    """Grid of the dynamic field, in space and time. Levels with more places than entries share them: 32 cells along each of four axes are
+    a million places."""
+    flow_grid: GridSizes = (8, 2, 8, 128, 15)
     """Grid of the flow field, in space and time."""
     first_proposal_grid: GridSizes = (5, 1, 16, 128, 16)
     """Grid of the first proposal network, in space."""
