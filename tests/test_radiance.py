@@ -26,7 +26,7 @@ from mudg.models.radiance.field import Extent, FieldSizes, RadianceField, aggreg
 from mudg.models.radiance.march import Budget, RayDraws, Rays
 from mudg.stages import fit, render, synthesize
 from mudg.stages.config import FitConfig, RenderConfig, SynthesizeConfig
-from mudg.stages.config.radiance import PUBLISHED_EMERNERF
+from mudg.stages.config.radiance import PUBLISHED_EMERNERF, RadianceConfig
 from mudg.stages.radiance import loop
 from mudg.stages.radiance.pictures import flow_colors
 from mudg.stages.radiance.rays import extent_of, lidar_rays, view_rays
@@ -169,11 +169,20 @@ def test_color_loss_reaches_every_field_and_proposals_learn_only_when_asked():
         assert field.proposals[level].table.grad.abs().sum() > 0
 
 
-def test_line_of_sight_wants_emptiness_before_the_surface_and_a_bell_at_it():
-    middles, measured = torch.tensor([[2.0, 9.5, 10.0, 15.0]]), torch.tensor([10.0])
-    bell = [math.exp(-0.5 * (off / 0.5) ** 2) / (0.5 * math.sqrt(2 * math.pi)) for off in (-0.5, 0.0)]
-    weights = torch.tensor([[0.2, *bell, 0.7]])
-    assert float(marching.line_of_sight(weights, middles, measured, 1.5)) == pytest.approx(0.04, abs=1e-6)
+def test_line_of_sight_wants_emptiness_before_the_surface_and_the_mass_of_a_bell_at_it():
+    edges, measured = torch.tensor([[1.0, 8.0, 9.5, 10.5, 20.0, 30.0]]), torch.tensor([10.0])
+    one = math.erf(1 / math.sqrt(2))  # the mass within a standard deviation, which is 0.5 m
+    weights = torch.tensor([[0.2, (1 - one) / 2, one, (1 - one) / 2, 0.7]])
+    assert float(marching.line_of_sight(weights, edges, measured, 1.5)) == pytest.approx(0.04, abs=5e-5)
+    assert float(marching.line_of_sight(weights - 0.05, edges, measured, 1.5)) == pytest.approx(0.03, abs=5e-5)
+
+
+def test_the_median_lies_where_half_of_the_weight_is_passed():
+    edges = torch.tensor([[1.0, 2.0, 3.0, 5.0]]).expand(3, -1)
+    weights = torch.tensor([[0.1, 0.8, 0.1], [0.2, 0.2, 0.4], [0.0, 0.0, 0.5]])
+    marched = marching.Marched(edges, edges, edges[:, 1:], weights, edges, edges, None, ())
+    assert marched.median_m.tolist() == pytest.approx([2.5, 3.0, 4.0])
+    assert marched.range_m.tolist() == pytest.approx([(0.2 + 2.4 + 0.5), (0.4 + 0.6 + 2.0) / 0.8, 5.0])
 
 
 def test_direction_code_has_the_published_width():
@@ -184,7 +193,9 @@ def test_schedules():
     assert loop.rate_share(1, 1000) == pytest.approx(0.01)
     assert loop.rate_share(200, 1000) == 1.0
     assert loop.rate_share(1000, 1000) == pytest.approx(0.33**4)
-    assert [loop.sight_width(step, 1000, 0.08) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 2.5]
+    assert [loop.sight_width(step, 1000, RadianceConfig()) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 0.6]
+    assert [loop.dynamic_share(step, 1000) for step in (1, 100, 300, 500, 900)] == pytest.approx([0, 0, 0.5, 1, 1])
+    assert loop.loss_weights(RadianceConfig(), 0.5).dynamic == pytest.approx(0.001)
 
 
 def _camera(width: int, height: int):

@@ -16,10 +16,11 @@ from pretend_device import pretend_device
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
-from mudg.base.errors import UsageError
+from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
 from mudg.core import losses, metrics
+from mudg.core.hex_planes import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.data.cloudfile import write_fused
@@ -27,7 +28,7 @@ from mudg.models.scene import densify, nodes
 from mudg.models.scene.bezier import BezierNode, bernstein, distance_change, fit_path
 from mudg.models.scene.deformed import DeformationField, DeformedNode
 from mudg.models.scene.flat_network import FlatNetwork, waves
-from mudg.models.scene.hexplane import HexPlaneNode, PlaneSizes, plane_smoothness
+from mudg.models.scene.hexplane import SHORT_GAIN, HexPlaneNode, plane_smoothness
 from mudg.models.scene.hexplane import moving_rows as hexplane_moving
 from mudg.models.scene.initial import columns_from_points
 from mudg.models.scene.model import SceneModel, compose
@@ -228,7 +229,7 @@ def field_in_float64() -> HexPlaneNode:
 def test_planes_agree_with_a_plain_loop():
     node, g = field_in_float64(), torch.Generator().manual_seed(5)
     places = torch.rand(7, 4, generator=g).double() * 2.4 - 1.2
-    planes = [(axes, plane.detach().numpy()) for axes, plane in node.planes()]
+    planes = [(axes, plane.detach().permute(2, 0, 1).numpy()) for axes, plane in node.planes()]
     assert [plane.shape for _, plane in planes] == [(2, 3, 3)] * 3 + [(2, 4, 3)] * 3 + [(2, 6, 6)] * 3 + [(2, 4, 6)] * 3
     expected = np.ones((7, 4))
     for index, (axes, plane) in enumerate(planes):
@@ -267,6 +268,18 @@ def test_the_field_moves_and_recolors_what_lies_in_its_box():
     assert set(seen.tolist()) <= {0, 1}
 
 
+def test_features_of_a_short_run_begin_near_one_and_the_factor_is_kept():
+    sizes = PlaneSizes(4, 2, 5, 3, 2)
+    places = torch.rand(400, 4, generator=torch.Generator().manual_seed(7)) * 2 - 1
+    plain, short = (HexPlaneNode.fresh([0, 0, 0, 0], [1, 1, 1, 1], sizes, 1, gain) for gain in (1.0, SHORT_GAIN))
+    assert torch.allclose(short.features(places), 37.037 * plain.features(places), rtol=1e-4)
+    assert float(short.features(places).detach().mean()) == pytest.approx(1.0, abs=0.3)
+    facts, tensors = short.state()
+    assert torch.equal(HexPlaneNode.from_state(facts, tensors).features(places), short.features(places))
+    with pytest.raises(InputError, match="earlier version"):
+        HexPlaneNode.from_state({name: value for name, value in facts.items() if name != "gain"}, tensors)
+
+
 def test_what_is_far_from_the_frustum_is_not_asked():
     node = HexPlaneNode.fresh([-99, -99, -9, 0], [99, 99, 9, 1], PlaneSizes(1, 1, 2, 2, 2), 1)
     view = view_at(0.0, camera())
@@ -283,8 +296,8 @@ def test_the_losses_of_s3gaussian_by_hand():
     node = HexPlaneNode.fresh([0, 0, 0, 0], [1, 1, 1, 1], PlaneSizes(1, 1, 3, 3, 2), 1)
     with torch.no_grad():
         for axes, plane in node.planes():
-            bent = torch.tensor([0.0, 1.0, 0.0]).view(1, 3, 1).expand(1, 3, 3)
-            plane.copy_(bent if axes in ((0, 1), (0, 3)) else torch.ones(1, 3, 3))
+            bent = torch.tensor([0.0, 1.0, 0.0]).view(3, 1, 1).expand(3, 3, 1)
+            plane.copy_(bent if axes in ((0, 1), (0, 3)) else torch.ones(3, 3, 1))
     space, time, flat = plane_smoothness(node)
     assert (space.item(), time.item(), flat.item()) == pytest.approx((4.0, 4.0, 2 / 3))
 

@@ -18,14 +18,14 @@ class Method:
         title: for tables.
         made_by: the verb that produces its views (``render`` after ``fit``, or ``synthesize``).
         nodes: what its scene consists of (objects: one rigid or deformable node per dynamic track); empty for a method without a scene.
-        supervision: what its scene learns from; virtual: the views of mudg_r.
+        supervision: what its scene learns from; virtual: the views of mudg_r; repaired: its own renders beside the path, repaired.
         scene: what its scene is made of: Gaussians, or a radiance field that is marched along rays.
     """
 
     title: str
     made_by: Literal["render", "synthesize"]
     nodes: tuple[Literal["static", "objects", "sky"], ...] = ()
-    supervision: tuple[Literal["color", "semantics", "lidar", "sky", "virtual"], ...] = ()
+    supervision: tuple[Literal["color", "semantics", "lidar", "sky", "virtual", "repaired"], ...] = ()
     scene: Literal["gaussians", "radiance"] = "gaussians"
 
 
@@ -39,10 +39,13 @@ METHODS: Final[dict[str, Method]] = {
     "bezier": Method("BezierGS", "render", ("static", "objects", "sky"), _STREET),
     "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET),
     "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance"),
+    "difix": Method(
+        "Difix3D scheme, our network, no last repair", "render", ("static", "objects", "sky"), (*_STREET, "repaired")
+    ),
     "mudg_r": Method("Diffusion output", "synthesize"),
     "freevs": Method("FreeVS condition, our network", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
 }
 
-PUBLISHED: Final = ("pvg", "s3gaussian", "bezier", "omnire", "emernerf")
-"""Published methods for comparison, fitted to recorded views alone."""
+PUBLISHED: Final = ("pvg", "s3gaussian", "bezier", "omnire", "emernerf", "difix")
+"""Published methods for comparison, fitted to recorded views alone; difix goes on under repaired renders."""

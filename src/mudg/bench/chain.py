@@ -2,6 +2,7 @@
 ``mudg run`` makes them: one on recorded views, and those under virtual views go on with it.
 
 OUT/fit/<method>   every fit      OUT/start/<method>   what a variant with other settings of the first fit goes on with
+OUT/repair/<step>  repaired renders on the way to the places of generated views (difix); OUT/start/difix-<step>   the fit that has seen them
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import is_temporary
 from mudg.core.raster.place import drawing_device
 from mudg.methods import METHODS
-from mudg.stages import fit
-from mudg.stages.config import BenchConfig, FitConfig
+from mudg.stages import fit, synthesize
+from mudg.stages.config import BenchConfig, FitConfig, SynthesizeConfig
 from mudg.stages.run import WITHOUT_DIFFUSION, fits_of
 
 _NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
@@ -33,6 +34,11 @@ VIRTUAL_TERMS: Final[dict[str, tuple[str, str, Mapping[str, float]]]] = {
 }
 """Ablation of supervision by virtual views, as in table 3 of the paper: row -> (title there, what is learned from, settings ``virtual``
 of the fit). Beside them stand street_gaussians (no virtual views) and mudg_s (all terms)."""
+
+
+REPAIRED: Final = "difix"
+REPAIR_STEPS: Final = 3
+"""Steps in which repaired views move from the recorded path to the places of generated views."""
 
 
 def each_log(make: Callable[[Any], Any], jobs: Sequence[Any], names: Sequence[str], processes: int) -> list[Any]:
@@ -114,6 +120,7 @@ class FitChain:
         out: folder of all. scene, fused: what is fitted.
         usual: settings of the whole chain, as ``mudg run`` takes them; the first fit has them.
         overwrite: replace what other settings left there.
+        generator: settings of generated views, whose places are those of repaired ones.
     """
 
     out: Path
@@ -121,6 +128,7 @@ class FitChain:
     fused: Path
     usual: FitConfig
     overwrite: bool
+    generator: SynthesizeConfig | None = None
 
     def first(self) -> Path:
         """The fit on recorded views with the usual settings, made if need be."""
@@ -134,12 +142,30 @@ class FitChain:
                 of the same settings: the first one, if these are the usual ones but for virtual views.
         """
         out = self.out / "fit" / name
+        if settings.method == REPAIRED:
+            return self._repaired(name, settings)
         if not learns_virtual(settings):
             return self._made(settings, out)
         plain, guided = fits_of(settings)
         plain = replace(plain, virtual=self.usual.virtual)
         begun = self.first() if plain == fits_of(self.usual)[0] else self._made(plain, self.out / "start" / name)
         return self._made(guided, out, virtual, begun)
+
+    def _repaired(self, name: str, settings: FitConfig) -> Path:
+        """Step by step towards the places of generated views: render there, repair, and fit under all that was repaired so far. Every
+        fit goes on with the first one."""
+        if self.generator is None:
+            raise UsageError("repaired views need settings of generated ones", got=name)
+        model, seen = self.first(), []
+        settings = replace(fits_of(settings)[1], method=settings.method)
+        for step in range(1, REPAIR_STEPS + 1):
+            views, last = self.out / "repair" / str(step), step == REPAIR_STEPS
+            asked = repair_settings(self.generator, step / REPAIR_STEPS)
+            made(lambda o, m=model, v=views, a=asked: synthesize.run(a, self.scene, self.fused, v, fitted=m, overwrite=o), self.overwrite)
+            seen.append(views)
+            out = self.out / "fit" / name if last else self.out / "start" / f"{name}-{step}"
+            model = self._made(settings, out, tuple(seen), self.first())
+        return model
 
     def _made(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
         def make(overwrite: bool) -> Path:
@@ -148,3 +174,13 @@ class FitChain:
             )
 
         return made(make, self.overwrite)
+
+
+def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConfig:
+    """How renders are repaired, in one pass from nothing that was measured, after a share of the way to the places of generated views.
+    Paths with a name begin at the end of the way."""
+    shifts = tuple(round(share * shift, 4) for shift in generator.shifts_m if shift)
+    return replace(
+        generator, condition="repair", steps=1, samples=1, shifts_m=shifts,
+        paths=generator.paths if share == 1 or not shifts else (),
+    )  # fmt: skip

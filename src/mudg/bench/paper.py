@@ -21,7 +21,7 @@ from mudg.base.errors import UsageError
 from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import paper_numbers, paper_page, paper_text, shift_page
-from mudg.bench.chain import FitChain, at_once, each_log, learns_virtual, made, refuse_foreign, seconds_of
+from mudg.bench.chain import REPAIRED, FitChain, at_once, each_log, learns_virtual, made, refuse_foreign, seconds_of
 from mudg.bench.paper_logs import ListedCity, PaperLog, facts_of, logs_of, make_scene, missing_scenes, scored_cameras
 from mudg.bench.paper_tables import RECORDED, TABLES, PaperRow, PaperTable, further_columns
 from mudg.bench.shift import PERCEPTUAL_VIEWS, write_fill
@@ -149,8 +149,10 @@ def rows_of(config: BenchConfig, table: PaperTable) -> tuple[PaperRow, ...]:
     unknown = sorted(set(asked) - set(METHODS))
     if unknown:
         raise UsageError("unknown method", where="--methods", expected=", ".join(METHODS), got=", ".join(unknown))
-    as_freevs = {"condition": "freevs", "model": config.freevs_model}
-    return tuple(replace(row, changes=as_freevs) if row.method == "freevs" else row for row in table.rows_of(asked))
+    own = {"freevs": {"condition": "freevs", "model": config.freevs_model}}
+    if not mdm_files.uses_renders(config.model):
+        own[REPAIRED] = {"model": ""}
+    return tuple(replace(row, changes=own.get(row.method, row.changes)) for row in table.rows_of(asked))
 
 
 def score_settings(config: ScoreConfig, table: PaperTable) -> ScoreConfig:
@@ -207,8 +209,9 @@ def make_log(job: PaperJob) -> dict[str, Any]:
     values = {
         name: {place: paper_numbers.at_place(documents, at, columns) for place, at in names.items()} for name, documents in scored.items()
     }  # fmt: skip
-    none = {column.key: {"value": "no model: --freevs-model"} for column in columns}
-    values |= {name: dict.fromkeys(names, none) for name in left_out}
+    for name in left_out:
+        why = "the model uses no renders" if name == REPAIRED else "no model: --freevs-model"
+        values[name] = dict.fromkeys(names, {column.key: {"value": why} for column in columns})
     if truth is None:
         values[TRUTH] = {place: paper_numbers.floors_at(scored[FILL], at, columns) for place, at in names.items()}
     shown = {**({} if truth is None else {TRUTH: truth}), **views}
@@ -245,7 +248,7 @@ def asked_of(job: PaperJob, scene: Path) -> Asked:
 
 def views_of(job: PaperJob, row: PaperRow, scene: Path, asked: Asked) -> tuple[Path, ...]:
     """The folders with a row's views at all places, made if need be."""
-    fits = job.fits(scene)
+    fits = replace(job.fits(scene), generator=asked.off_path)
     whole_condition = row.changes.get("condition", "full") == "full"
     if METHODS[row.method].made_by == "synthesize":
         first = fits.first() if job.renders and whole_condition else None

@@ -141,7 +141,7 @@ class SplitJob:
     @property
     def fits(self) -> FitChain:
         """The fits."""
-        return FitChain(self.folder, self.scene, self.fused, self.usual, self.overwrite)
+        return FitChain(self.folder, self.scene, self.fused, self.usual, self.overwrite, self.generator)
 
 
 def run(
@@ -431,7 +431,8 @@ def fitted(job: SplitJob, row: RealMethod, use: DiffusionUse | None, cameras: tu
         virtual.append(generated(job, use, (camera,), job.generator.shifts_m, job.folder / "virtual" / use.sees))
         if job.split.by_camera or job.split.block:
             virtual.append(generated(job, use, cameras, job.split.shifts_m, job.folder / "generated" / use.sees))
-    return job.fits.fitted(row.name, settings, virtual)
+    beside = replace(job.generator, cameras=(first_camera(read_scene(job.scene), job.shown),))
+    return replace(job.fits, generator=beside).fitted(row.name, settings, virtual)
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class LogJob:
     @property
     def fits(self) -> FitChain:
         """The fits."""
-        return FitChain(self.out, self.out / "scene", self.out / "fuse", self.usual, self.overwrite)
+        return FitChain(self.out, self.out / "scene", self.out / "fuse", self.usual, self.overwrite, self.synthesize)
 
 
 def run(

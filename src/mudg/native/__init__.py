@@ -1,4 +1,4 @@
-"""Loads the C++ library that holds the hot loops (rasteriser, z-buffer, SSIM, hash grids, Adam, the city's ray caster).
+"""Loads the C++ library that holds the hot loops (rasteriser, z-buffer, SSIM, hash grids, planes, Adam, the city's ray caster).
 
 The library is optional: an install on a machine without any C++ compiler works without it, slower. `status()` says in
 words which of both it is and why; `require()` raises when a caller cannot do without it.
@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from mudg.base.errors import ResourceError, UsageError
 
-ABI_VERSION: Final = 4
+ABI_VERSION: Final = 5
 FOLDER: Final = Path(__file__).resolve().parent
 LIBRARY_PATH: Final = FOLDER / {"darwin": "libmudg_native.dylib", "win32": "mudg_native.dll"}.get(
     sys.platform, "libmudg_native.so"

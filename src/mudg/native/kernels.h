@@ -102,6 +102,23 @@ struct HashGridJob {
   float *of_table, *of_x;  // like table and x
 };
 
+// Features of places and times in six planes of several sizes (hex_planes.h), and gradients; what is null is not computed.
+constexpr int kHexPlanes = 6;  // xy, xz, yz, xt, yt, zt
+struct HexPlanesLevel {
+  std::int64_t offset[kHexPlanes];  // of the planes, in floats; a plane is [second axis][first axis][features]
+  std::int32_t cells[4];            // numbers along x, y, z, t
+};
+struct HexPlanesJob {
+  const float* x;  // [points][4] in -1..1; outside: the value at the border
+  const float* planes;
+  const HexPlanesLevel* levels;
+  int level_count, features;  // any; 1, 2, 4, 8, 16 or 32
+  std::int64_t points;
+  float* out;               // [points][level_count * features]
+  const float* gradient;    // like out
+  float *of_planes, *of_x;  // like planes and x; added to
+};
+
 struct Kernels {
   void (*project_forward)(RasterState&, RasterImage&);
   void (*blend_forward)(RasterState&, RasterImage&);
@@ -113,6 +130,7 @@ struct Kernels {
   void (*over)(const OverJob&);
   void (*box_mean)(const BoxJob&);
   void (*hash_grid)(const HashGridJob&);
+  void (*hex_planes)(const HexPlanesJob&);
   double (*peak_multiply_add)(std::int64_t rounds, float* sink);
 };
 

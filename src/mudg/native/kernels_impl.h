@@ -5,6 +5,7 @@
 #include "box.h"
 #include "classes.h"
 #include "hash_grid.h"
+#include "hex_planes.h"
 #include "kernels.h"
 #include "loss.h"
 #include "over.h"
@@ -74,7 +75,7 @@ void blend_backward(RasterState& state, const RasterImageGradient& image) {
 }
 
 constexpr Kernels kTable = {project_forward, blend_forward, blend_backward, project_backward, photometric, adam,
-                            class_loss, over, box_mean, hash_grid, peak_multiply_add};
+                            class_loss, over, box_mean, hash_grid, hex_planes, peak_multiply_add};
 
 }  // namespace
 }  // namespace mudg::MUDG_ISA_NAMESPACE

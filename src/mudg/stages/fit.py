@@ -128,7 +128,7 @@ def run(
     if fused is None:
         raise UsageError(f"{config.method} needs fused clouds", remedy="run `mudg fuse` and give its folder as --fused")
     recipe_of(config.method).check(config, start is not None)
-    learns_virtual = "virtual" in METHODS[config.method].supervision
+    learns_virtual = bool({"virtual", "repaired"} & set(METHODS[config.method].supervision))
     folders = (observations,) if isinstance(observations, Path) else tuple(map(Path, observations or ()))
     named = {"observations" + f" {n}" * (n > 0): folder for n, folder in enumerate(folders)}
     if learns_virtual and not folders:
@@ -153,6 +153,7 @@ def run(
     folder = RunDir.open(out, OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
+    config = recipe_of(config.method).used(config)
     if begun is not None:
         config = whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):

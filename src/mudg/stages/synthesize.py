@@ -51,6 +51,8 @@ from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.learning import loading
 
 SOURCE, FREEVS = "mudg_r", "freevs"
+COLOR_ALONE = {FREEVS: FREEVS, "repair": "difix"}
+"""Conditions of which only the colour counts, and the method that views made from them belong to."""
 SKY = palette.ID["sky"]
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
@@ -189,7 +191,7 @@ def make_trajectory(
     first, tail = _read_state(state)
     fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     every = max(1, len(path) // 5)
-    with ObservationWriter(folder, path.name, FREEVS if config.condition == FREEVS else SOURCE) as writer:
+    with ObservationWriter(folder, path.name, COLOR_ALONE.get(config.condition, SOURCE)) as writer:
         done = spans[first - 1].stop if first else 0
         for view in path.views[:done]:
             writer.skip(maker.sized(view))
@@ -255,7 +257,7 @@ class ViewMaker:
         if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
             usable[0] = False
         trust = made.confidence * usable
-        source, color_alone = (FREEVS, True) if self._parts == FREEVS else (SOURCE, False)
+        source, color_alone = COLOR_ALONE.get(self._parts, SOURCE), self._parts in COLOR_ALONE
         observations = [
             Observation(
                 view, made.rgb[i], None if color_alone else made.depth[i], None if color_alone else made.semantics[i], trust[i],

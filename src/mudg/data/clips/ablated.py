@@ -18,9 +18,14 @@ from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.near_points import NearSweeps, near_condition
 
-ConditionParts = Literal["full", "reference", "points", "concat", "freevs"]
+ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
-without recorded images and renders. concat: points and that image, without anything warped by depth, and without renders."""
+without recorded images and renders. concat: points and that image, without anything warped by depth, and without renders. repair:
+renders of a fit and that image, without anything measured."""
+
+
+COVERED = 0.5
+"""Opacity above which a render covers a pixel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +58,38 @@ def conditions_of(
         return condition, condition
     if parts == "full":
         return build_conditions(cloud, tracks, views, recorded, rules, kept, sources.render_at)
+    if parts == "repair":
+        return _of_renders(sources, views, kept)
     points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)
     if parts == "points":
         return points
     images = build_conditions(cloud, tracks, views, recorded, replace(rules, images_per_view=1), kept)
     small, fine = (_with_backdrop(a, b, rules, parts) for a, b in zip(points, images, strict=True))
+    return small, fine
+
+
+def _of_renders(
+    sources: ConditionSources, views: Sequence[View], kept: dict[int, WarpSource]
+) -> tuple[Condition, Condition]:
+    """Renders in the place of points, none of them measured, and the nearest recorded image. Where a render covers a pixel it counts as a
+    recorded image that was warped there: it is the picture that is repaired."""
+    if sources.render_at is None:
+        raise UsageError("this condition needs renders of a fitted scene", got="repair")
+    rules, static = replace(sources.rules, images_per_view=1), sources.cloud.static
+    labels = None if static.semantics is None else static.semantics[:0]
+    empty = FusedCloud(replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors)
+    made = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
+
+    def bare(given: Condition) -> Condition:
+        shown = given.renders
+        if shown is None:
+            raise UsageError("this condition needs renders of a fitted scene", got="repair")
+        return replace(
+            given, color=shown.color, depth=shown.depth, semantics=shown.semantics, valid=torch.zeros_like(given.valid),
+            warped=shown.alpha > COVERED,
+        )  # fmt: skip
+
+    small, fine = (bare(given) for given in made)
     return small, fine
 
 

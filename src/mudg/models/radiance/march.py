@@ -80,13 +80,14 @@ class Marched:
     """Rays after marching, n samples each.
 
     Args:
-        along: normalised edges ``[R, n + 1]``; middles_m: distances ``[R, n]``; weights ``[R, n]``.
+        along: normalised edges ``[R, n + 1]``; edges_m: the same as distances; middles_m: distances ``[R, n]``; weights ``[R, n]``.
         xyz, times: of all samples, ``[R * n, 3]`` and ``[R * n, 1]``.
         values: of the fields there.
         proposals: edges and weights of every proposal round.
     """
 
     along: Tensor
+    edges_m: Tensor
     middles_m: Tensor
     weights: Tensor
     xyz: Tensor
@@ -103,6 +104,17 @@ class Marched:
     def range_m(self) -> Tensor:
         """Expected distance ``[R]`` of what is there."""
         return (self.weights * self.middles_m).sum(1) / self.opacity.clamp_min(TINY)
+
+    @property
+    def median_m(self) -> Tensor:
+        """Distance ``[R]`` before which half of what is there lies; within an interval it lies evenly."""
+        upto = self.weights.cumsum(1)
+        half = 0.5 * upto[:, -1:]
+        hit = (upto < half).sum(1, keepdim=True).clamp(max=upto.shape[1] - 1)
+        own = self.weights.gather(1, hit)
+        share = ((half - upto.gather(1, hit) + own) / own.clamp_min(TINY)).clamp(0, 1)
+        near, far = self.edges_m.gather(1, hit), self.edges_m.gather(1, hit + 1)
+        return (near + share * (far - near))[:, 0]
 
     def dynamic_weights(self) -> Tensor:
         """Share of the weights that belongs to what moves, ``[R, n]``."""
@@ -137,7 +149,7 @@ def march(
     xyz, times = _places(rays, middles_m), rays.times.expand(-1, budget.samples).reshape(-1, 1)
     values = field.values(xyz, times, 1.0 if draws is None else draws.share)
     density = (values.static_density + values.dynamic_density).view_as(middles_m)
-    return Marched(edges, middles_m, rendering_weights(density, edges_m), xyz, times, values, tuple(rounds))
+    return Marched(edges, edges_m, middles_m, rendering_weights(density, edges_m), xyz, times, values, tuple(rounds))
 
 
 def _places(rays: Rays, middles_m: Tensor) -> Tensor:
@@ -210,20 +222,23 @@ def lidar_terms(
     missed = ((marched.range_m - range_m) / LARGEST_RANGE_M).square()
     terms = {"lidar": weights.lidar * (missed * near).mean(), **_of_motion(field, marched, draws, weights)}
     if sight_m > 0 and weights.sight:
-        terms["sight"] = weights.sight * line_of_sight(marched.weights, marched.middles_m, range_m, sight_m)
+        terms["sight"] = weights.sight * line_of_sight(marched.weights, marched.edges_m, range_m, sight_m)
     return terms
 
 
-def line_of_sight(weights: Tensor, middles_m: Tensor, range_m: Tensor, sight_m: float) -> Tensor:
+def line_of_sight(weights: Tensor, edges_m: Tensor, range_m: Tensor, sight_m: float) -> Tensor:
     """How far weights are from a narrow bell at the measured range, and from 0 before it: sums along rays, mean of rays.
 
-    Near the surface (within ``sight_m``) the square of ``w - N(t - z; sight_m / 3)``, N the normal density per metre; before it ``w^2``.
+    The weight of an interval is compared with the mass of the bell N(z, sight_m / 3) in it, by the square of the difference; what begins
+    more than ``sight_m`` behind the range is free.
+
+    Args:
+        weights: ``[R, n]``. edges_m: ``[R, n + 1]``. range_m: ``[R]``.
     """
-    off = middles_m - range_m[:, None]
-    scale = sight_m / 3
-    bell = torch.exp(-0.5 * (off / scale).square()) / (scale * (2 * torch.pi) ** 0.5)
-    loss = torch.where(off.abs() < sight_m, (weights - bell).square(), torch.where(off < 0, weights.square(), 0.0))
-    return loss.sum(1).mean()
+    off = edges_m - range_m[:, None]
+    upto = 0.5 * (1 + torch.erf(off * (3 / (sight_m * 2**0.5))))
+    missed = (weights - (upto[:, 1:] - upto[:, :-1])).square()
+    return torch.where(off[:, :-1] < sight_m, missed, 0.0).sum(1).mean()
 
 
 def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, weights: Weights) -> dict[str, Tensor]:

@@ -13,44 +13,27 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any, Final, Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from mudg.base import seeds
+from mudg.base.errors import InputError
 from mudg.base.types import View
+from mudg.core.hex_planes import TIME, PlaneSizes, look_up
 from mudg.core.table import Table
 from mudg.models.scene.flat_network import FlatNetwork
 from mudg.models.scene.nodes import NodeRows, StaticNode
 
-PLANES: Final = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
-"""The two axes of each plane: x, y, z, t."""
-TIME: Final = 3
 FRUSTUM_MARGIN: Final = 1.3
 """A Gaussian may be moved this much further than the edge of the image, as a share of half the image, plus `NEAR_MARGIN_M`."""
 NEAR_MARGIN_M: Final = 5.0
-
-
-@dataclass(frozen=True)
-class PlaneSizes:
-    """Sizes of the planes: ``features`` numbers per place, ``levels`` of 1, 2, 4, ... times ``space`` cells along x, y and z, ``time``
-    cells along t at every level; ``width`` of the networks."""
-
-    features: int
-    levels: int
-    space: int
-    time: int
-    width: int
-
-    def shapes(self) -> Iterator[tuple[int, tuple[int, int], tuple[int, int, int]]]:
-        """Level, axes and shape (features, second axis, first axis) of every plane, in the order in which their numbers lie."""
-        for level in range(self.levels):
-            for axes in PLANES:
-                second, first = (self.time if axis == TIME else self.space * 2**level for axis in axes[::-1])
-                yield level, axes, (self.features, second, first)
+SPACE_START: Final = (0.1, 0.5)
+"""Planes of space start between these."""
+SHORT_GAIN: Final = (sum(SPACE_START) / 2) ** -3
+"""Factor that makes the product of three such planes about 1."""
 
 
 class HexPlaneNode(StaticNode):
@@ -60,16 +43,17 @@ class HexPlaneNode(StaticNode):
 
     Args:
         low, high: corners of the field's box: x, y, z in metres, t in seconds.
+        gain: factor on the features (published: 1).
     """
 
     kind = "hexplane"
 
     def __init__(
-        self, name: str, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, learnt: Table
+        self, name: str, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, learnt: Table, gain: float = 1.0
     ) -> None:
         super().__init__(name)
         self.low, self.high = tuple(map(float, low)), tuple(map(float, high))
-        self.sizes, self.learnt, self.rests = sizes, learnt, False
+        self.sizes, self.learnt, self.gain, self.rests = sizes, learnt, float(gain), False
         self._view: View | None = None
         inner = sizes.features * sizes.levels
         self.networks = (
@@ -79,16 +63,19 @@ class HexPlaneNode(StaticNode):
         )
 
     @classmethod
-    def fresh(cls, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, run_seed: int) -> HexPlaneNode:
+    def fresh(
+        cls, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, run_seed: int, gain: float = 1.0
+    ) -> HexPlaneNode:
         """A field that moves nothing yet: planes of space between 0.1 and 0.5, planes of time 1."""
+        least, most = SPACE_START
         generator = seeds.torch_generator(run_seed, 0, "hexplane")
         planes = [
             torch.ones(shape).flatten()
             if TIME in axes
-            else torch.rand(shape, generator=generator).flatten() * 0.4 + 0.1
-            for _, axes, shape in sizes.shapes()
+            else torch.rand(shape, generator=generator).flatten() * (most - least) + least
+            for axes, shape in sizes.shapes
         ]
-        node = cls("background", low, high, sizes, Table({"planes": torch.zeros(1, 1)}))
+        node = cls("background", low, high, sizes, Table({"planes": torch.zeros(1, 1)}), gain)
         trunk, *heads = node.networks
         network = [trunk.start(generator, silent=False), *(head.start(generator) for head in heads)]
         node.learnt = Table({"planes": torch.cat(planes)[None], "plane_network": torch.cat(network, 1)})
@@ -107,27 +94,12 @@ class HexPlaneNode(StaticNode):
         return made
 
     def planes(self) -> Iterator[tuple[tuple[int, int], Tensor]]:
-        """Axes and numbers ``[features, second axis, first axis]`` of every plane, level by level."""
-        shapes = list(self.sizes.shapes())
-        parts = self.learnt["planes"][0].split(
-            [shape[0] * shape[1] * shape[2] for _, _, shape in shapes]
-        )  # one gradient for all
-        for (_, axes, shape), part in zip(shapes, parts):
-            yield axes, part.view(shape)
+        """Axes and numbers ``[second axis, first axis, features]`` of every plane, level by level."""
+        return self.sizes.planes(self.learnt["planes"][0])
 
     def features(self, places: Tensor) -> Tensor:
-        """What the planes say at places ``[n, 4]``, -1 to 1 along x, y, z, t: ``[n, features * levels]``."""
-        levels: list[Tensor] = []
-        for index, (axes, plane) in enumerate(self.planes()):
-            at = places[None, None, :, list(axes)]
-            value = F.grid_sample(plane[None], at, mode="bilinear", padding_mode="border", align_corners=True)[
-                0, :, 0
-            ].T
-            if index % len(PLANES):
-                levels[-1] = levels[-1] * value
-            else:
-                levels.append(value)
-        return torch.cat(levels, 1)
+        """What the planes say at places ``[n, 4]``, -1 to 1 along x, y, z, t, times the gain: ``[n, features * levels]``."""
+        return self.gain * look_up(places, self.learnt["planes"][0], self.sizes)
 
     def changes(self, means: Tensor, time_s: float) -> tuple[Tensor, Tensor]:
         """Displacement ``[n, 3]`` m and change of colour ``[n, 3]`` of Gaussians at ``means`` [n, 3] at a time."""
@@ -176,14 +148,22 @@ class HexPlaneNode(StaticNode):
             "name": self.name,
             "low": list(self.low),
             "high": list(self.high),
+            "gain": self.gain,
             **asdict(self.sizes),
         }, self.learnt.state()
 
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HexPlaneNode:
-        """Inverse of ``state``."""
+        """Inverse of ``state``.
+
+        Raises:
+            InputError: of an earlier version, whose planes lie in another order.
+        """
+        if "gain" not in facts:
+            raise InputError("this field of place and time was fitted by an earlier version", where="nodes",
+                             remedy="fit the scene again, or render it with the version that fitted it")  # fmt: skip
         sizes = PlaneSizes(**{name: int(facts[name]) for name in PlaneSizes.__dataclass_fields__})
-        return cls(str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors))
+        return cls(str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors), float(facts["gain"]))
 
 
 def _near_frustum(view: View, means: Tensor) -> Tensor:
@@ -209,10 +189,10 @@ def plane_smoothness(node: HexPlaneNode) -> tuple[Tensor, Tensor, Tensor]:
     space = time = flat = node.learnt["planes"].new_zeros(())
     for axes, plane in node.planes():
         if TIME in axes:
-            time = time + _bending(plane, 1)
+            time = time + _bending(plane, 0)
             flat = flat + (1 - plane).abs().mean()
         else:
-            space = space + _bending(plane, 1) + _bending(plane, 2)
+            space = space + _bending(plane, 0) + _bending(plane, 1)
     return space, time, flat
 
 

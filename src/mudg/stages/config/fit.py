@@ -65,7 +65,7 @@ class HexplaneConfig:
     space: int = Field(default=64, ge=2)
     """Cells along x, y and z of the smallest planes."""
     time: int = Field(default=25, ge=2)
-    """Cells along the time."""
+    """Cells along the time, at most; no more than one for two frames."""
     width: int = Field(default=64, ge=1)
     """Width of the networks."""
 
@@ -200,9 +200,10 @@ class FitConfig:
                          "virtual_seen_weight")),
     }  # fmt: skip
 
-    method: Literal["gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "mudg_s"] = "mudg_s"
+    method: Literal["gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "difix", "mudg_s"] = "mudg_s"
     """gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, also supervised by
-    virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier: published methods for comparison (docs/baselines.md)."""
+    virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier, difix (which learns from repaired renders): published
+    methods for comparison (docs/baselines.md)."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
     """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
     to this number. With `--start-from`: further steps, the second half of a schedule of twice as many."""

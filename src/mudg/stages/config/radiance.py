@@ -34,9 +34,10 @@ class RadianceConfig:
     """Distance of the farthest sample, in metres, above 200."""
     static_grid: GridSizes = (8, 2, 16, 1024, 17)
     """Grid of the static field, in space."""
-    dynamic_grid: GridSizes = (8, 2, 32, 1024, 16)
-    """Grid of the dynamic field, in space and time."""
-    flow_grid: GridSizes = (8, 2, 16, 512, 15)
+    dynamic_grid: GridSizes = (8, 2, 8, 256, 17)
+    """Grid of the dynamic field, in space and time. Levels with more places than entries share them: 32 cells along each of four axes are
+    a million places."""
+    flow_grid: GridSizes = (8, 2, 8, 128, 15)
     """Grid of the flow field, in space and time."""
     first_proposal_grid: GridSizes = (5, 1, 16, 128, 16)
     """Grid of the first proposal network, in space."""
@@ -62,8 +63,11 @@ class RadianceConfig:
     """Weight of the line of sight: empty before the LiDAR point, dense at it."""
     sight_start: float = Field(default=0.08, ge=0, le=1)
     """Share of the iterations before the line of sight counts, 0 to 1."""
-    dynamic_weight: float = Field(default=0.01, ge=0)
-    """Weight of the mean density of the dynamic field."""
+    sight_least_m: float = Field(default=0.6, gt=0)
+    """Half width of a surface in the line of sight at the end, in metres; it begins at 6 m (published: 2.5)."""
+    dynamic_weight: float = Field(default=0.002, ge=0)
+    """Weight of the mean density of the dynamic field; it grows from 0 to this between a tenth and half of the iterations (published:
+    0.01, at once)."""
     shadow_weight: float = Field(default=0.01, ge=0)
     """Weight of the squared shadow."""
     cycle_weight: float = Field(default=0.01, ge=0)
@@ -76,5 +80,6 @@ PUBLISHED_EMERNERF: Final[Mapping[str, Any]] = {
     "radiance.static_grid": (10, 4, 16, 8192, 20), "radiance.dynamic_grid": (10, 4, 32, 8192, 18),
     "radiance.flow_grid": (10, 4, 16, 4096, 18), "radiance.first_proposal_grid": (8, 1, 16, 512, 20),
     "radiance.second_proposal_grid": (8, 1, 16, 2048, 20), "radiance.width": 64, "radiance.proposal_width": 64,
+    "radiance.sight_least_m": 2.5, "radiance.dynamic_weight": 0.01,
 }  # fmt: skip
-"""The published sizes, over the defaults of ``FitConfig``."""
+"""The published sizes and weights, over the defaults of ``FitConfig``."""

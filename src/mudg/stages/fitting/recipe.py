@@ -66,6 +66,10 @@ class Recipe:
             UsageError: naming the setting.
         """
 
+    def used(self, config: FitConfig) -> FitConfig:
+        """The settings with those put in that the method fixes."""
+        return config
+
     def scene(self, scene: Scene) -> Scene:
         """The scene as the method may know it."""
         return scene if self.boxes else replace(scene, tracks=())

@@ -19,11 +19,13 @@ from torch import Tensor
 from mudg.base import log
 from mudg.base.types import FusedCloud, Scene
 from mudg.core import losses
+from mudg.core.hex_planes import PlaneSizes
 from mudg.core.table import Table
-from mudg.models.scene.hexplane import HexPlaneNode, PlaneSizes, plane_smoothness
+from mudg.models.scene.hexplane import SHORT_GAIN, HexPlaneNode, plane_smoothness
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting.recipe import BOX_SETTINGS, DrawnView, OwnRecipe
+from mudg.stages.fitting.schedule import FIELD_STEPS
 from mudg.stages.fitting.timed import timed_points
 from mudg.stages.fitting.views import StoredView, TrainView
 
@@ -33,6 +35,8 @@ SSIM_SHARE: Final = 0.2
 LIDAR_WEIGHT, LIDAR_SPAN_M = 0.5, 80.0
 MOVE_WEIGHT, COLOR_WEIGHT = 0.001, 0.001
 SPACE_WEIGHT, TIME_WEIGHT, FLAT_WEIGHT = 1e-4, 0.01, 1e-4
+FRAMES_PER_CELL: Final = 2
+"""Frames of a cell of time (published: 25 cells for 50 frames): what lies between two shown frames must not have one of its own."""
 BOX_MARGIN: Final = 0.02
 """The box of the field is that of the LiDAR points, grown by this share."""
 
@@ -53,15 +57,17 @@ class FieldRecipe(OwnRecipe):
         self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
     ) -> SceneModel:
         """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
-        found = timed_points(scene, views, classes, config, fused.colors, moments=False)
+        found = timed_points(scene, views, classes, config, fused.colors, moments=True)
         measured = found.points.xyz[~np.isnan(found.time_s)].astype(np.float64)
         low, high = measured.min(0), measured.max(0)
         margin = BOX_MARGIN * (high - low) + 0.1
         times = [frame.view.time_s for frame in scene.frames]
         first, last = min(times), max(max(times), min(times) + 1e-3)
         wanted = config.hexplane
-        sizes = PlaneSizes(wanted.features, wanted.levels, wanted.space, wanted.time, wanted.width)
-        node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed)
+        moments = max(2, min(wanted.time, len(set(times)) // FRAMES_PER_CELL))
+        sizes = PlaneSizes(wanted.features, wanted.levels, wanted.space, moments, wanted.width)
+        gain = SHORT_GAIN if config.iterations < FIELD_STEPS else 1.0
+        node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed, gain)
         columns = found.points.columns(classes, config.sh_degree)
         log.info(
             f"start: {len(found.time_s)} Gaussians, {node.learnt['planes'].numel()} numbers in {wanted.levels} x 6 planes"

@@ -15,8 +15,8 @@ from mudg.stages.config import FitConfig
 
 PUBLISHED_STEPS = 30_000
 FIELD_STEPS = 55_000
-"""Published steps of the field of ``s3gaussian``, whose rates a shorter run raises in proportion, within bounds: the field starts from
-nothing, and has as far to go."""
+"""Published steps of the field of ``s3gaussian``, whose rates a shorter run raises more than in proportion, within bounds: the field
+starts from nothing and has as far to go, and every time is seen by few of the steps."""
 LAST_DENSIFIED = 0.6
 """Share of the run after which Gaussians are no longer added."""
 LAST_POSE_ROUND = 0.85
@@ -31,6 +31,7 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
     boost = min(4.0, math.sqrt(max(1.0, PUBLISHED_STEPS / iterations)))
     along = step / max(1, iterations)
     decay, gentle = 0.01**along, 0.2**along
+    field = max(1.0, FIELD_STEPS / iterations) ** 1.5
     return {
         "means": 1.6e-4 * 10.0 * boost * decay,
         "quats": 1e-3 * boost,
@@ -43,8 +44,8 @@ def learning_rates(step: int, iterations: int) -> dict[str, float]:
         "deform": 1e-3 * boost * gentle,
         "network": 1e-3 * gentle,
         "embeddings": 1e-3 * gentle,
-        "planes": min(2e-2, 1.6e-4 * FIELD_STEPS / iterations) * 0.1**along,
-        "plane_network": min(2e-3, 1.6e-5 * FIELD_STEPS / iterations) * 0.1**along,
+        "planes": min(0.03, 1.6e-4 * field) * 0.1**along,
+        "plane_network": min(0.003, 1.6e-5 * field) * 0.1**along,
         "curve": 1.6e-3 * 10.0 * boost * decay,
         "trajectory": 1.6e-5 * 10.0 * boost * decay,
         "tau": 8e-4 * boost * decay,

@@ -43,7 +43,11 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
     (PublishedMDM if published else MDM).check_request(request_of(config))
     if published and fitted:
         raise UsageError("a published-type model does not use a fitted scene", where="--fitted", remedy="leave it out")
-    if config.condition != "full" and (published or fitted):
+    repairs = config.condition == "repair"
+    if repairs and not (fitted or published):
+        raise UsageError("this condition is made of renders of a fitted scene", where="--condition", got="repair",
+                         remedy="give the folder of a finished fit as --fitted")  # fmt: skip
+    if config.condition != "full" and (published or (fitted and not repairs)):
         got = "a published-type model" if published else "--fitted: renders are left out of such a condition"
         raise UsageError("parts of the condition cannot be switched off here", where="--condition", expected="full", got=got,
                          remedy="leave out --condition" + ("" if published else " or --fitted"))  # fmt: skip

@@ -45,8 +45,10 @@ from mudg.stages.radiance.storage import save_field
 
 WARM_UP = 0.1
 FALLS_AT, FALL = (0.25, 0.5, 0.75, 0.9), 0.33
-SIGHT_M, LEAST_SIGHT_M, SIGHT_HALVES = 6.0, 2.5, 0.2
+SIGHT_M, SIGHT_HALVES = 6.0, 0.2
 BETAS, EPSILON = (0.9, 0.99), 1e-15
+DYNAMIC_RISE = (0.1, 0.5)
+"""Shares of the run between which the weight of the dynamic density grows. From the first step on it would empty that field."""
 LOG_EVERY = 20
 
 
@@ -144,7 +146,8 @@ def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
 def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, Tensor]:
     """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
     settings, field = config.radiance, state.field
-    device, budget, weights = field.device, budget_of(settings), loss_weights(settings)
+    device, budget = field.device, budget_of(settings)
+    weights = loss_weights(settings, dynamic_share(step, config.iterations))
     learns = step <= WARM_UP * config.iterations or step % settings.proposals_every == 0
     for optimiser in state.optimisers:
         for group in optimiser.param_groups:
@@ -165,7 +168,7 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     generator = batch_generator(config.seed, step, "lidar")
     given, range_m = state.lidar.batch(settings.lidar_rays, field.extent, generator)
     marched, draws, _ = _marched(field, given, budget, generator, learns)
-    sight_m = sight_width(step, config.iterations, settings.sight_start)
+    sight_m = sight_width(step, config.iterations, settings)
     measured = lidar_terms(field, marched, draws, range_m.to(device), weights, sight_m)
     _learn(state, measured, marched, learns, f"step {step}, LiDAR")
     return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
@@ -202,9 +205,9 @@ def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, 
         optimiser.step()
 
 
-def loss_weights(settings: RadianceConfig) -> Weights:
-    """The weights of a configuration."""
-    return Weights(settings.sky_weight, settings.lidar_weight, settings.sight_weight, settings.dynamic_weight,
+def loss_weights(settings: RadianceConfig, moving: float = 1.0) -> Weights:
+    """The weights of a configuration; ``moving``: share of that of the dynamic density."""
+    return Weights(settings.sky_weight, settings.lidar_weight, settings.sight_weight, moving * settings.dynamic_weight,
                    settings.shadow_weight, settings.cycle_weight)  # fmt: skip
 
 
@@ -214,10 +217,16 @@ def rate_share(step: int, iterations: int) -> float:
     return rising * FALL ** sum(step > share * iterations for share in FALLS_AT)
 
 
-def sight_width(step: int, iterations: int, start: float) -> float:
+def dynamic_share(step: int, iterations: int) -> float:
+    """Weight of the dynamic density at a step as a share of the full one."""
+    first, last = DYNAMIC_RISE
+    return min(1.0, max(0.0, (step / iterations - first) / max(last - first, 1e-9)))
+
+
+def sight_width(step: int, iterations: int, settings: RadianceConfig) -> float:
     """Half width of the surface in the line-of-sight term at a step, metres; 0 before it begins."""
-    since = step / iterations - start
-    return 0.0 if since <= 0 else max(LEAST_SIGHT_M, SIGHT_M * 0.5 ** math.floor(since / SIGHT_HALVES))
+    since = step / iterations - settings.sight_start
+    return 0.0 if since <= 0 else max(settings.sight_least_m, SIGHT_M * 0.5 ** math.floor(since / SIGHT_HALVES))
 
 
 def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:

@@ -26,8 +26,8 @@ FULL_FLOW_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (camera z, metres), opacity and share of what moves ``[H, W]``; flow to the
-    next time step ``[3, H, W]`` in metres, of what moves."""
+    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (of the median, along z, metres), opacity and share of what moves ``[H, W]``;
+    flow to the next time step ``[3, H, W]`` in metres, of what moves."""
 
     rgb: Tensor
     depth: Tensor
@@ -54,7 +54,7 @@ def _part(field: RadianceField, rays: Rays, budget: Budget) -> Tensor:
     marched = march(field, rays, budget)
     moving = marched.dynamic_weights()
     flow = (moving[..., None] * marched.values.flow[:, :3].view(*moving.shape, 3)).sum(1)
-    rest = torch.stack([marched.range_m, marched.opacity, moving.sum(1)], 1)
+    rest = torch.stack([marched.median_m, marched.opacity, moving.sum(1)], 1)
     return torch.cat([colors(field, rays, marched)[0], rest, flow], 1).cpu()
 
 

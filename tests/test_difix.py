@@ -1,0 +1,107 @@
+"""Renders of a fit, repaired beside the path: what the network sees, in which order they are made, and what the fit makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_world import camera, fused_cloud, view_at
+
+from mudg.base.errors import UsageError
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import FusedCloud, Photo
+from mudg.bench import chain
+from mudg.bench.chain import FitChain, repair_settings
+from mudg.data.clips import condition as clips
+from mudg.data.clips.ablated import ConditionSources, conditions_of
+from mudg.data.clips.condition import ConditionRules
+from mudg.methods import METHODS
+from mudg.stages.config import FitConfig, SynthesizeConfig
+from mudg.stages.fitting.recipes import recipe_of
+from mudg.stages.learning import loading
+
+
+def shown(view):
+    """A render with colours, depths and classes of its own, that covers the right half."""
+    size = view.camera.height, view.camera.width
+    plane = torch.linspace(0, 1, size[0] * size[1]).view(1, *size)
+    classes = torch.full((1, *size), 2, dtype=torch.uint8)
+    covers = (torch.arange(size[1]) >= size[1] // 2).float().expand(1, *size)
+    return RenderPlanes(plane.expand(3, -1, -1), 5 + 20 * plane, covers, 0.7 * covers, classes)
+
+
+@pytest.mark.parametrize("fine", [0, 2])
+def test_a_repair_sees_the_render_and_one_photograph_and_nothing_measured(fine):
+    cam = camera(width=48, height=32)
+    rules = ConditionRules(48, 32, 48 * fine, 32 * fine)
+    image = np.random.default_rng(1).integers(0, 255, (32, 48, 3)).astype(np.uint8)
+    view = view_at(0.2, cam)
+    given = ConditionSources(fused_cloud(3), (), [Photo(view, image)], rules, shown)
+    for grid, condition in enumerate(conditions_of(given, "repair", [view], {})):
+        own = shown(view.resized(48 * fine, 32 * fine)) if fine and grid else shown(view)
+        width = condition.color.shape[-1]
+        assert not bool(condition.valid.any())
+        assert not bool(condition.warped[..., : width // 2].any()) and bool(condition.warped[..., width // 2 :].all())
+        if grid or not fine:  # the coarse grid averages the fine one
+            assert torch.equal(condition.color[0], own.color) and torch.equal(condition.depth[0], own.depth)
+        assert torch.equal(condition.color, condition.renders.color) and torch.equal(condition.depth, condition.renders.depth)
+        assert bool((condition.semantics == 2).all())
+    small = conditions_of(replace(given, rules=ConditionRules(48, 32)), "repair", [view], {})[0]
+    assert torch.allclose(small.backdrop[0], clips.image_tensor(image), atol=1e-5)
+    elsewhere = FusedCloud(replace(given.cloud.static, xyz=given.cloud.static.xyz + 500), {})
+    without_points = replace(given, cloud=elsewhere, rules=ConditionRules(48, 32))
+    assert torch.equal(conditions_of(without_points, "repair", [view], {})[0].color, small.color)
+    with pytest.raises(UsageError, match="renders"):
+        conditions_of(replace(given, render_at=None), "repair", [view], {})
+
+
+def test_repairs_need_a_fit_and_only_they_go_with_one():
+    with pytest.raises(UsageError, match="renders of a fitted scene"):
+        loading.check_config(SynthesizeConfig(condition="repair"), False)
+    assert loading.check_config(SynthesizeConfig(condition="repair", device="cpu"), True).condition == "repair"
+    with pytest.raises(UsageError, match="cannot be switched off"):
+        loading.check_config(SynthesizeConfig(condition="points"), True)
+
+
+def test_repaired_views_move_towards_their_places():
+    generator = SynthesizeConfig(shifts_m=(3.0, -3.0, 0.0), paths=("lane+0.1",), steps=4, samples=2)
+    first, last = repair_settings(generator, 1 / 3), repair_settings(generator, 1.0)
+    assert (first.shifts_m, first.paths, first.steps, first.samples) == ((1.0, -1.0), (), 1, 1)
+    assert (last.shifts_m, last.paths, last.condition) == ((3.0, -3.0), ("lane+0.1",), "repair")
+    assert repair_settings(replace(generator, shifts_m=(0.0,)), 1 / 3).paths == ("lane+0.1",)
+
+
+def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with_the_first(tmp_path, monkeypatch):
+    done: list[tuple] = []
+
+    def repaired(config, scene, fused, out, *, fitted, overwrite):
+        done.append(("repair", config.shifts_m, fitted.relative_to(tmp_path).as_posix()))
+        return out
+
+    def fitted(config, scene, fused, out, *, observations, start, overwrite):
+        begun = None if start is None else start.relative_to(tmp_path).as_posix()
+        done.append((config.method, config.iterations, [path.name for path in observations], begun))
+        return out
+
+    monkeypatch.setattr(chain.synthesize, "run", repaired)
+    monkeypatch.setattr(chain.fit, "run", fitted)
+    usual = FitConfig(method="mudg_s", iterations=100)
+    fits = FitChain(tmp_path, tmp_path / "scene", tmp_path / "fuse", usual, False, SynthesizeConfig(shifts_m=(3.0,)))
+    assert fits.fitted("difix", replace(usual, method="difix"), ()) == tmp_path / "fit" / "difix"
+    assert [entry for entry in done if entry[0] != "street_gaussians"] == [
+        ("repair", (1.0,), "fit/street_gaussians"), ("difix", 50, ["1"], "fit/street_gaussians"),
+        ("repair", (2.0,), "start/difix-1"), ("difix", 50, ["1", "2"], "fit/street_gaussians"),
+        ("repair", (3.0,), "start/difix-2"), ("difix", 50, ["1", "2", "3"], "fit/street_gaussians"),
+    ]  # fmt: skip
+    with pytest.raises(UsageError, match="settings of generated"):
+        replace(fits, generator=None).fitted("difix", replace(usual, method="difix"), ())
+
+
+def test_only_the_colour_of_a_repair_counts():
+    used = recipe_of("difix").used(FitConfig(method="difix")).virtual
+    assert (used.probability, used.continued_probability, used.color_weight, used.ssim_weight) == (0.3, 0.3, 0.3, 0.2)
+    assert (used.depth_weight, used.lidar_weight, used.semantic_weight, used.perceptual_weight, used.gaussians) == (0, 0, 0, 0, 0)
+    assert "virtual" not in METHODS["difix"].supervision and "no last repair" in METHODS["difix"].title
+    assert recipe_of("mudg_s").used(FitConfig()) == FitConfig()
