@@ -27,7 +27,7 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.bench import edit as bench_edit
+from mudg.bench import edit_diffusion
 from mudg.bench import paper as bench_paper
 from mudg.bench import poses as bench_poses
 from mudg.bench import real as bench_real
@@ -165,6 +165,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
     "poses": bench_poses.measure,
-    "edit": bench_edit.measure,
+    "edit": edit_diffusion.with_diffusion,
 }
 """Every measurement that is one folder, by name."""
