@@ -84,6 +84,7 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
 
 
 def case_of(config: BenchConfig, city: int, out: Path) -> EditCase:
+    """A city, the scene fitted to it, and the vehicle that is edited."""
     scene = bench_poses.city_scene(city, out / "cities" / str(city))
     cloud = fuse_sweeps(scene_sweeps(scene, FuseConfig()), scene.tracks, rules_of(FuseConfig()))[0]
     settings = bench_poses.fit_settings(config, "fixed")

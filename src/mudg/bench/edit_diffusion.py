@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mudg.base import log, store
-from mudg.base.config import result_settings
-from mudg.base.run_folder import RunDir
 from mudg.base.types import Observation, View
 from mudg.bench import edit as bench_edit
 from mudg.bench import poses as bench_poses
@@ -122,9 +120,7 @@ def _refitted(config: BenchConfig, case: EditCase, edited: tuple[EditedDrive, Ed
     settings = replace(bench_poses.fit_settings(config, "fixed"), iterations=config.pose_iterations)
     views, classes = fit.recorded_views(settings, scene, None, start)
     state = fit.continued_state(whole_run(settings), start, views, classes)
-    run = RunDir.open(out / "fit", fit.OUTPUT, result_settings(settings), {}, overwrite=True)
-    fit.optimise(state, whole_run(settings), run)
-    return state.model
+    return bench_poses.optimised(state, whole_run(settings), out / "fit").model
 
 
 def _without(config: BenchConfig, case: EditCase, world: CityWorld, out: Path) -> SceneModel:

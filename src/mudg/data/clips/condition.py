@@ -160,16 +160,21 @@ class Surfaces:
     render: RenderPlanes | None
     vacated: Vacated | None = None
 
-    def with_hole(self, color: Tensor, ids: Tensor, found: Tensor) -> tuple[Surfaces, Tensor, Tensor]:
-        """These surfaces, colours and classes of a view after images were warped in to the pixels `found` bool[H,W]: what was vacated
-        and not found continues what is around it, and does not count as measured."""
+    def with_hole(self, color: Tensor, ids: Tensor, found: Tensor) -> tuple[Surfaces, Tensor, Tensor, Tensor]:
+        """These surfaces, colours, classes and `found` bool[H,W] of a view after images were warped in to these pixels: what was vacated
+        and not found continues what is around it, and does not count as measured; where objects are new the render is all that there is,
+        and counts like a photograph."""
         if self.vacated is None:
-            return self, color, ids
+            return self, color, ids, found
+        if self.render is not None:
+            shown = self.vacated.shown & (self.render.alpha[0] > 0.5)
+            color, ids = torch.where(shown, self.render.color, color), torch.where(shown, self.render.semantics[0], ids)
+            found = found | shown
         ground = self.measured & torch.isin(self.ids, GROUND_IDS) & torch.isfinite(self.vacated.ground)
         hole = self.vacated.mask & ~found & ~ground  # what stood there may have coloured other points
         color, ids = continued(color, ids, self.vacated, hole)
         render = None if self.render is None else uncertain_there(self.render, self.vacated, hole, color)
-        return replace(self, measured=self.measured & ~hole, render=render), color, ids
+        return replace(self, measured=self.measured & ~hole, render=render), color, ids, found
 
 
 def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -360,7 +365,7 @@ def _condition_of_view(
     if not (rules.warp and recorded):
         here = points.look(view, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
         found = torch.zeros_like(here.measured)
-        here, color, own_ids = here.with_hole(here.color, here.ids, found)
+        here, color, own_ids, found = here.with_hole(here.color, here.ids, found)
         ids = own_ids[None]
         return (color, here.depth[None], here.measured[None], found[None], color, ids, ids), here.render
     nearest = source(min(range(len(recorded)), key=_rank_of_images(view, recorded, rules)))
@@ -382,7 +387,7 @@ def _condition_of_view(
         color = torch.where(new, rgb, color)
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
         found = found | new
-    here, color, ids = here.with_hole(color, ids, found)
+    here, color, ids, found = here.with_hole(color, ids, found)
     if known is not None:  # what stood there is not part of the picture any more
         backdrop, far_ids = torch.where(known, backdrop, color), torch.where(known, far_ids, ids[None])
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render

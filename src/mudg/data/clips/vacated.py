@@ -29,10 +29,12 @@ DYNAMIC = torch.tensor(sorted(palette.DYNAMIC_IDS), dtype=torch.uint8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vacated:
-    """Pixels bool[H,W] of a view in which something stood, and the depth f32[H,W] in metres of level ground there (NaN above it)."""
+    """Where edits changed a view: pixels bool[H,W] in which something stood that is gone; the depth f32[H,W] in metres of level ground
+    there (NaN above it); and pixels bool[H,W] in which objects are new or stand anew."""
 
     mask: Tensor
     ground: Tensor
+    shown: Tensor
 
 
 VacatedAt = Callable[[View], Vacated]
@@ -50,7 +52,7 @@ def continued(color: Tensor, ids: Tensor, vacated: Vacated, hole: Tensor) -> tup
     ground, moving = torch.isin(ids, GROUND_IDS), torch.isin(ids, DYNAMIC)
     low = torch.isfinite(vacated.ground)
     for part, given in ((hole & low, ground), (hole & ~low, ~ground & ~moving)):
-        source = given & ~vacated.mask
+        source = given & ~hole
         if bool(part.any()) and bool(source.any()):
             filled = _pulled(color[None] * source, source.float()[None, None])[0]
             color, ids = torch.where(part, filled, color), torch.where(part, _nearest(ids, source), ids)

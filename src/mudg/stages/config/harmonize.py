@@ -18,7 +18,7 @@ class HarmonizeConfig:
     """Let the diffusion model repair what an edit script changed. Needs the fused clouds."""
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn."""
-    steps: int = Field(default=4, ge=1, le=1000)
+    steps: int = Field(default=2, ge=1, le=1000)
     """Denoising steps."""
     uncovered: float = Field(default=1.0, ge=0, le=1)
     """How far the model may leave the render where something stood before, its shadow included: share of the noise schedule, 0 (it stays)

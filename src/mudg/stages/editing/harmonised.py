@@ -219,7 +219,8 @@ class Harmoniser:
     def _repaired(self, render: Observation, touched: Touched, made: Observation) -> Observation:
         brighter = (made.rgb - render.rgb).mean(0).numpy()
         lit = touched.shaded & torch.from_numpy(ndimage.uniform_filter(brighter, 5) > BRIGHTER)
-        touched = replace(touched, shaded=lit)
+        objects = touched.objects & (self._config.objects > 0)
+        touched = replace(touched, shaded=lit & (self._config.uncovered > 0), objects=objects)
         boxes = boxes_mask(render.view, others(self._sources.plan, render.view.time_s))
         kept = guarded(touched, render, made, boxes) if self._config.keep_classes else touched.any
         return pasted(render, made, soft_edge(kept.numpy(), self._config.feather_px))

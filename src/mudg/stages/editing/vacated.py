@@ -29,6 +29,9 @@ from mudg.stages.editing.plan import Actor, Background, EditPlan, EditSources, E
 from mudg.stages.editing.weathered import conditions_of
 from mudg.stages.fitting.objects import outline_mask
 
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Pose world_from_box f64[4, 4] and size f64[3] in metres."""
+Boxes = Sequence[Box]
 SHADOW_REACH: Final = 1.0
 """Shadows are looked for this far about a box, as a share of its height."""
 SLAB_M: Final = 0.1
@@ -85,13 +88,24 @@ def photos_of_edited(photos: Iterable[Photo], plan: EditPlan) -> list[Photo]:
 def _usable(photo: Photo, plan: EditPlan) -> NDArray[np.bool_] | None:
     height, width = photo.rgb.shape[:2]
     view = photo.view if photo.view.camera.width == width else photo.view.resized(width, height)
-    before, after = (touched_boxes(plan, photo.view.time_s, when) for when in ("before", "after"))
-    covered = boxes_mask(view, [*before, *after]) | ground_mask(view, [*before, *after])
+    touched = [box for when in ("before", "after") for box in touched_boxes(plan, photo.view.time_s, when)]
+    covered = _hidden_by(view, touched, plan)
     usable = ~covered if photo.usable is None else photo.usable & ~covered
     return None if usable.all() else usable
 
 
-def touched_boxes(plan: EditPlan, time_s: float, when: str) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def _hidden_by(view: View, boxes: Boxes, plan: EditPlan) -> NDArray[np.bool_]:
+    """Bool[H, W]: inside the outlines of boxes or on the ground about them, but not where another moving object stands in front, nor on
+    that ground where one stands anywhere."""
+    if not boxes:
+        return np.zeros((view.camera.height, view.camera.width), bool)
+    ahead = lambda box: float((view.cam_from_world @ box[0])[2, 3])  # noqa: E731
+    rest, nearest = others(plan, view.time_s), min(map(ahead, boxes))
+    covered = boxes_mask(view, boxes) | (ground_mask(view, boxes) & ~boxes_mask(view, rest))
+    return covered & ~boxes_mask(view, [box for box in rest if ahead(box) < nearest])
+
+
+def touched_boxes(plan: EditPlan, time_s: float, when: str) -> list[Box]:
     """Poses world_from_box f64[4, 4] and sizes f64[3] of what a plan removes, moves or puts in, where it is not the same at this time
     `before` and `after` the edits. An object on its recorded place is left out."""
     found = []
@@ -111,13 +125,13 @@ def vacated_at(plan: EditPlan) -> VacatedAt:
 
     def found(view: View) -> Vacated:
         before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
-        there = boxes_mask(view, after) | boxes_mask(view, others(plan, view.time_s))
-        mask = (boxes_mask(view, before) | ground_mask(view, before)) & ~there
+        shown = boxes_mask(view, after)
+        mask = _hidden_by(view, before, plan) & ~shown
         ground = np.full(mask.shape, np.nan, np.float32)
         for pose, size in before:
             depth = _plane_depth(view, pose, size)
             ground = np.where(boxes_mask(view, [(pose, size)]) | ground_mask(view, [(pose, size)]), np.fmin(ground, depth), ground)
-        return Vacated(torch.from_numpy(mask), torch.from_numpy(ground))
+        return Vacated(torch.from_numpy(mask), torch.from_numpy(ground), torch.from_numpy(shown))
 
     return found
 
@@ -149,7 +163,7 @@ def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
     return replace(cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=part(static.semantics)))
 
 
-def others(plan: EditPlan, time_s: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def others(plan: EditPlan, time_s: float) -> list[Box]:
     """Poses and sizes of the moving objects that a plan leaves alone."""
     touched = {*plan.removed, *plan.changes, *plan.inserted}
     found = [(actor, _pose(actor, time_s)) for name, actor in plan.after.actors.items() if name not in touched and actor.moves]
@@ -160,12 +174,12 @@ def _pose(actor: Actor | None, time_s: float) -> NDArray[np.float64] | None:
     return None if actor is None else actor.motion.pose_at(time_s)
 
 
-def boxes_mask(view: View, boxes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> NDArray[np.bool_]:
+def boxes_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     """Bool[H, W]: inside the outline of a box, grown a little."""
     return _outlines(view, [(pose, size + BOX_GROWTH_M) for pose, size in boxes])
 
 
-def ground_mask(view: View, boxes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> NDArray[np.bool_]:
+def ground_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     """Bool[H, W]: ground below and about a box, where its shadow may lie; what stands there is not told apart."""
     slabs = []
     for pose, size in boxes:
@@ -175,7 +189,7 @@ def ground_mask(view: View, boxes: Sequence[tuple[NDArray[np.float64], NDArray[n
     return _outlines(view, slabs)
 
 
-def _outlines(view: View, boxes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> NDArray[np.bool_]:
+def _outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     covered = np.zeros((view.camera.height, view.camera.width), bool)
     for pose, (length, width, height) in boxes:
         outline = outline_mask(view, pose, (length, width, height))
