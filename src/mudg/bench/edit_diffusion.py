@@ -28,7 +28,6 @@ from mudg.bench.edit import CHANGED, NEARBY_PX, SAME, EditCase, city_keys
 from mudg.core import metrics
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.perceptual import lpips_distance, unit_features
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.city import CityWorld
 from mudg.data.city.recording import write_world
 from mudg.data.edits import EditScript, parse_edits
@@ -44,7 +43,7 @@ from mudg.stages.editing.carried import EditedDrive, carry_out
 from mudg.stages.editing.harmonised import repairing
 from mudg.stages.editing.written import EditedImages, write_edited_scene
 from mudg.stages.fitting.continued import StartFit, whole_run
-from mudg.stages.fitting.rendering import NEAR_M, render_view
+from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.fitting.storage import save_model
 from mudg.stages.fuse import rules_of, scene_sweeps
 
@@ -88,7 +87,7 @@ def _rows_of(config: BenchConfig, case: EditCase, name: str, out: Path) -> list[
     images = replace(images, repaired={name: iter(kept.values()) for name in case.scene.cameras})
     place = out / "edited" / f"{case.city}_{name.replace(' ', '_')}"
     refitted = _refitted(config, case, (drive, images), place)
-    drawn = lambda model: lambda view: render_view(model, view, RasterConfig(near_m=NEAR_M)).rgb  # noqa: E731
+    drawn = lambda model: lambda view: render_view(model, view, raster_of(model)).rgb  # noqa: E731
     ways: dict[str, Draw] = {"fit": drawn(edited), "+ diffusion": lambda view: kept[view.time_s].rgb, "+ refit": drawn(refitted)}
     if name == "remove":
         ways[UNSEEN] = drawn(_without(config, case, truth, out))

@@ -27,7 +27,6 @@ from torch.nn import functional
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.clips.ablated import ConditionSources
 from mudg.data.clips.condition import ConditionRules
 from mudg.data.clips.vacated import GROUND_IDS
@@ -49,7 +48,7 @@ from mudg.stages.editing.vacated import (
 )
 from mudg.stages.editing.written import EditedImages
 from mudg.stages.fitting.planes import FAR_M, render_planes
-from mudg.stages.fitting.rendering import NEAR_M, render_view
+from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.learning import loading
 from mudg.stages.synthesize import ViewMaker, recorded_images, windows
 
@@ -232,7 +231,7 @@ def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> Edit
     Args:
         recorded: the scene as it was; the views are those of the edited one.
     """
-    raster, edited = RasterConfig(backend=images.config.raster, near_m=NEAR_M), drive.scene or recorded
+    raster, edited = raster_of(images.before, images.config.raster), drive.scene or recorded
     sources, config = EditedSources.of(drive, images.after, recorded), images.config.harmonize
     draw = lambda view: (render_view(images.before, view, raster), render_view(images.after, view, raster))  # noqa: E731
     views = {name: [f.view for f in edited.frames if f.view.camera.name == name] for name in edited.cameras}
