@@ -16,6 +16,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import FusedCloud, Observation, Photo
+from mudg.bench import run as bench
 from mudg.core.edit import Motion
 from mudg.data.clips import vacated as clip_parts
 from mudg.data.clips.condition import build_conditions, image_tensor
@@ -29,7 +30,7 @@ from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.models.published.model import PublishedMDM
 from mudg.stages import edit, fit, render, synthesize
-from mudg.stages.config import EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
+from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
 from mudg.stages.editing.harmonised import Touched, guarded, pasted, soft_edge
 from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.vacated import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
@@ -271,3 +272,19 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
         fit.run(config, run / "scene", run / "fuse", tmp_path / "wrong", start=out / "fit" / "street_gaussians")
     with pytest.raises(UsageError, match="no images"):
         edit.run(EditConfig(harmonize=harmonize), run / "fit" / "street_gaussians", edits, tmp_path / "alone", scene=run / "scene")
+
+
+@pytest.mark.slow
+def test_the_benchmark_finds_repaired_edits_no_worse(tmp_path: Path) -> None:
+    """What the diffusion model repairs of a removed vehicle's background is nearer to the truth than the fit, and little else changes."""
+    config = BenchConfig(cities="development", count=1, pose_iterations=60, harmonize=True, device="cpu")
+    out = bench.run("edit", config, tmp_path / "out")
+    rows = {(row["edit"], row["way"]): row for row in store.read_json(out / "bench.json")["diffusion"]["rows"]}
+    for name in ("remove", "move 3 m ahead", "insert"):
+        plain, repaired = rows[name, "fit"], rows[name, "+ diffusion"]
+        assert repaired["inside"] > plain["inside"] - 0.3
+        assert repaired["outside"] < plain["outside"] + 0.01
+    assert rows["remove", "+ diffusion"]["uncovered"] > rows["remove", "fit"]["uncovered"]
+    assert rows["remove", "+ diffusion"]["perceptual"] < rows["remove", "fit"]["perceptual"]
+    assert rows["remove", "never there"]["uncovered"] > rows["remove", "+ refit"]["uncovered"]
+    assert "+ refit" in (out / "bench.md").read_text(encoding="utf-8")

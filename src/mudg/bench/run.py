@@ -45,7 +45,7 @@ from mudg.stages.learning.city_fits import fit_city
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
-_FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "fits/", "rows/*.json")
+_FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 SHIFT, REAL, PAPER = "shift", "real", "paper"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
