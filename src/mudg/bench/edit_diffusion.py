@@ -47,9 +47,10 @@ from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.fitting.storage import save_model
 from mudg.stages.fuse import rules_of, scene_sweeps
 
+MOVE: Final = "- move: {id: ID, along_m: 3, ground: false}"
 EDITS: Final = {
     "remove": "- remove: {ids: [ID]}",
-    "move 3 m ahead": "- move: {id: ID, along_m: 3, ground: false}",
+    "move 3 m ahead": MOVE,
     "insert": "- remove: {ids: [ID]}\n- insert: {id: new, asset: {file: ASSET}, path: PATH, ground: false}",
 }
 """Name of a row -> script."""
@@ -101,7 +102,7 @@ def _script(case: EditCase, text: str, out: Path) -> EditScript:
     asset = out / "edited" / f"{case.city}.safetensors"
     if "ASSET" in text:
         write_asset(asset, asset_of(case.model, case.name, ()))
-        moved = carry_out(parse_edits(EDITS["move 3 m ahead"].replace("ID", case.name), "move"), case.model, case.scene)
+        moved = carry_out(parse_edits(MOVE.replace("ID", case.name), "move"), case.model, case.scene)
         motion = moved.plan.after.actors[case.name].motion
         yaws = np.degrees(np.unwrap(np.arctan2(motion.poses[:, 1, 0], motion.poses[:, 0, 0])))
         path = [[round(float(x), 4) for x in row] for row in np.column_stack([motion.times_s, motion.poses[:, :2, 3], yaws])]

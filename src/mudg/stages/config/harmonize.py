@@ -23,8 +23,8 @@ class HarmonizeConfig:
     uncovered: float = Field(default=1.0, ge=0, le=1)
     """How far the model may leave the render where something stood before, its shadow included: share of the noise schedule, 0 (it stays)
     to 1."""
-    objects: float = Field(default=0.25, ge=0, le=1)
-    """The same for objects that were moved or put in, and their shadows."""
+    objects: float = Field(default=0.0, ge=0, le=1)
+    """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
     changed_above: float = Field(default=4 / 255, ge=0, le=1)
     """Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as they are."""
     feather_px: int = Field(default=3, ge=0)

@@ -57,6 +57,8 @@ GROWN_PX: Final = 2
 """Touched pixels are grown by this much: a render fades out beyond what differs clearly."""
 BRIGHTER: Final = 0.02
 """Ground that other moments show brighter than the render by this, 0 to 1, lay in a shadow."""
+CONTACT_REACH: Final = 0.2
+"""The ground this far about a new place of an object, as a share of its height, is its contact shadow and no longer what was uncovered."""
 OVERLAP: Final = 2
 """Frames that windows share."""
 
@@ -120,8 +122,9 @@ def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Obse
     differs = ((made.rgb - usual.rgb).abs().amax(0) > changed_above).numpy()
     differs = np.asarray(ndimage.binary_dilation(differs, iterations=GROWN_PX), bool) if differs.any() else differs
     old_ground, new_box, new_ground = ground_mask(view, before), boxes_mask(view, after), ground_mask(view, after)
-    uncovered = differs & (boxes_mask(view, before) | old_ground) & ~new_box
-    objects = differs & (new_box | new_ground) & ~uncovered
+    near = new_box | ground_mask(view, after, CONTACT_REACH)
+    uncovered = differs & (boxes_mask(view, before) | old_ground) & ~near
+    objects = differs & (near | new_ground) & ~uncovered
     ids = torch.full(made.rgb.shape[1:], 255) if made.semantics is None else made.semantics
     shaded = old_ground & torch.isin(ids, GROUND_IDS.long()).numpy() & ~new_box & ~uncovered & ~objects
     return Touched(*(torch.from_numpy(mask) for mask in (objects, uncovered, shaded)))

@@ -179,13 +179,14 @@ def boxes_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     return _outlines(view, [(pose, size + BOX_GROWTH_M) for pose, size in boxes])
 
 
-def ground_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
-    """Bool[H, W]: ground below and about a box, where its shadow may lie; what stands there is not told apart."""
+def ground_mask(view: View, boxes: Boxes, reach: float = SHADOW_REACH) -> NDArray[np.bool_]:
+    """Bool[H, W]: ground below and about a box, as far as `reach` times its height, where its shadow may lie; what stands there is not
+    told apart."""
     slabs = []
     for pose, size in boxes:
-        reach = 2 * SHADOW_REACH * size[2]
+        about_m = 2 * reach * size[2]
         flat = pose @ geometry.yaw_matrix(0.0, (0.0, 0.0, -size[2] / 2))
-        slabs.append((flat, np.array([size[0] + reach, size[1] + reach, SLAB_M])))
+        slabs.append((flat, np.array([size[0] + about_m, size[1] + about_m, SLAB_M])))
     return _outlines(view, slabs)
 
 
