@@ -27,7 +27,7 @@ TEXTS = [*PAGES, REPOSITORY / "CONTRIBUTING.md"]
 FLAGS: dict[str, list[str]] = json.loads((REPOSITORY / "tests" / "house" / "cli.json").read_text(encoding="utf-8"))
 
 FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--standalone": "torchrun",
-                 "--version": "mudg", "--help": "every verb", "--help-all": "mudg run, mudg demo",
+                 "--version": "mudg", "--dist": "pytest", "--help": "every verb", "--help-all": "mudg run, mudg demo",
                  **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker")}  # fmt: skip
 FOLDERS = "base core native data models report stages bench docs tests tools build_backend src".split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()

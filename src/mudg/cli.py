@@ -98,7 +98,9 @@ def _adapt(args: f.Adapt) -> dict[str, Any]:
 def _synthesize(args: f.Synthesize) -> dict[str, Any]:
     from mudg.stages import synthesize
 
-    made = synthesize.run(args.settings, args.scene, args.fused, args.out, fitted=args.fitted, overwrite=args.overwrite)
+    made = synthesize.run(
+        args.settings, args.scene, args.fused, args.out, fitted=args.fitted, edits=args.edits, overwrite=args.overwrite
+    )
     return {"views": made}
 
 
@@ -115,7 +117,9 @@ def _fit(args: f.Fit) -> dict[str, Any]:
 def _render(args: f.RenderFlags) -> dict[str, Any]:
     from mudg.stages import render
 
-    made = render.run(args.settings, args.scene, args.model, args.out, edits=args.edits, overwrite=args.overwrite)
+    made = render.run(
+        args.settings, args.scene, args.model, args.out, edits=args.edits, fused=args.fused, overwrite=args.overwrite
+    )
     return {"views": made}
 
 

@@ -147,6 +147,8 @@ class Synthesize(Output):
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were
     trained with renders."""
+    edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
+    """Edit script (docs/edit.md): make views of the drive as it says."""
     settings: Annotated[stage_config.SynthesizeConfig, arg(name="")]
 
 
@@ -176,6 +178,8 @@ class RenderFlags(Output):
     """Gaussian scene written by fit, or edit. It may also stand after SCENE without the flag."""
     edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
+    fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Point clouds written by fuse; for --harmonize.on."""
     settings: Annotated[stage_config.RenderConfig, arg(name="")]
 
 

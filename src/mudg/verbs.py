@@ -84,13 +84,18 @@ def adapt(
 
 def synthesize(
     scene: Location, fused: Location, out: Location, *,
-    fitted: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+    fitted: Location | None = None, edits: Location | None = None, overwrite: bool = False, config: Location | None = None,
+    **settings: Any,
 ) -> Path:  # fmt: skip
-    """Generate colour, depth and classes on shifted trajectories; returns the folder of observation sets."""
+    """Generate colour, depth and classes on shifted trajectories; returns the folder of observation sets.
+
+    Args:
+        edits: an edit script; the views are of the drive as it says.
+    """
     from mudg.stages import synthesize as stage
 
     made = _settings(stage_config.SynthesizeConfig, config, settings)
-    return stage.run(made, Path(scene), Path(fused), Path(out), fitted=_optional(fitted), overwrite=overwrite)
+    return stage.run(made, Path(scene), Path(fused), Path(out), fitted=_optional(fitted), edits=_optional(edits), overwrite=overwrite)
 
 
 def fit(
@@ -115,17 +120,19 @@ def fit(
 
 def render(
     scene: Location, model: Location, out: Location, *,
-    edits: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+    edits: Location | None = None, fused: Location | None = None, overwrite: bool = False, config: Location | None = None,
+    **settings: Any,
 ) -> Path:  # fmt: skip
     """Render a fitted scene on recorded and shifted trajectories; returns the folder of observation sets and videos.
 
     Args:
         edits: an edit script to carry out before.
+        fused: point clouds of fuse, for settings of ``harmonize``.
     """
     from mudg.stages import render as stage
 
     made = _settings(stage_config.RenderConfig, config, settings)
-    return stage.run(made, Path(scene), Path(model), Path(out), edits=_optional(edits), overwrite=overwrite)
+    return stage.run(made, Path(scene), Path(model), Path(out), edits=_optional(edits), fused=_optional(fused), overwrite=overwrite)
 
 
 def edit(

@@ -175,12 +175,13 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photo:
-    """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or None. The image may
-    have another size than the view's camera."""
+    """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or None, ``usable``
+    bool[H, W]: pixels that show what is asked for (None = all). The image may have another size than the view's camera."""
 
     view: View
     rgb: NDArray[np.uint8]
     semantics: NDArray[np.uint8] | None = None
+    usable: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

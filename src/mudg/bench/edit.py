@@ -75,7 +75,7 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
         for city in cities:
             place = out / "rows" / f"{city}_edits.json"
             if not place.is_file():
-                case = _case(config, city, out)
+                case = case_of(config, city, out)
                 store.write_json(place, [row_of(case, name, text) for name, text in EDITS.items()])
             rows += store.read_json(place)
             bar.advance()
@@ -83,7 +83,8 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     return result, table(result)
 
 
-def _case(config: BenchConfig, city: int, out: Path) -> EditCase:
+def case_of(config: BenchConfig, city: int, out: Path) -> EditCase:
+    """A city, the scene fitted to it, and the vehicle that is edited."""
     scene = bench_poses.city_scene(city, out / "cities" / str(city))
     cloud = fuse_sweeps(scene_sweeps(scene, FuseConfig()), scene.tracks, rules_of(FuseConfig()))[0]
     settings = bench_poses.fit_settings(config, "fixed")

@@ -133,7 +133,11 @@ def disturbed(tracks: tuple[Track, ...], kind: str, seed: int) -> tuple[Track, .
 def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> fit.FitState:
     """Fit in memory; ``folder`` takes the log and the pictures."""
     device = drawing_device(config.device, "fit", config.raster)
-    state = fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene)).to(device)
+    return optimised(fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene)).to(device), config, folder)
+
+
+def optimised(state: fit.FitState, config: FitConfig, folder: Path) -> fit.FitState:
+    """The state after all steps; as ``fitted``."""
     run = RunDir.open(folder, fit.OUTPUT, result_settings(config), {})
     if not run.fresh:  # the fit starts again, and so does its log
         run.discard()

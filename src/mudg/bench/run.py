@@ -27,7 +27,7 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.bench import edit as bench_edit
+from mudg.bench import edit_diffusion
 from mudg.bench import paper as bench_paper
 from mudg.bench import poses as bench_poses
 from mudg.bench import real as bench_real
@@ -45,7 +45,7 @@ from mudg.stages.learning.city_fits import fit_city
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
-_FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "fits/", "rows/*.json")
+_FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 SHIFT, REAL, PAPER = "shift", "real", "paper"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
@@ -165,6 +165,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
     "poses": bench_poses.measure,
-    "edit": bench_edit.measure,
+    "edit": edit_diffusion.with_diffusion,
 }
 """Every measurement that is one folder, by name."""

@@ -28,6 +28,17 @@ from mudg.models.mdm.codec import Modality
 
 
 @dataclass(frozen=True, eq=False)
+class StartClip:
+    """What a clip is to stay like: rgb f32[T,3,H,W] in [0,1], depth f32[T,1,H,W] metres, semantics u8[T,1,H,W] (255 = unknown), and
+    freedom f32[T,1,H,W]: the share of the noise schedule, from 0 (stays) to 1 (made from noise), that each pixel goes through."""
+
+    rgb: Tensor
+    depth: Tensor
+    semantics: Tensor
+    freedom: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class SampleRequest:
     """How one clip is to be generated.
 
@@ -41,6 +52,7 @@ class SampleRequest:
         guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's own).
         n_samples: if > 1, the first sample is returned, and the spread of all lowers the confidence.
         known: modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window.
+        start: a clip at the size of the condition that the sample begins from, each pixel as far as its freedom says; small kind.
         align: bring each frame's depth to the measured scale (`core.align`).
         bf16: run the networks in bfloat16.
     """
@@ -54,6 +66,7 @@ class SampleRequest:
     guidance_rescale: float | None = None
     n_samples: int = 1
     known: Mapping[Modality, Tensor] | None = field(default=None, repr=False)
+    start: StartClip | None = field(default=None, repr=False)
     align: bool = True
     bf16: bool = False
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from mudg.base import log, store
 from mudg.base.config import result_settings
+from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.raster.place import drawing_device
@@ -19,13 +20,14 @@ from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.scene import SCENE_FILES, read_scene
 from mudg.stages.config import EditConfig
 from mudg.stages.editing.carried import EditedDrive, carry_out, read_and_digest
+from mudg.stages.editing.harmonised import repairing
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.editing.weathered import conditions_of
 from mudg.stages.editing.written import DriveChange, EditedImages, write_edited_scene
 from mudg.stages.fitting.storage import load_model, model_of_scene, save_model
 
 _MODEL = ("model.json", "gaussians.safetensors", "nodes.safetensors")
-_OUTPUT = VerbOutput("edit", 1, (
+_OUTPUT = VerbOutput("edit", 2, (
     "edits.yaml", "edit.json", "lidar.json", *_MODEL, *below("fit/*", _MODEL), *below("scene", (*SCENE_FILES, store.MANIFEST)),
     *below("fuse", ("static.safetensors", "objects/*.safetensors", "fuse.json")),
 ))  # fmt: skip
@@ -62,6 +64,9 @@ def run(
         log.info("edit: `mudg render` shows weather and light; images and LiDAR of the edited scene stay as recorded")
     if parts.whole and drive.plan.background is not None:
         log.info("edit: all pixels of the edited images are renders; its scene has no LiDAR sweeps, for nobody measured that street")
+    if config.harmonize.on and not parts.whole:
+        raise UsageError("a fit by itself has no images to repair", where="--harmonize.on",
+            remedy="edit a whole run, or render the fit with `mudg render --edits ... --harmonize.on`")  # fmt: skip
     made = drive.model(model, keep_ego=not parts.whole)
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
@@ -73,6 +78,7 @@ def run(
         if parts.whole and loaded is not None and cloud is not None:
             everywhere = drive.plan.moves_ego or drive.plan.background is not None
             images = EditedImages(model.to(device), made.to(device), config, everywhere)
+            images = repairing(images, drive, loaded) if config.harmonize.on else images
             changed["lidar"] = _write_run(drive, parts, loaded, images, folder.path)
         else:
             save_model(made, folder.path)

@@ -24,14 +24,17 @@ from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
+from mudg.data.cloudfile import read_fused
 from mudg.data.edits import EditScript
 from mudg.data.exporters.video import write_mp4
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
+from mudg.models.mdm.files import digest
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import RenderConfig
 from mudg.stages.editing.apply import scene_seen_by
-from mudg.stages.editing.carried import FACT, carry_out, read_and_digest
+from mudg.stages.editing.carried import FACT, EditedDrive, carry_out, read_and_digest
+from mudg.stages.editing.harmonised import EditedSources, Harmoniser, RepairedViews
 from mudg.stages.editing.weathered import Drawer, conditions_of, in_conditions
 from mudg.stages.fit import load_model, render_view
 from mudg.stages.fitting.rendering import raster_of
@@ -46,8 +49,9 @@ _OUTPUT = VerbOutput("render", 1, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
 def run(
-    config: RenderConfig, scene: Path, model: Path, out: Path, *, edits: Path | None = None, overwrite: bool = False
-) -> Path:
+    config: RenderConfig, scene: Path, model: Path, out: Path, *,
+    edits: Path | None = None, fused: Path | None = None, overwrite: bool = False,
+) -> Path:  # fmt: skip
     """Render every camera and shift of the configuration.
 
     Args:
@@ -55,6 +59,7 @@ def run(
         model: folder made by fit.
         out: one observation folder (and video) per trajectory.
         edits: an edit script to carry out before.
+        fused: fused clouds of the scene, for ``config.harmonize``.
 
     Returns:
         ``out``, finished; an interrupted run continues with the next missing view.
@@ -64,21 +69,26 @@ def run(
     if edits is not None:
         script, inputs["edits"] = read_and_digest(Path(edits))
         named = {f"{edits}: {name}": path for name, path in script.files().items()}
-    refuse_overlap(out, {"scene": scene, "model": model, "edits": edits, **named})
-    radiance = kind_of(Path(model)) == RADIANCE
+    refuse_overlap(out, {"scene": scene, "model": model, "edits": edits, "fused": fused, **named})
+    if config.harmonize.on:
+        inputs |= _harmonised_inputs(config, edits, fused)
+    radiance, repaired = kind_of(Path(model)) == RADIANCE, None
     if radiance and (config.remove_tracks or script is not None):
         raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),
             remedy="leave --remove-tracks and --edits out")  # fmt: skip
     device = choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
-    edited = None if script is None else _edited(scene, model, script)  # what cannot be done is told before anything is written
+    asked = fused if config.harmonize.on else None
+    edited = None if script is None else _edited(scene, model, script, asked)  # what cannot be done is told before anything is written
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     if radiance:
         loaded, (draw, source) = read_scene(Path(scene)), _field_drawer(config, Path(model), device)
     else:
-        loaded, fitted = edited or _edited(scene, model, None)
+        loaded, fitted, drive = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
+        if config.harmonize.on and drive is not None:
+            draw = repaired = _repaired(config, (drive, fitted), (Path(scene), Path(model)), draw)
         conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
         draw = draw if conditions is None else in_conditions(draw, conditions, loaded)
     paths = trajectories(loaded, config)
@@ -86,6 +96,8 @@ def run(
     try:
         with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
             for path in paths:
+                if repaired is not None:
+                    repaired.follow(path)
                 _render_trajectory(draw, path, folder.path / path.name, source, bar)
                 if config.video:
                     _write_video(folder.path / path.name, folder.path / f"{path.name}.mp4", config.fps)
@@ -103,14 +115,44 @@ def _require_memory(paths: Sequence[Trajectory]) -> None:
     memory.require(pixels * VIEW_BYTES, asked, "smaller views (--width-px)")
 
 
-def _edited(scene: Path, model: Path, script: EditScript | None) -> tuple[Scene, SceneModel]:
-    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script."""
+def _edited(
+    scene: Path, model: Path, script: EditScript | None, fused: Path | None = None
+) -> tuple[Scene, SceneModel, EditedDrive | None]:
+    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script; and what it did."""
     fitted = load_model(Path(model))
     loaded = scene_seen_by(read_scene(Path(scene)), fitted.facts)
     if script is None:
-        return loaded, fitted
-    drive = carry_out(script, fitted, loaded)
-    return drive.scene or loaded, drive.model(fitted)
+        return loaded, fitted, None
+    drive = carry_out(script, fitted, loaded, None if fused is None else read_fused(Path(fused)))
+    return drive.scene or loaded, drive.model(fitted), drive
+
+
+def _harmonised_inputs(config: RenderConfig, edits: Path | None, fused: Path | None) -> dict[str, str]:
+    """What else a harmonised render reads.
+
+    Raises:
+        UsageError: no edit script or no fused clouds.
+    """
+    if edits is None or fused is None:
+        raise UsageError("harmonising repairs what an edit script touched, from the fused clouds", where="--harmonize.on",
+            got=f"no --{'edits' if edits is None else 'fused'}", remedy="give --edits and --fused, or leave it out")  # fmt: skip
+    return {"fused": store.digest(Path(fused)), "diffusion": digest(config.harmonize.model)}
+
+
+def _repaired(
+    config: RenderConfig, edited: tuple[EditedDrive, SceneModel], given: tuple[Path, Path], draw: Drawer
+) -> RepairedViews:
+    """What draws views with the touched pixels repaired.
+
+    Args:
+        edited: what was done, and the edited fit. given: folders of scene and fit, as they are without the edits.
+    """
+    (drive, fitted), (scene, model) = edited, given
+    before = load_model(model)
+    recorded, (usual, _) = scene_seen_by(read_scene(scene), before.facts), _scene_drawer(config, before.to(fitted.device))
+    camera = trajectories(recorded, config)[0].views[0].camera
+    harmoniser = Harmoniser(EditedSources.of(drive, fitted, recorded), config.harmonize, (camera.width, camera.height), config.device)
+    return RepairedViews(harmoniser, lambda view: (usual(view), draw(view)))
 
 
 def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:

@@ -15,13 +15,14 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -30,7 +31,7 @@ from mudg.base.config import result_settings
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
-from mudg.base.types import Condition, FusedCloud, Observation, Photo, Scene, Trajectory, View
+from mudg.base.types import Condition, Frame, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
@@ -38,14 +39,17 @@ from mudg.data.clips.ablated import ConditionParts, ConditionSources, conditions
 from mudg.data.clips.condition import ConditionRules, WarpSource
 from mudg.data.clips.near_points import NearSweeps
 from mudg.data.cloudfile import read_fused
+from mudg.data.edits import EditScript
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
-from mudg.data.scene import read_image, read_scene, read_trusted_classes
-from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
+from mudg.data.scene import read_image, read_label, read_scene, read_trusted_classes
+from mudg.models.diffusion import GeneratedClip, SampleRequest, StartClip, generated, generated_and_finished
 from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of
 from mudg.models.mdm.model import MDM
 from mudg.stages import fuse
 from mudg.stages.config import FuseConfig, SynthesizeConfig
+from mudg.stages.editing.carried import read_and_digest
+from mudg.stages.editing.vacated import DriveOfEdits, drive_of_edits, photos_of_edited, vacated_at
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.learning import loading
@@ -56,14 +60,17 @@ COLOR_ALONE = {FREEVS: FREEVS, "repair": "difix"}
 SKY = palette.ID["sky"]
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
+EDITED_IMAGES_PER_VIEW = 24
+"""Recorded images tried per view of an edited drive: what an object hid at one moment others show."""
 COMPUTE = ("offload", "compiled")
 """Settings that say how is computed, not what: a result may be resumed and reused under others."""
 _OUTPUT = VerbOutput("synthesize", 1, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
 
 
 def run(
-    config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *, fitted: Path | None = None, overwrite: bool = False
-) -> Path:
+    config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *,
+    fitted: Path | None = None, edits: Path | None = None, overwrite: bool = False,
+) -> Path:  # fmt: skip
     """Generate all trajectories of the configuration; returns `out`, one folder of observations per trajectory inside.
 
     Args:
@@ -71,17 +78,23 @@ def run(
         scene: scene directory or stored zip. fused: output of fuse for this scene.
         out: a finished result of the same configuration and inputs is verified and reused.
         fitted: output of fit for this scene, whose renders become part of the condition. For models that were trained with renders.
+        edits: an edit script; views are made of the drive as it says.
 
     Raises:
         UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
     """
-    refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "model": folder_of(config.model)})
+    script, named, asked = None, {}, {}
+    if edits is not None:
+        script, asked["edits"] = read_and_digest(Path(edits))
+        named = {f"{edits}: {name}": path for name, path in script.files().items()}
+    refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "edits": edits, "model": folder_of(config.model), **named})
     config = loading.check_config(config, fitted is not None)
-    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": digest(config.model)}
+    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": digest(config.model), **asked}
     loaded = read_scene(scene)
     if fitted is not None:
         inputs["fitted"] = store.digest(fitted)
         model_of_scene(fitted, loaded)
+    loaded = loaded if script is None else _edited(config, script, (loaded, fused, fitted)).scene
     settings = {name: value for name, value in result_settings(config).items() if name not in COMPUTE}
     directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if directory.complete:
@@ -101,12 +114,22 @@ def run(
     usual = os.cpu_count() if config.device == "cpu" else 1
     processes = config.processes or usual or 1
     model = loading.load_any(config) if processes == 1 else None  # several processes load one each
-    jobs = [(config, Path(scene), Path(fused), directory.path, path, fitted, model) for path in paths]
+    inputs_of = JobInputs(Path(scene), Path(fused), fitted, script)
+    jobs = [(config, inputs_of, directory.path, path, model) for path in paths]
     frames = _run_jobs(jobs, names, processes)
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
     return directory.path
+
+
+def _edited(config: SynthesizeConfig, script: EditScript, given: tuple[Scene, Path, Path | None]) -> DriveOfEdits:
+    """The drive that a script makes of scene, clouds and fit; what cannot be done is told here, before anything is written."""
+    scene, fused, fitted = given
+    if config.condition == FREEVS:
+        raise UsageError("this condition is made of recorded sweeps, which show no edits", where="--condition", got=FREEVS,
+            remedy="edit a whole run with `mudg edit` and give its scene")  # fmt: skip
+    return drive_of_edits(script, scene, read_fused(fused), None if fitted is None else load_model(fitted), told=True)
 
 
 def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:
@@ -145,7 +168,12 @@ def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
     frames = scene.frames if config.held_out_images else scene.frames_in("train")
     classes = lambda frame: read_trusted_classes(scene, frame, config.label_confidence) if config.given_classes else None  # noqa: E731
-    return [Photo(frame.view, read_image(scene, frame), classes(frame)) for frame in frames]
+    return [Photo(frame.view, read_image(scene, frame), classes(frame), recorded_pixels(scene, frame)) for frame in frames]
+
+
+def recorded_pixels(scene: Scene, frame: Frame) -> NDArray[np.bool_] | None:
+    """Which pixels bool[H, W] of a frame a camera recorded; None = all. Frames of an edited drive say which are rendered."""
+    return ~read_label(scene, frame, "rendered") if "rendered" in frame.labels else None
 
 
 def near_sweeps(scene: Scene, cloud: FusedCloud, path: Trajectory) -> NearSweeps:
@@ -165,27 +193,26 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
     return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()}, cloud.colors)
 
 
+@dataclass(frozen=True, slots=True)
+class JobInputs:
+    """What every trajectory is made from: folders of the scene, its fused clouds and its fit, and the edit script."""
+
+    scene: Path
+    fused: Path
+    fitted: Path | None = None
+    script: EditScript | None = None
+
+
 def make_trajectory(
-    config: SynthesizeConfig, scene_path: Path, fused: Path, out: Path, path: Trajectory, fitted: Path | None,
-    model: loading.DiffusionModel | None = None,
-) -> int:  # fmt: skip
+    config: SynthesizeConfig, given: JobInputs, out: Path, path: Trajectory, model: loading.DiffusionModel | None = None
+) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`: that of the
     configuration, if it is in memory already."""
     folder = out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
-    scene, cloud = read_scene(scene_path), read_fused(fused)
-    cloud = cloud if config.given_classes else without_classes(cloud)
     model = model or loading.load_any(config)
-    camera = path.views[0].camera
-    width, height = model.image_size(camera.width, camera.height, config.width_px)
-    model.check_clip(min(len(path), model.config.window), height, width)
-    fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
-    rules = ConditionRules(width, height, *fine, published=model.points_alone)
-    recorded = recorded_images(scene, config)
-    render_at = None if fitted is None else functools.partial(render_planes, load_model(fitted))
-    near = near_sweeps(scene, cloud, path) if config.condition == FREEVS else None
-    maker = ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at, near), config)
+    maker = _view_maker(config, given, path, model)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -224,6 +251,27 @@ def make_trajectory(
     return len(path)
 
 
+def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel) -> ViewMaker:
+    """What makes the views of one trajectory."""
+    scene, cloud = read_scene(given.scene), read_fused(given.fused)
+    fit = None if given.fitted is None else load_model(given.fitted)
+    recorded, vacated = recorded_images(scene, config), None
+    if given.script is not None:
+        drive = drive_of_edits(given.script, scene, cloud, fit)
+        scene, cloud, fit, recorded = drive.scene, drive.cloud, drive.model, photos_of_edited(recorded, drive.plan)
+        vacated = vacated_at(drive.plan)
+    cloud = cloud if config.given_classes else without_classes(cloud)
+    camera = path.views[0].camera
+    width, height = model.image_size(camera.width, camera.height, config.width_px)
+    model.check_clip(min(len(path), model.config.window), height, width)
+    fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
+    rules = ConditionRules(width, height, *fine, published=model.points_alone)
+    rules = rules if given.script is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
+    render_at = None if fit is None else functools.partial(render_planes, fit)
+    near = near_sweeps(scene, cloud, path) if config.condition == FREEVS else None
+    return ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at, near, vacated), config)
+
+
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     """Number of finished windows and the latents of the last one."""
     files = sorted(state.glob("[0-9]*.safetensors"))
@@ -232,16 +280,27 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
 
 
-class ViewMaker:
-    """Conditions, samples and observations of one scene at one size."""
+StartAt = Callable[[Sequence[View]], StartClip]
+"""What a clip of some views, of the size that the model works at, is to stay like."""
 
-    def __init__(self, model: loading.DiffusionModel, given: ConditionSources, config: SynthesizeConfig) -> None:
+
+class ViewMaker:
+    """Conditions, samples and observations of one scene at one size.
+
+    Args:
+        start_at: what clips begin from, and how far they may leave it (``StartClip``).
+    """
+
+    def __init__(
+        self, model: loading.DiffusionModel, given: ConditionSources, config: SynthesizeConfig, start_at: StartAt | None = None
+    ) -> None:
         if not given.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._given, self._full_size = model, given, config.full_size
         self._parts: ConditionParts = config.condition
         self._sources: dict[int, WarpSource] = {}
         self._request = loading.request_of(config, loading.half_of(config) == torch.bfloat16)
+        self._start_at = start_at
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
@@ -252,7 +311,9 @@ class ViewMaker:
     ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
         condition, fine = conditions_of(self._given, self._parts, views, self._sources)
-        sample, made, made_views = self._generated(condition, fine, views, replace(self._request, index=number, known=known))
+        start = None if self._start_at is None else self._start_at(condition.views)
+        request = replace(self._request, index=number, known=known, start=start)
+        sample, made, made_views = self._generated(condition, fine, views, request)
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
         if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
             usable[0] = False

@@ -39,6 +39,12 @@ def write_city(config: CityConfig, out_dir: Path | str, *, test_every: int = 4) 
         raise UsageError("test_every cannot be negative", got=str(test_every))
     world = CityWorld(config)
     log.info(f"city {config.seed}: {world.describe()}")
+    return write_world(world, out_dir, test_every)
+
+
+def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> Scene:
+    """As ``write_city``, of a world that is there, such as one with objects elsewhere (``CityWorld.rearranged``)."""
+    config = world.config
     moving = np.array([0, *(int(posed.moving) for posed in world.objects)], bool)
     split: dict[str, str] = {}
     with SceneWriter(out_dir, f"city-{config.seed}", world.source()) as writer:

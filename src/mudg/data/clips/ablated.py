@@ -17,6 +17,7 @@ from mudg.base.errors import UsageError
 from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.near_points import NearSweeps, near_condition
+from mudg.data.clips.vacated import VacatedAt
 
 ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
@@ -31,7 +32,7 @@ COVERED = 0.5
 @dataclass(frozen=True, slots=True)
 class ConditionSources:
     """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the log's
-    sweeps, where they are needed."""
+    sweeps, where they are needed; of an edited drive also where something stood that is not there any more."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
@@ -39,6 +40,7 @@ class ConditionSources:
     rules: ConditionRules
     render_at: RenderAt | None = None
     near: NearSweeps | None = None
+    vacated_at: VacatedAt | None = None
 
 
 def conditions_of(
@@ -57,7 +59,7 @@ def conditions_of(
         condition = near_condition(sources.near, views, rules)
         return condition, condition
     if parts == "full":
-        return build_conditions(cloud, tracks, views, recorded, rules, kept, sources.render_at)
+        return build_conditions(cloud, tracks, views, recorded, rules, kept, sources.render_at, sources.vacated_at)
     if parts == "repair":
         return _of_renders(sources, views, kept)
     points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)

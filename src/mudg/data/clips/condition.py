@@ -39,6 +39,7 @@ from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import seen_pixels
+from mudg.data.clips.vacated import Vacated, VacatedAt, continued, ground_behind, uncertain_there
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +114,8 @@ class DrawnCloud:
     tracks: Sequence[Track]
     rules: ConditionRules
     render_at: RenderAt | None
+    vacated_at: VacatedAt | None = None
+    """Where something stood that an edit took away."""
 
     def look(self, view: View, far_ids: Tensor) -> Surfaces:
         """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured pixel.
@@ -124,8 +127,10 @@ class DrawnCloud:
         sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
         nearest = _nearest_measured(sparse)
         color, depth, moving, ids = _filled(sparse, nearest, self.rules)
+        vacated = None if self.vacated_at is None else self.vacated_at(view)
         if self.render_at is None:
-            return Surfaces(sparse.valid, color, depth, moving, ids, None)
+            depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
+            return Surfaces(sparse.valid, color, depth, moving, ids, None, vacated)
         render = self.render_at(view)
         near = torch.from_numpy(ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1)))
         solid = render.alpha[0] >= self.rules.solid_alpha
@@ -135,15 +140,17 @@ class DrawnCloud:
         render = replace(render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics))
         shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(max=self.rules.far_m)
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
+        depth = pick(depth, shown)
+        depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
         return Surfaces(
-            sparse.valid, pick(color, render.color), pick(depth, shown), moving & near, pick(ids, render.semantics[0]), render
+            sparse.valid, pick(color, render.color), depth, moving & near, pick(ids, render.semantics[0]), render, vacated
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surfaces:
     """What is known of a view before images are warped in: measured bool[H,W]; color f32[3,H,W], depth f32[H,W] m, moving bool[H,W]
-    and ids u8[H,W] of every pixel; the render, if there is one."""
+    and ids u8[H,W] of every pixel; the render, if there is one; and where something stood that an edit took away."""
 
     measured: Tensor
     color: Tensor
@@ -151,6 +158,23 @@ class Surfaces:
     moving: Tensor
     ids: Tensor
     render: RenderPlanes | None
+    vacated: Vacated | None = None
+
+    def with_hole(self, color: Tensor, ids: Tensor, found: Tensor) -> tuple[Surfaces, Tensor, Tensor, Tensor]:
+        """These surfaces, colours, classes and `found` bool[H,W] of a view after images were warped in to these pixels: what was vacated
+        and not found continues what is around it, and does not count as measured; where objects are new the render is all that there is,
+        and counts like a photograph."""
+        if self.vacated is None:
+            return self, color, ids, found
+        if self.render is not None:
+            shown = self.vacated.shown & (self.render.alpha[0] > 0.5)
+            color, ids = torch.where(shown, self.render.color, color), torch.where(shown, self.render.semantics[0], ids)
+            found = found | shown
+        ground = self.measured & torch.isin(self.ids, GROUND_IDS) & torch.isfinite(self.vacated.ground)
+        hole = self.vacated.mask & ~found & ~ground  # what stood there may have coloured other points
+        color, ids = continued(color, ids, self.vacated, hole)
+        render = None if self.render is None else uncertain_there(self.render, self.vacated, hole, color)
+        return replace(self, measured=self.measured & ~hole, render=render), color, ids, found
 
 
 def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -218,11 +242,13 @@ def warp(
     """Colours and classes that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
 
     `surface` f32[h,w]: depth of the nearest surface at the pixels of the recorded image.
-    Returns rgb f32[3,H,W] (bilinear), semantics u8[H,W] (nearest) and found bool[H,W]: inside the image and not hidden in it.
+    Returns rgb f32[3,H,W] (bilinear), semantics u8[H,W] (nearest) and found bool[H,W]: inside the image, usable and not hidden in it.
     """
     x, y, z = carry(view, depth[None], source.view)
     in_front = look_up(surface[None], x, y, "nearest")[0, 0]
     found = inside(source.view, x, y, z)[0] & (in_front >= z[0] * (1 - hidden_share) - 0.3)
+    if source.usable is not None:
+        found &= look_up_ids(source.usable, x, y)[0]
     return look_up(source.rgb, x, y)[0], look_up_ids(source.semantics, x, y)[0], found
 
 
@@ -230,13 +256,14 @@ def warp(
 class WarpSource:
     """A recorded image made ready for warping: rgb f32[3,h,w] in common colours (of 0..1 or a little beyond), depth f32[h,w] m (filled),
     moving bool[h,w],
-    semantics u8[h,w] (255 = unknown)."""
+    semantics u8[h,w] (255 = unknown), usable bool[h,w] or None (all)."""
 
     view: View
     rgb: Tensor
     depth: Tensor
     moving: Tensor
     semantics: Tensor
+    usable: Tensor | None = None
 
 
 def build_conditions(
@@ -247,6 +274,7 @@ def build_conditions(
     rules: ConditionRules,
     sources: dict[int, WarpSource] | None = None,
     render_at: RenderAt | None = None,
+    vacated_at: VacatedAt | None = None,
 ) -> tuple[Condition, Condition]:
     """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
 
@@ -256,6 +284,7 @@ def build_conditions(
         sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views.
         render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was measured on
             (not with `published`). Recorded images that `sources` holds must have been prepared with the same renders.
+        vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
 
     Returns:
         Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
@@ -275,7 +304,7 @@ def build_conditions(
     sources = {} if sources is None else sources
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
-    points = DrawnCloud(cloud, tracks, rules, render_at)
+    points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
     parts, shown = zip(*(_condition_of_view(points, view, recorded, rules, sources) for view in fine_views))
     color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*parts))
     renders = None if render_at is None else _stacked_renders(shown)
@@ -294,8 +323,9 @@ def build_conditions(
         small_renders = RenderPlanes(
             reduced(renders.color), picked(renders.depth), reduced(renders.alpha), reduced(renders.certainty), picked(renders.semantics)
         )
-    small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders))
+    small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders), vacated_at)
     own = [small_points.look(view, there[0]) for view, there in zip(small, picked(far_ids))]
+    own = [o.with_hole(o.color, o.ids, there[0] > 0.5)[0] for o, there in zip(own, reduced(warped))]
     own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
     condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
                           reduced(backdrop), picked(ids), picked(far_ids), small_renders)  # fmt: skip
@@ -334,11 +364,15 @@ def _condition_of_view(
     shape = (view.camera.height, view.camera.width)
     if not (rules.warp and recorded):
         here = points.look(view, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
-        color, ids, found = here.color, here.ids[None], torch.zeros_like(here.measured)
+        found = torch.zeros_like(here.measured)
+        here, color, own_ids, found = here.with_hole(here.color, here.ids, found)
+        ids = own_ids[None]
         return (color, here.depth[None], here.measured[None], found[None], color, ids, ids), here.render
     nearest = source(min(range(len(recorded)), key=_rank_of_images(view, recorded, rules)))
     x, y, _ = carry(view, torch.full((1, *shape), rules.backdrop_m), nearest.view)
     backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
+    known = None if nearest.usable is None else look_up_ids(nearest.usable, x, y)
+    far_ids = far_ids if known is None else torch.where(known, far_ids, palette.UNLABELLED)
     here = points.look(view, far_ids[0])
     color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     shown = points.cloud.colors
@@ -353,6 +387,9 @@ def _condition_of_view(
         color = torch.where(new, rgb, color)
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
         found = found | new
+    here, color, ids, found = here.with_hole(color, ids, found)
+    if known is not None:  # what stood there is not part of the picture any more
+        backdrop, far_ids = torch.where(known, backdrop, color), torch.where(known, far_ids, ids[None])
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
 
 
@@ -403,10 +440,13 @@ def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> 
     if not own:
         return torch.zeros(3, rules.height, rules.width)
     nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
+    rgb = nearest.rgb
+    if nearest.usable is not None and not nearest.usable.all():
+        rgb = rgb[nearest_valid(nearest.usable)]
     if rules.published and rules.fine_width:
         size = (rules.height, rules.width)
-        return functional.interpolate(image_tensor(nearest.rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
-    return image_tensor(resize_area(nearest.rgb, rules.width, rules.height))
+        return functional.interpolate(image_tensor(rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
+    return image_tensor(resize_area(rgb, rules.width, rules.height))
 
 
 def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
@@ -455,7 +495,14 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     here = points.look(view, ids)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
     common = points.cloud.colors.image_to_common(camera.name, rgb)
-    return WarpSource(view, common, here.depth, here.moving, ids)
+    usable = None if recorded.usable is None else _coarser(recorded.usable, width, height)
+    return WarpSource(view, common, here.depth, here.moving, ids, usable)
+
+
+def _coarser(usable: NDArray[np.bool_], width: int, height: int) -> Tensor:
+    """Which pixels bool[height,width] of an image brought to this size show nothing but usable ones."""
+    spoilt = torch.from_numpy(~usable).float()[None, None]
+    return functional.adaptive_max_pool2d(spoilt, (height, width))[0, 0] == 0
 
 
 def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:

@@ -16,7 +16,7 @@ from mudg.base.types import Camera, Frame, Scene
 from mudg.data.scene.files import open_files
 from mudg.data.scene.schema import LABEL_NAMES, MAX_IMAGE_SIDE_PX
 
-_PNG_LABELS: Final = ("semantics", "sky", "ego", "dynamic")
+_PNG_LABELS: Final = ("semantics", "sky", "ego", "dynamic", "rendered")
 """Kept as PNG, the rest as safetensors; all but the first are masks."""
 _CLASS_IDS: Final = (*range(19), palette.UNLABELLED)
 
@@ -31,6 +31,7 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
                                       writes it dense: a value everywhere, the sky at 100 m
     semantics            u8[H, W]     Cityscapes train id 0..18, 255 = unlabelled
     sky, ego, dynamic    bool[H, W]   sky; own vehicle; dynamic object
+    rendered             bool[H, W]   not recorded: rendered or generated for an edited drive
     instance             i32[H, W]    id of an object, 0 = none
     *_confidence         f32[H, W]    0 (unknown) .. 1 (measured)
     ==================== ============ ==================================================================

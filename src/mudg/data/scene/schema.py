@@ -31,6 +31,7 @@ MAX_BOX_SIDE_M: Final = 200.0
 
 LABEL_NAMES: Final = (
     "depth", "semantics", "sky", "ego", "dynamic", "instance", "semantics_confidence", "depth_confidence",
+    "rendered",
 )  # fmt: skip
 """Labels a frame may carry; see ``read_label`` for the array each of them is."""
 

@@ -32,6 +32,7 @@ from mudg.core.noise import Schedule
 from mudg.models.diffusion import (
     GeneratedClip,
     SampleRequest,
+    StartClip,
     check_image_size,
     confidence_of,
     denoised,
@@ -504,17 +505,28 @@ class MDM(nn.Module):
         device, shared = encoded.planes.device, self.config.shared_noise
         draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)  # noqa: E731
         known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None].to(device)
+        begun = None if request.start is None else self._encode_start(request.start, device)
 
         def denoise(x: Tensor, t: int) -> Tensor:
             at = torch.full((lead[0],), t, device=device)
             stated, _ = self.predict(dict(zip(MODALITIES, x.split(sizes, 2))), encoded, at)
             out = torch.cat([stated[m].float() for m in MODALITIES], 2)
+            if begun is not None:  # a pixel moves once the noise has come down to its share
+                out = torch.where(begun[1] * len(self.schedule) >= t + 1, out, begun[0])
             return out if known is None else torch.cat([known, out[:, known.shape[1] :]], 1)
 
         with torch.autocast(device.type, torch.bfloat16, enabled=request.bf16):  # around all steps: the weights are converted once
             x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
         color = lambda z: z[:, :, : sizes[0]]  # noqa: E731
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
+
+    def _encode_start(self, start: StartClip, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Latents [1,T,C,h,w] of the clip that a sample begins from, and the freedom f32[1,T,1,h,w] of their cells."""
+        rgb, depth, ids = (x[None].to(device) for x in (start.rgb, start.depth, start.semantics))
+        shares = self.codec.shares_to_latent(_cell_shares(ids))
+        latents = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
+        freedom = functional.max_pool2d(start.freedom.to(device), self.codec.factor)[None]
+        return latents, freedom
 
 
 def _expected_error(log_error: Tensor) -> Tensor:

@@ -428,6 +428,8 @@ class PublishedMDM(nn.Module):
     def check_request(request: SampleRequest) -> None:
         """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
         request.sampler_settings()
+        if request.start is not None:
+            raise UsageError("only small models can begin from a given clip", where="start", remedy="choose another model")
         if "last" not in noise.SAMPLER_SETTINGS[request.sampler]:
             raise UsageError(
                 "the sampler does not suit a published-type model, which has a dynamic rescale and ends at the first noise level",

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.convert import ConvertConfig
     from mudg.stages.config.edit import EditConfig
     from mudg.stages.config.fit import FitConfig
+    from mudg.stages.config.harmonize import HarmonizeConfig
     from mudg.stages.config.learn import LearnConfig
     from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
     from mudg.stages.config.presets import DEMO_CITY, PRESETS, PresetName, chosen_preset, run_preset
@@ -27,6 +28,7 @@ _HOMES = {
     "ConvertConfig": "mudg.stages.config.convert",
     "EditConfig": "mudg.stages.config.edit",
     "FitConfig": "mudg.stages.config.fit",
+    "HarmonizeConfig": "mudg.stages.config.harmonize",
     "LearnConfig": "mudg.stages.config.learn",
     "AdaptConfig": "mudg.stages.config.adapt",
     "AnnotateConfig": "mudg.stages.config.prepare",
@@ -57,6 +59,7 @@ __all__ = [
     "EditConfig",
     "FitConfig",
     "FuseConfig",
+    "HarmonizeConfig",
     "IngestConfig",
     "LearnConfig",
     "PresetName",

@@ -37,6 +37,8 @@ class BenchConfig:
     1)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
+    harmonize: bool = False
+    """edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them."""
     threads: int = Field(default=1, ge=1)
     """mdm, poses, edit: number of torch threads."""
     seed: int = 0

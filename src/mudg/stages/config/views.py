@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
 from mudg.base.devices import DeviceName
+from mudg.stages.config.harmonize import HarmonizeConfig
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -36,6 +37,8 @@ class RenderConfig:
     """Also write one MP4 video per trajectory."""
     fps: float = Field(default=10.0, gt=0)
     """Frames per second of the videos."""
+    harmonize: HarmonizeConfig = Field(default_factory=HarmonizeConfig)
+    """With an edit script: let the diffusion model repair what the edits touch."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
     device: DeviceName = "auto"

@@ -6,6 +6,7 @@ the edited one. Where the vehicle drives another path or through another street 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +29,7 @@ from mudg.stages.fitting.rendering import raster_of, render_view
 NOTE: Final = "edited: parts of the images are renders of a fitted scene"
 KEPT_LABELS: Final = ("semantics", "depth", "sky", "dynamic")
 """Labels that a changed image keeps; others speak of the recording."""
+RENDERED: Final = "rendered"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,11 +45,13 @@ class EditedImages:
     after: SceneModel
     config: EditConfig
     whole: bool
+    repaired: Mapping[str, Iterator[Observation]] | None = None
+    """By camera: views of its frames in order, repaired by a diffusion model."""
 
     def of(self, recorded: NDArray[np.uint8], frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Observation]:
         """The image u8[H, W, 3] of a frame, which of its pixels [H, W] are rendered, and the render."""
         raster = raster_of(self.before, self.config.raster)
-        made = render_view(self.after, frame.view, raster)
+        made = render_view(self.after, frame.view, raster) if self.repaired is None else next(self.repaired[frame.view.camera.name])
         if self.whole:
             return to_bytes(made.rgb), np.ones(recorded.shape[:2], bool), made
         usual = render_view(self.before, frame.view, raster)
@@ -102,11 +106,12 @@ def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, r
 def _labels(scene: Scene, frame: Frame, changed: NDArray[np.bool_], made: Observation) -> dict[str, NDArray[Any]]:
     """Labels of a changed image: those of the render where it is rendered."""
     found = {name: read_label(scene, frame, name) for name in KEPT_LABELS if name in frame.labels}
+    ours = {RENDERED: changed | read_label(scene, frame, RENDERED) if RENDERED in frame.labels else changed}
     if made.semantics is None or made.depth is None:
-        return {}
+        return ours
     ids = made.semantics.numpy().astype(np.uint8)
     rendered = {
         "semantics": ids, "sky": ids == ID["sky"], "dynamic": np.isin(ids, DYNAMIC_IDS),
         "depth": np.nan_to_num(made.depth[0].numpy(), nan=np.inf),
     }  # fmt: skip
-    return {name: np.where(changed, rendered[name].astype(old.dtype), old) for name, old in found.items()}
+    return ours | {name: np.where(changed, rendered[name].astype(old.dtype), old) for name, old in found.items()}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -47,10 +48,7 @@ class StartFit:
             InputError: no finished fit of street_gaussians, or one of another scene or cloud.
         """
         folder = Path(folder)
-        try:
-            state = run_state(folder)
-        except UsageError:
-            state = {}
+        state = _state_of_edited(folder) or _state_of(folder)
         remedy = "give the folder of a finished `mudg fit --method street_gaussians` as --start-from"
         if state.get("verb") != "fit" or state.get("state") != "complete":
             got = f"{state['verb']}, {state['state']}" if state else "no run of mudg"
@@ -67,6 +65,25 @@ class StartFit:
             raise InputError("a fit can only go on with one on recorded views", where=f"{folder / 'model.json'}, facts.method",
                              expected=START_METHOD, got=str(method), remedy=remedy)  # fmt: skip
         return cls(folder, store.digest(folder))
+
+
+def _state_of(folder: Path) -> dict[str, Any]:
+    try:
+        return dict(run_state(folder))
+    except UsageError:
+        return {}
+
+
+def _state_of_edited(folder: Path) -> dict[str, Any]:
+    """The state of a fit that belongs to a finished edited run, RUN/fit/METHOD: its inputs are the run's own scene and clouds."""
+    run = folder.resolve().parent.parent
+    if folder.resolve().parent.name != "fit" or not (run / "scene").is_dir() or not (run / "fuse").is_dir():
+        return {}
+    state = _state_of(run)
+    if state.get("verb") != "edit":
+        return {}
+    inputs = {"scene": store.digest(run / "scene"), "fused": store.digest(run / "fuse")}
+    return {"verb": "fit", "state": state.get("state"), "inputs": inputs}
 
 
 WHAT = {"scene": "scene", "fused": "fused cloud"}

@@ -1,0 +1,39 @@
+"""Settings of harmonising: what a diffusion model may change in the views of an edited scene."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from mudg.base.config import STRICT
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class HarmonizeConfig:
+    """Where and how far a diffusion model changes the views of an edited scene."""
+
+    on: bool = False
+    """Let the diffusion model repair what an edit script changed. Needs the fused clouds."""
+    model: str = "embedded"
+    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn."""
+    steps: int = Field(default=2, ge=1, le=1000)
+    """Denoising steps."""
+    uncovered: float = Field(default=1.0, ge=0, le=1)
+    """How far the model may leave the render where something stood before, its shadow included: share of the noise schedule, 0 (it stays)
+    to 1."""
+    objects: float = Field(default=0.0, ge=0, le=1)
+    """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
+    changed_above: float = Field(default=4 / 255, ge=0, le=1)
+    """Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as they are."""
+    feather_px: int = Field(default=3, ge=0)
+    """Generated pixels fade into the render over this many pixels, inside of what the edit touches."""
+    images_per_view: int = Field(default=24, ge=1)
+    """Recorded images tried per view. Many: what an object hid at one moment others show."""
+    keep_classes: bool = True
+    """Keep the render where the model shows another object in place of a removed one, or none in place of one that is there."""
+    seed: int = 0
+    """Seed of the noise."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Number format of the diffusion model, as for synthesize."""

@@ -1,0 +1,265 @@
+"""Views of an edited scene in which a diffusion model repairs what the edits touched, and nothing else.
+
+1. Touched are the pixels whose renders with and without the edits differ, near the boxes of what was removed, moved or put in; and the
+   ground about them where recorded photographs of other moments show it brighter: a shadow that stayed.
+2. The model's condition is that of the edited drive (``stages/editing/vacated.py``): points of removed objects are gone, those of moved
+   ones moved; photographs do not count where such objects or their shadows were; the renders are those of the edited scene.
+3. The sample begins from the edited render. Untouched pixels stay at it at every step; touched ones are free from the noise level on that
+   belongs to their kind (``HarmonizeConfig.uncovered``, ``.objects``).
+4. Guard: where the model shows a road user in place of one that was removed, or none where one was put, the render stays.
+5. The generated pixels are pasted into the render with a soft edge that lies inside the touched pixels: every other pixel keeps its bits.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+from torch.nn import functional
+
+from mudg.base.errors import UsageError
+from mudg.base.palette import DYNAMIC_IDS
+from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
+from mudg.data.clips.ablated import ConditionSources
+from mudg.data.clips.condition import ConditionRules
+from mudg.data.clips.vacated import GROUND_IDS
+from mudg.models.diffusion import StartClip
+from mudg.models.mdm.codec import Modality
+from mudg.models.scene.model import SceneModel
+from mudg.stages.config import SynthesizeConfig
+from mudg.stages.config.harmonize import HarmonizeConfig
+from mudg.stages.editing.carried import EditedDrive
+from mudg.stages.editing.plan import EditPlan
+from mudg.stages.editing.vacated import (
+    boxes_mask,
+    cleared_cloud,
+    ground_mask,
+    others,
+    photos_of_edited,
+    touched_boxes,
+    vacated_at,
+)
+from mudg.stages.editing.written import EditedImages
+from mudg.stages.fitting.planes import FAR_M, render_planes
+from mudg.stages.fitting.rendering import raster_of, render_view
+from mudg.stages.learning import loading
+from mudg.stages.synthesize import ViewMaker, recorded_images, windows
+
+DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
+GROWN_PX: Final = 2
+"""Touched pixels are grown by this much: a render fades out beyond what differs clearly."""
+BRIGHTER: Final = 0.02
+"""Ground that other moments show brighter than the render by this, 0 to 1, lay in a shadow."""
+CONTACT_REACH: Final = 0.2
+"""The ground this far about a new place of an object, as a share of its height, is its contact shadow and no longer what was uncovered."""
+OVERLAP: Final = 2
+"""Frames that windows share."""
+
+
+DrawPair = Callable[[View], tuple[Observation, Observation]]
+"""Renders of a view without and with the edits."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touched:
+    """Pixels bool[H,W] of a view that edits touch, by kind: `objects` that were moved or put in, with their shadows; `uncovered`: what
+    such and removed objects stood before; `shaded`: ground where a recorded shadow may have stayed."""
+
+    objects: Tensor
+    uncovered: Tensor
+    shaded: Tensor
+
+    @property
+    def any(self) -> Tensor:
+        """All of them."""
+        return self.objects | self.uncovered | self.shaded
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EditedSources:
+    """What the diffusion model is told of an edited drive.
+
+    Args:
+        fitted: its fitted scene. cloud: edited clouds, without what was left behind (``cleared_cloud``).
+        tracks: edited boxes. photos: recorded images with the pixels marked that do not show the edited drive.
+    """
+
+    fitted: SceneModel
+    plan: EditPlan
+    cloud: FusedCloud
+    tracks: Sequence[Track]
+    photos: Sequence[Photo]
+
+    @classmethod
+    def of(cls, drive: EditedDrive, fitted: SceneModel, recorded: Scene) -> EditedSources:
+        """Of a script that was carried out on a scene with its clouds.
+
+        Args:
+            fitted: edited. recorded: the scene as it was.
+        """
+        if drive.scene is None or drive.cloud is None:
+            raise UsageError("the diffusion model needs the fused clouds of the drive", remedy="give --fused, as `mudg fuse` wrote it")
+        plan, edited, cloud = drive.plan, drive.scene, drive.cloud
+        photos = photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
+        return cls(fitted, plan, cleared_cloud(cloud, plan), edited.tracks, photos)
+
+
+def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Observation], changed_above: float) -> Touched:
+    """What edits touch in a view.
+
+    Args:
+        pictures: renders of the view without and with the edits.
+    """
+    usual, made = pictures
+    before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
+    differs = ((made.rgb - usual.rgb).abs().amax(0) > changed_above).numpy()
+    differs = np.asarray(ndimage.binary_dilation(differs, iterations=GROWN_PX), bool) if differs.any() else differs
+    old_ground, new_box, new_ground = ground_mask(view, before), boxes_mask(view, after), ground_mask(view, after)
+    near = new_box | ground_mask(view, after, CONTACT_REACH)
+    uncovered = differs & (boxes_mask(view, before) | old_ground) & ~near
+    objects = differs & (near | new_ground) & ~uncovered
+    ids = torch.full(made.rgb.shape[1:], 255) if made.semantics is None else made.semantics
+    shaded = old_ground & torch.isin(ids, GROUND_IDS.long()).numpy() & ~new_box & ~uncovered & ~objects
+    return Touched(*(torch.from_numpy(mask) for mask in (objects, uncovered, shaded)))
+
+
+def soft_edge(mask: NDArray[np.bool_], feather_px: int) -> Tensor:
+    """Weights f32[H,W]: 0 outside of a mask, growing to 1 over `feather_px` pixels inside."""
+    if not feather_px:
+        return torch.from_numpy(mask).float()
+    inner = ndimage.distance_transform_edt(mask)
+    return torch.from_numpy(np.clip(np.asarray(inner) / (feather_px + 1), 0, 1).astype(np.float32))
+
+
+def guarded(touched: Touched, render: Observation, made: Observation, other_boxes: NDArray[np.bool_]) -> Tensor:
+    """Pixels bool[H,W] of `touched` whose generated class agrees with the edits: no road user came back where one was removed (but for
+    those whose `other_boxes` bool[H,W] are there), and none vanished where the render has one."""
+    if render.semantics is None or made.semantics is None:
+        return touched.any
+    there, wanted = (torch.isin(seen.semantics, DYNAMIC.long()) for seen in (made, render))
+    back = (touched.uncovered | touched.shaded) & there & ~torch.from_numpy(other_boxes)
+    gone = touched.objects & wanted & ~there
+    return touched.any & ~back & ~gone
+
+
+def pasted(render: Observation, made: Observation, weight: Tensor) -> Observation:
+    """The render with generated colours of weight f32[H,W]; depth and classes are the generated ones where these weigh more than half.
+    Where the weight is 0 every value keeps its bits."""
+    inside, most = weight > 0, weight > 0.5
+    rgb = torch.where(inside, torch.lerp(render.rgb, made.rgb, weight), render.rgb)
+    chosen = lambda mine, theirs: mine if mine is None or theirs is None else torch.where(most, theirs.to(mine.dtype), mine)  # noqa: E731
+    return replace(
+        render, rgb=rgb.clamp(0, 1) if bool(inside.any()) else rgb, depth=chosen(render.depth, made.depth),
+        semantics=chosen(render.semantics, made.semantics), confidence=torch.where(most, made.confidence, render.confidence),
+    )  # fmt: skip
+
+
+class Harmoniser:
+    """Repairs the views of an edited scene, window after window along a path."""
+
+    def __init__(self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto") -> None:
+        """``size``: width and height of the views."""
+        settings = SynthesizeConfig(
+            model=config.model, steps=config.steps, precision=config.precision, seed=config.seed, device=device, processes=1
+        )  # fmt: skip
+        self._settings = loading.check_config(settings, fitted=True)
+        self._sources, self._config = sources, config
+        model = loading.load_any(self._settings)
+        self.window = model.config.window
+        width, height = model.image_size(*size, 0)
+        rules = ConditionRules(width, height, *size, images_per_view=config.images_per_view)
+        given = ConditionSources(
+            sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
+            vacated_at(sources.plan),
+        )  # fmt: skip
+        self._maker = ViewMaker(model, given, self._settings, self._start_at)
+        self._parts: list[tuple[Observation, Touched]] = []
+
+    def _start_at(self, views: Sequence[View]) -> StartClip:
+        """The renders of the window that is being made, at the size that the model works at."""
+        size = views[0].camera.height, views[0].camera.width
+        area = lambda x: functional.interpolate(x, size=size, mode="area")  # noqa: E731
+        picked = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
+        renders, touched = [part[0] for part in self._parts], [part[1] for part in self._parts]
+        unknown = torch.full_like(renders[0].rgb[0], 255)
+        depth = [torch.full_like(unknown, FAR_M)[None] if r.depth is None else r.depth.nan_to_num(FAR_M) for r in renders]
+        ids = [unknown if r.semantics is None else r.semantics.float() for r in renders]
+        freedom = [self._config.uncovered * (t.uncovered | t.shaded) + self._config.objects * t.objects for t in touched]
+        return StartClip(
+            area(torch.stack([r.rgb for r in renders])), picked(torch.stack(depth)),
+            picked(torch.stack(ids)[:, None]).to(torch.uint8),
+            functional.adaptive_max_pool2d(torch.stack(freedom)[:, None].float(), size),
+        )  # fmt: skip
+
+    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
+        """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits do not touch."""
+        done, tail = 0, dict[Modality, Tensor]()
+        parts: dict[int, tuple[Observation, Touched]] = {}
+        for number, span in enumerate(windows(len(views), self.window, min(OVERLAP, self.window - 1))):
+            parts = {i: parts[i] if i in parts else self._part(views[i], draw) for i in span}
+            if not any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values()):
+                yield from (parts[i][0] for i in span if i >= done)
+                done, tail = span.stop, {}
+                continue
+            self._parts = list(parts.values())
+            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
+            sample, _, generated = self._maker.make([views[i] for i in span], number, known)
+            yield from [self._repaired(*parts[i], generated[i - span.start]) for i in span if i >= done]
+            done, tail = span.stop, sample.latents
+
+    def _part(self, view: View, draw: DrawPair) -> tuple[Observation, Touched]:
+        usual, made = draw(view)
+        return made, touched_pixels(self._sources.plan, view, (usual, made), self._config.changed_above)
+
+    def _repaired(self, render: Observation, touched: Touched, made: Observation) -> Observation:
+        brighter = (made.rgb - render.rgb).mean(0).numpy()
+        lit = touched.shaded & torch.from_numpy(ndimage.uniform_filter(brighter, 5) > BRIGHTER)
+        objects = touched.objects & (self._config.objects > 0)
+        touched = replace(touched, shaded=lit & (self._config.uncovered > 0), objects=objects)
+        boxes = boxes_mask(render.view, others(self._sources.plan, render.view.time_s))
+        kept = guarded(touched, render, made, boxes) if self._config.keep_classes else touched.any
+        return pasted(render, made, soft_edge(kept.numpy(), self._config.feather_px))
+
+
+def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> EditedImages:
+    """The same with every image of an edited run repaired, camera by camera.
+
+    Args:
+        recorded: the scene as it was; the views are those of the edited one.
+    """
+    raster, edited = raster_of(images.before, images.config.raster), drive.scene or recorded
+    sources, config = EditedSources.of(drive, images.after, recorded), images.config.harmonize
+    draw = lambda view: (render_view(images.before, view, raster), render_view(images.after, view, raster))  # noqa: E731
+    views = {name: [f.view for f in edited.frames if f.view.camera.name == name] for name in edited.cameras}
+    made = {
+        name: Harmoniser(sources, config, (mine[0].camera.width, mine[0].camera.height), images.config.device).along(mine, draw)
+        for name, mine in views.items() if mine
+    }  # fmt: skip
+    return replace(images, repaired=made)
+
+
+class RepairedViews:
+    """Draws the views of paths repaired, one path at a time and in order; any other view as the renders show it."""
+
+    def __init__(self, harmoniser: Harmoniser, draw: DrawPair) -> None:
+        self._harmoniser, self._draw = harmoniser, draw
+        self._left: Iterator[tuple[View, Observation]] = iter(())
+        self._views: tuple[View, ...] = ()
+
+    def follow(self, path: Trajectory) -> None:
+        """Views of this path come next."""
+        self._views = path.views
+        self._left = zip(path.views, self._harmoniser.along(path.views, self._draw))
+
+    def __call__(self, view: View) -> Observation:
+        """The view; of a path that is followed, repaired."""
+        if not any(view is own for own in self._views):
+            return self._draw(view)[1]
+        return next(made for own, made in self._left if own is view)

@@ -1,0 +1,290 @@
+"""Edits that a diffusion model repairs: what its condition shows of an edited drive, what is pasted, what the guard keeps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_settings import fit_config
+from test_clips import RULES, image_of_wall, stripes, view_at, wall
+from toy_world import fused_cloud, write_scene
+
+from mudg.base import geometry, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.base.types import FusedCloud, Observation, Photo
+from mudg.bench import run as bench
+from mudg.core.edit import Motion
+from mudg.data.clips import vacated as clip_parts
+from mudg.data.clips.condition import build_conditions, image_tensor
+from mudg.data.cloudfile import write_fused
+from mudg.data.edits import parse_edits
+from mudg.data.observations import read_observations
+from mudg.data.scene import read_image, read_label, read_scene
+from mudg.models.diffusion import SampleRequest, StartClip
+from mudg.models.mdm import files
+from mudg.models.mdm.codec import CodecConfig
+from mudg.models.mdm.model import MDM, MDMConfig
+from mudg.models.published.model import PublishedMDM
+from mudg.stages import edit, fit, render, synthesize
+from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
+from mudg.stages.editing.harmonised import Touched, guarded, pasted, soft_edge
+from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
+from mudg.stages.editing.vacated import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
+
+CAR = (0.6, 1.0, 1.0)
+
+
+def drive(text: str) -> EditPlan:
+    """A small box 6 m ahead, at y = -2 at first and at y = 2 after a second; and a script on it."""
+    poses = np.stack([geometry.yaw_matrix(0.0, (6.0, y, 0.0)) for y in (-2.0, 2.0)])
+    world = EditWorld({"box": Actor("car", CAR, Motion.recorded([0.0, 1.0], poses))})
+    return plan_edits(parse_edits(text, "edits.yaml"), world, EditSources(lambda source: None, lambda name: None))
+
+
+def photo_with_box(time_s: float, y: float) -> Photo:
+    """The striped wall 12 m ahead with a black box before it."""
+    image = image_of_wall(view_at(), 12.0)
+    columns = 24 - 40 * (y + np.array([0.5, -0.5])) / 5.7
+    image[11:21, int(columns[0]) : int(columns[1]) + 1] = 0
+    return Photo(view_at(time_s=time_s), image)
+
+
+def observed(rgb: torch.Tensor, ids: torch.Tensor) -> Observation:
+    height, width = ids.shape
+    one = torch.ones(1, height, width)
+    return Observation(view_at(), rgb, torch.where(ids == ID["sky"], torch.nan, 9.0)[None], ids, one, one > 0, "virtual", "made")
+
+
+def test_the_condition_of_a_removed_object_is_that_of_a_log_that_never_had_it() -> None:
+    """Two photographs with the box at different places, and two without any: the same condition, to the bit."""
+    plan = drive("- remove: {ids: [box]}")
+    cloud, target = FusedCloud(wall(12.0, stripes), {}), view_at(y=0.3, time_s=0.0)
+    with_box = photos_of_edited([photo_with_box(0.0, -2.0), photo_with_box(1.0, 2.0)], plan)
+    assert all(p.usable is not None and bool(p.usable[p.rgb.max(-1) > 0].any()) for p in with_box)
+    assert not any(bool(p.usable[(p.rgb == 0).all(-1)].any()) for p in with_box)
+    empty = [Photo(p.view, image_of_wall(view_at(), 12.0)) for p in with_box]
+    given = build_conditions(cloud, [], [target], with_box, RULES, vacated_at=vacated_at(plan))[0]
+    never = build_conditions(cloud, [], [target], empty, RULES)[0]
+    for name in ("color", "depth", "valid", "warped", "semantics"):
+        assert torch.equal(getattr(given, name), getattr(never, name)), name
+    seen = build_conditions(cloud, [], [target], [replace(p, usable=None) for p in with_box], RULES)[0]
+    assert not torch.equal(seen.color, never.color)  # the box would be in the picture
+    assert float((given.backdrop - never.backdrop).abs().max()) < 0.2 < float((seen.backdrop - never.backdrop).abs().max())
+
+
+def test_what_nobody_saw_continues_its_surroundings_and_does_not_count_as_seen() -> None:
+    plan = drive("- remove: {ids: [box]}")
+    photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
+    made = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], [view_at()], photos, RULES, vacated_at=vacated_at(plan))[0]
+    hole = vacated_at(plan)(view_at()).mask
+    assert 0 < float(hole.float().mean()) < 0.4
+    assert not bool((made.warped[0, 0] | made.valid[0, 0])[hole].any())
+    truth = image_tensor(image_of_wall(view_at(), 12.0))
+    assert float((made.color[0] - truth).abs()[:, hole].max()) < 0.35  # smooth, not black
+    assert torch.allclose(made.color[0][:, ~hole], truth[:, ~hole], atol=1e-5)
+
+
+def test_the_published_reference_is_masked_too() -> None:
+    photos = photos_of_edited([photo_with_box(0.0, -2.0)], drive("- remove: {ids: [box]}"))
+    rules = replace(RULES, published=True)
+    made = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], [view_at()], photos, rules)[0]
+    assert float(made.reference.amax(0).min()) > 0.2
+    kept = torch.from_numpy(photos[0].usable)
+    assert torch.equal(made.reference[:, kept], image_tensor(photos[0].rgb)[:, kept])
+
+
+def test_photographs_count_where_an_object_is_on_its_recorded_place() -> None:
+    """A stop after 0.5 s changes nothing before; a moved object masks its new place as well."""
+    photos = [photo_with_box(0.0, -2.0), photo_with_box(1.0, 2.0)]
+    early, late = photos_of_edited(photos, drive("- stop: {id: box, at_s: 0.5, brake_m_s2: 12}"))
+    assert early.usable is None and late.usable is not None
+    moved = photos_of_edited(photos, drive("- move: {id: box, left_m: 3, ground: false}"))[0]
+    assert not moved.usable[16, 10 + 24] and not moved.usable[16, 17]
+
+
+def test_points_that_a_box_left_behind_are_cleared() -> None:
+    cloud = FusedCloud(wall(6.2, stripes, (-3, 3), (-0.4, 0.4)), {})
+    kept = cleared_cloud(cloud, drive("- remove: {ids: [box]}")).static.xyz
+    assert 0 < len(kept) < len(cloud.static.xyz)
+    assert not ((np.abs(kept[:, 1] - 2.0) < 0.8) & (kept[:, 2] > -0.3)).any()
+    assert len(cleared_cloud(cloud, drive("- move: {id: box, left_m: 1, ground: false}")).static) == len(kept)
+
+
+def test_ground_continues_ground_and_what_is_above_continues_what_is_above() -> None:
+    ids = torch.full((16, 16), ID["building"], dtype=torch.uint8)
+    ids[8:] = ID["road"]
+    color = torch.where((ids == ID["road"])[None], 0.2, 0.8).repeat(3, 1, 1)
+    hole = torch.zeros(16, 16, dtype=torch.bool)
+    hole[4:12, 5:11] = True
+    ground = torch.full((16, 16), torch.nan)
+    ground[8:] = 10.0
+    spoilt = torch.where(hole, torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)), color)
+    filled, classes = clip_parts.continued(spoilt, torch.where(hole, ID["car"], ids), clip_parts.Vacated(hole, ground, hole & False), hole)
+    assert torch.allclose(filled, color, atol=1e-5) and torch.equal(classes, ids)
+
+
+def test_pasting_changes_nothing_outside_of_the_mask() -> None:
+    generator = torch.Generator().manual_seed(1)
+    ids = torch.randint(0, 19, (32, 48), generator=generator)
+    one, two = (observed(torch.rand(3, 32, 48, generator=generator), ids.roll(n)) for n in (0, 1))
+    mask = np.zeros((32, 48), bool)
+    mask[8:20, 10:30] = True
+    weight = soft_edge(mask, 3)
+    assert not bool(weight[~torch.from_numpy(mask)].any()) and float(weight.max()) == 1.0
+    assert bool((weight[14, 10:14].diff() > 0).all()) and float(weight[14, 10]) == pytest.approx(0.25)
+    made = pasted(one, two, weight)
+    for name in ("rgb", "depth", "semantics", "confidence", "mask"):
+        mine, theirs = getattr(one, name), getattr(made, name)
+        assert torch.equal(mine[..., ~torch.from_numpy(mask)].nan_to_num(-1), theirs[..., ~torch.from_numpy(mask)].nan_to_num(-1)), name
+    assert torch.equal(made.rgb[:, 14, 20], two.rgb[:, 14, 20]) and torch.equal(made.semantics[14, 20], two.semantics[14, 20])
+    nothing = pasted(one, two, torch.zeros(32, 48))
+    assert torch.equal(nothing.rgb, one.rgb) and torch.equal(nothing.semantics, one.semantics)
+
+
+def test_a_removed_car_does_not_come_back_and_an_inserted_one_does_not_vanish() -> None:
+    road, car = torch.full((32, 48), ID["road"]), torch.full((32, 48), ID["car"])
+    left, right = torch.zeros(32, 48, dtype=torch.bool), torch.zeros(32, 48, dtype=torch.bool)
+    left[8:20, 4:20], right[8:20, 26:40] = True, True
+    touched, gray = Touched(right, left, torch.zeros_like(left)), torch.full((3, 32, 48), 0.5)
+    none = np.zeros((32, 48), bool)
+    wanted = observed(gray, torch.where(right, car, road))
+    assert torch.equal(guarded(touched, wanted, wanted, none), left | right)
+    assert torch.equal(guarded(touched, wanted, observed(gray, car), none), right)
+    assert torch.equal(guarded(touched, wanted, observed(gray, road), none), left)
+    behind = none.copy()
+    behind[8:20, 4:10] = True  # somebody else drives there
+    assert torch.equal(guarded(touched, wanted, observed(gray, car), behind), right | (left & torch.from_numpy(behind)))
+
+
+# -- through the commands ------------------------------------------------------------------------------------------------
+
+FRAMES = 4
+SMALL = MDMConfig(
+    widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=3, embed_width=16,
+    codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(16, 32), refine_blocks=(1, 1), area_px=48 * 32,
+    renders=True,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A folder like that of ``mudg run``, and a tiny diffusion model."""
+    root = tmp_path_factory.mktemp("run")
+    write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
+    write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
+    config = fit_config(method="street_gaussians", iterations=40, start__gaussians=900, densify__max_gaussians=1500)
+    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    torch.manual_seed(0)
+    files.save(MDM(SMALL), root / "model", "", {})
+    return root
+
+
+def script(folder: Path, text: str) -> Path:
+    store.write_text(folder / "edits.yaml", text)
+    return folder / "edits.yaml"
+
+
+def views_of(folder: Path, name: str = "front_recorded") -> list[Observation]:
+    seen = read_observations(folder / name)
+    return [seen[i] for i in range(len(seen))]
+
+
+def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
+    model = files.load(str(run / "model"))
+    views = [view_at(time_s=0.1 * n) for n in range(2)]
+    photos = [Photo(view, image_of_wall(view, 12.0)) for view in views]
+    condition = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], views, photos, RULES)[0]
+    freedom = torch.zeros(2, 1, 32, 48)
+    freedom[..., 8:24, 8:24] = 1.0
+    begun = StartClip(condition.color.flip(-1), condition.depth, torch.full((2, 1, 32, 48), ID["road"], dtype=torch.uint8), freedom)
+    free = model.sample(condition, SampleRequest(2))
+    same = model.sample(condition, SampleRequest(2, start=replace(begun, freedom=torch.ones_like(freedom))))
+    held = model.sample(condition, SampleRequest(2, start=begun))
+    assert torch.equal(free.rgb, same.rgb)  # wholly free: as without a start
+    code = model.codec.encode_rgb(begun.rgb[None])[0]
+    assert torch.equal(held.latents["rgb"][..., :, :3], code[..., :, :3])
+    assert not torch.equal(held.latents["rgb"][..., 6:10, 6:10], code[..., 6:10, 6:10])
+    with pytest.raises(UsageError, match="small models"):
+        PublishedMDM.check_request(SampleRequest(2, start=begun))
+
+
+def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
+    config = SynthesizeConfig(shifts_m=(0.0,), model=str(run / "model"), steps=1, full_size=False, processes=1, precision="float32")
+    edits, parts = script(tmp_path, "- remove: {ids: [car]}"), (run / "scene", run / "fuse")
+    plain = synthesize.run(config, *parts, tmp_path / "plain")
+    made = synthesize.run(config, *parts, tmp_path / "made", edits=edits)
+    fitted = synthesize.run(config, *parts, tmp_path / "fitted", edits=edits, fitted=run / "fit" / "street_gaussians")
+    pictures = [[v.rgb for v in views_of(folder)] for folder in (plain, made, fitted)]
+    assert not any(torch.equal(a, b) for a, b in zip(pictures[0], pictures[1], strict=True))
+    assert not any(torch.equal(a, b) for a, b in zip(pictures[1], pictures[2], strict=True))
+    with pytest.raises(InputError, match="no object of this id"):
+        synthesize.run(config, *parts, tmp_path / "bad", edits=script(tmp_path, "- remove: {ids: [cat]}"))
+    assert not (tmp_path / "bad").exists()
+
+
+def test_renders_are_repaired_where_the_edit_touches_them(run: Path, tmp_path: Path) -> None:
+    edits, fitted = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians"
+    config = RenderConfig(shifts_m=(0.0,), video=False)
+    repaired = replace(config, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2, keep_classes=False, feather_px=0))
+    with pytest.raises(UsageError, match="--fused"):
+        render.run(repaired, run / "scene", fitted, tmp_path / "none", edits=edits)
+    before, physical, made = (
+        views_of(render.run(settings, run / "scene", fitted, tmp_path / name, edits=file, fused=run / "fuse"))
+        for name, settings, file in (("before", config, None), ("physical", config, edits), ("made", repaired, edits))
+    )
+    assert len(made) == FRAMES
+    scene, changed = read_scene(run / "scene"), 0
+    for old, plain, new in zip(before, physical, made, strict=True):
+        differs = (new.rgb != plain.rgb).any(0)
+        changed += int(differs.sum())
+        boxes = [(scene.track("car").pose_at(old.view.time_s), scene.track("car").size_m)]
+        near = boxes_mask(old.view, boxes) | ground_mask(old.view, boxes)
+        assert not bool((differs & ~torch.from_numpy(near)).any())  # beside the car and its ground every bit stays
+        assert torch.equal(new.semantics[~near], plain.semantics[~near])
+    assert changed > 0
+
+
+@pytest.mark.slow
+def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Path) -> None:
+    """Its images say which pixels were not recorded; warps leave these out; a fit goes on with the run's own fit."""
+    harmonize = HarmonizeConfig(on=True, model=str(run / "model"), steps=1, keep_classes=False)
+    edits = script(tmp_path, "- remove: {ids: [car]}")
+    out = edit.run(EditConfig(harmonize=harmonize), run, edits, tmp_path / "edited")
+    plain = edit.run(EditConfig(), run, edits, tmp_path / "plain")
+    scene, other, old = read_scene(out / "scene"), read_scene(plain / "scene"), read_scene(run / "scene")
+    differ = 0
+    for frame, rendered, recorded in zip(scene.frames, other.frames, old.frames, strict=True):
+        mask, image = read_label(scene, frame, "rendered"), read_image(scene, frame)
+        assert 0 < mask.mean() < 0.9
+        assert np.array_equal(image[~mask], read_image(old, recorded)[~mask])
+        differ += int((image != read_image(other, rendered)).any(-1).sum())
+    assert differ > 0
+    photos = synthesize.recorded_images(scene, SynthesizeConfig(held_out_images=True))
+    assert all(np.array_equal(~p.usable, read_label(scene, f, "rendered")) for p, f in zip(photos, scene.frames, strict=True))
+    config = fit_config(method="street_gaussians", iterations=4, start__gaussians=900, densify__max_gaussians=1500)
+    again = fit.run(config, out / "scene", out / "fuse", tmp_path / "again", start=out / "fit" / "street_gaussians")
+    assert "car" not in fit.load_model(again).node_names()
+    with pytest.raises(InputError, match="another scene"):
+        fit.run(config, run / "scene", run / "fuse", tmp_path / "wrong", start=out / "fit" / "street_gaussians")
+    with pytest.raises(UsageError, match="no images"):
+        edit.run(EditConfig(harmonize=harmonize), run / "fit" / "street_gaussians", edits, tmp_path / "alone", scene=run / "scene")
+
+
+@pytest.mark.slow
+def test_the_benchmark_finds_repaired_edits_no_worse(tmp_path: Path) -> None:
+    """What the diffusion model repairs of a removed vehicle's background is nearer to the truth than the fit, and little else changes."""
+    config = BenchConfig(cities="development", count=1, pose_iterations=60, harmonize=True, device="cpu")
+    out = bench.run("edit", config, tmp_path / "out")
+    rows = {(row["edit"], row["way"]): row for row in store.read_json(out / "bench.json")["diffusion"]["rows"]}
+    for name in ("remove", "move 3 m ahead", "insert"):
+        plain, repaired = rows[name, "fit"], rows[name, "+ diffusion"]
+        assert repaired["inside"] > plain["inside"] - 0.3
+        assert repaired["outside"] < plain["outside"] + 0.01
+    assert rows["remove", "+ diffusion"]["uncovered"] > rows["remove", "fit"]["uncovered"]
+    assert rows["remove", "+ diffusion"]["perceptual"] < rows["remove", "fit"]["perceptual"]
+    assert rows["remove", "never there"]["uncovered"] > rows["remove", "+ refit"]["uncovered"]
+    assert "+ refit" in (out / "bench.md").read_text(encoding="utf-8")
