@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.bench import BenchConfig
     from mudg.stages.config.convert import ConvertConfig
     from mudg.stages.config.edit import EditConfig
+    from mudg.stages.config.export import ExportConfig, ImportConfig
     from mudg.stages.config.fit import FitConfig
     from mudg.stages.config.learn import LearnConfig
     from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
@@ -26,11 +27,13 @@ _HOMES = {
     "BenchConfig": "mudg.stages.config.bench",
     "ConvertConfig": "mudg.stages.config.convert",
     "EditConfig": "mudg.stages.config.edit",
+    "ExportConfig": "mudg.stages.config.export",
     "FitConfig": "mudg.stages.config.fit",
     "LearnConfig": "mudg.stages.config.learn",
     "AdaptConfig": "mudg.stages.config.adapt",
     "AnnotateConfig": "mudg.stages.config.prepare",
     "FuseConfig": "mudg.stages.config.prepare",
+    "ImportConfig": "mudg.stages.config.export",
     "IngestConfig": "mudg.stages.config.prepare",
     "DEMO_CITY": "mudg.stages.config.presets",
     "PRESETS": "mudg.stages.config.presets",
@@ -55,8 +58,10 @@ __all__ = [
     "BenchConfig",
     "ConvertConfig",
     "EditConfig",
+    "ExportConfig",
     "FitConfig",
     "FuseConfig",
+    "ImportConfig",
     "IngestConfig",
     "LearnConfig",
     "PresetName",
