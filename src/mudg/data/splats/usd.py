@@ -25,6 +25,8 @@ from mudg.data.splats.cloud import Floats, SplatCloud, SplatNode, SplatScene
 
 CODES_PER_S: Final = 1000
 SKY_FILE: Final = "sky.png"
+DOME: Final = "(0.5, 0.5, 0.5, 0.5)"
+"""A dome looks along its z axis at the middle of its picture, y up, x (left) at a quarter: turned to x, z and y of the world."""
 _MOST_PACKAGE: Final = (1 << 32) - 1
 
 
@@ -47,20 +49,21 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False) -
     for name, node in zip(names, nodes):
         lines += _indented(_node(name, node, scene.file_from_world if not static else np.eye(4)))
     if sky:
-        lines += ['    def DomeLight_1 "Sky"', "    {", f"        asset inputs:texture:file = @{SKY_FILE}@",
-                  '        token inputs:texture:format = "latlong"', '        uniform token poleAxis = "Z"', "    }"]  # fmt: skip
+        lines += ['    def DomeLight "Sky"', "    {", f"        asset inputs:texture:file = @{SKY_FILE}@",
+                  '        token inputs:texture:format = "latlong"', f"        quatf xformOp:orient = {DOME}",
+                  '        uniform token[] xformOpOrder = ["xformOp:orient"]', "    }"]  # fmt: skip
     return "\n".join([*lines, "}", ""]).encode()
 
 
 def to_package(scene: SplatScene, time_s: float | None = None) -> bytes:
-    """A scene as a USDZ package: the text, and the sky as a picture (zenith on top, longitude growing to the left).
+    """A scene as a USDZ package: the text, and the sky as a picture (zenith on top, as one looks at it).
 
     Raises:
         InputError: more than 4 GiB, which a package cannot hold.
     """
     files = {"scene.usda": to_text(scene, time_s, scene.sky is not None)}
     if scene.sky is not None:
-        files[SKY_FILE] = png(scene.sky)
+        files[SKY_FILE] = png(scene.sky[:, ::-1])
     size = sum(map(len, files.values()))
     if size > _MOST_PACKAGE - (1 << 20):
         raise InputError("the scene is too large for a USDZ package", expected="below 4 GiB", got=f"{size} bytes",
