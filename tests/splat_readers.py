@@ -194,7 +194,7 @@ def read_glb_mesh(document: dict[str, Any], content: bytes, mesh: int) -> list[S
 
 
 def parse_usda(text: str) -> dict[str, Any]:
-    """Prims as nested dictionaries: attribute -> value (numbers, tuples, texts, lists; ``{time: value}`` for samples), prim -> dictionary."""
+    """Prims as nested dictionaries: attribute -> value (``{time: value}`` for samples), prim -> dictionary."""
     lines = iter(text.splitlines())
     assert next(lines) == "#usda 1.0"
     root: dict[str, Any] = {"metadata": {}}

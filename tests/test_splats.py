@@ -163,11 +163,11 @@ def test_the_ply_keeps_the_order_that_readers_by_position_expect() -> None:
 
 
 def test_a_ply_with_other_columns_types_and_order_of_bytes_is_read() -> None:
-    rows = np.zeros(2, [("red", ">u1"), *((n, ">f8") for n in ("rot_3", "rot_2", "rot_1", "rot_0", "scale_0", "scale_1", "scale_2", "opacity",
-                                                               "f_dc_0", "f_dc_1", "f_dc_2", "z", "y", "x"))])  # fmt: skip
+    names = "rot_3 rot_2 rot_1 rot_0 scale_0 scale_1 scale_2 opacity f_dc_0 f_dc_1 f_dc_2 z y x".split()
+    rows = np.zeros(2, [("red", ">u1"), *((name, ">f8") for name in names)])
     rows["rot_0"], rows["x"], rows["z"] = 2, (1, 2), (3, 4)
     lines = ["ply", "format binary_big_endian 1.0", "comment made elsewhere", "element vertex 2", "property uchar red"]
-    lines += [f"property double {name}" for name in rows.dtype.names[1:]] + ["end_header"]
+    lines += [f"property double {name}" for name in names] + ["end_header"]
     cloud = ply.from_bytes(("\r\n".join(lines) + "\r\n").encode() + rows.tobytes(), "x")
     assert cloud.means.tolist() == [[1, 0, 3], [2, 0, 4]] and cloud.quats.tolist() == [[1, 0, 0, 0]] * 2
 

@@ -24,9 +24,11 @@ from mudg.base.versions import version
 from mudg.core.harmonics import C0
 from mudg.data.cloudfile import read_fused
 from mudg.data.exporters.colmap import colmap_files
+from mudg.data.exporters.mcap import LogMessages, McapBlocks
 from mudg.data.exporters.nerfstudio import nerfstudio_files
 from mudg.data.exporters.pictures import picture_names, pictures
-from mudg.data.scene import read_scene
+from mudg.data.scene import read_points, read_scene
+from mudg.data.scene.files import open_files
 from mudg.data.splats.cloud import SplatScene
 from mudg.data.splats.formats import FORMATS, WriteRequest, file_from_world, losses
 from mudg.models.scene.model import SceneModel
@@ -41,6 +43,7 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
     "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
 }  # fmt: skip
 """Formats of cameras: files beside the pictures."""
+MESSAGES: Final = "mcap"
 MOST_POINTS: Final = 500_000
 _FOLDER = VerbOutput("export", 1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/"))
 
@@ -73,16 +76,18 @@ def run(
     Raises:
         UsageError: an unknown format, or a setting that it does not have. InputError: nothing that can be exported.
     """
-    if name not in FORMATS and name not in CAMERAS:
-        known = ", ".join((*FORMATS, *CAMERAS))
+    if name not in FORMATS and name not in CAMERAS and name != MESSAGES:
+        known = ", ".join((*FORMATS, *CAMERAS, MESSAGES))
         raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
     cameras = name in CAMERAS
     refuse_overlap(out, {"run": source, "scene": scene, "edits": edits})
     _refuse_settings(config, name)
-    given = _opened(source, scene, edits, not cameras)
+    given = _opened(source, scene, edits, name in FORMATS)
     if cameras:
         return _cameras(config, name, given, out, overwrite)
     _refuse_name(out, name, overwrite)
+    if name == MESSAGES:
+        return _messages(given, Path(out))
     request = requested(config, name, given)
     content = FORMATS[name].write(request)
     _written(out, name, config, request, content, given.inputs)
@@ -99,14 +104,14 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
     if name == "bundle" and config.time_s is not None:
         raise UsageError("a bundle holds all moments", where="--time-s", remedy="leave it out, or export ply")
     set_here = [key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)]
-    refused = set_here if name in CAMERAS else [key for key in set_here if key == "spz_version" and name != "spz"]
+    refused = set_here if name not in FORMATS else [key for key in set_here if key == "spz_version" and name != "spz"]
     if refused:
         flag = refused[0].replace("_", "-")
         raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
 
 
 def _refuse_name(out: Path, name: str, overwrite: bool) -> None:
-    suffixes = FORMATS[name].suffixes
+    suffixes = (".mcap",) if name == MESSAGES else FORMATS[name].suffixes
     if not Path(out).name.lower().endswith(suffixes):
         expected = f"a name that ends in {' or '.join(suffixes)}"
         raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
@@ -192,12 +197,7 @@ def _count(scene: SplatScene) -> int:
 
 def _cameras(config: ExportConfig, name: str, given: Exported, out: Path, overwrite: bool) -> Path:
     """A folder of cameras, pictures and starting points."""
-    recorded = given.log
-    if recorded is None:
-        raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
-            remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
-    if given.model is not None and "edits" in given.inputs:
-        log.warn("export: an edit script changes cameras and their path here; the pictures stay as recorded")
+    recorded = _known(given)
     folder = RunDir.open(out, _FOLDER, {**result_settings(config), "format": name}, given.inputs, overwrite)
     if folder.complete:
         return folder.reused()
@@ -215,6 +215,28 @@ def _cameras(config: ExportConfig, name: str, given: Exported, out: Path, overwr
         store.atomic_write(folder.path / place, content)
     folder.finish({"format": name, "images": len(names)})
     return folder.path
+
+
+def _messages(given: Exported, out: Path) -> Path:
+    """The log as messages over time."""
+    recorded = _known(given)
+    files = open_files(recorded.root)
+    messages = LogMessages(
+        recorded, lambda frame: files.read(frame.image.path), lambda sweep: read_points(recorded, sweep), _points(given)
+    )
+    store.write_blocks(out, McapBlocks(messages, f"mudg {version()}"))
+    log.info(f"export: {len(recorded.frames)} pictures, {len(recorded.sweeps)} sweeps, {out.stat().st_size / 1e6:.2f} MB in {out}")
+    return out
+
+
+def _known(given: Exported) -> Scene:
+    """The recorded scene; InputError if none is known."""
+    if given.log is None:
+        raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
+            remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
+    if given.model is not None and "edits" in given.inputs:
+        log.warn("export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded")
+    return given.log
 
 
 def _points(given: Exported) -> PointCloud | None:
