@@ -178,7 +178,7 @@ def _centroid_picture(index: NDArray[np.intp]) -> Picture:
 
 def _webp(picture: Picture) -> bytes:
     target = io.BytesIO()
-    Image.fromarray(picture, "RGBA").save(target, "WEBP", lossless=True, exact=True, quality=100, method=4)
+    Image.fromarray(picture, "RGBA").save(target, "WEBP", lossless=True, exact=True, quality=50, method=2)
     return target.getvalue()
 
 
