@@ -46,6 +46,16 @@ class WriteRequest:
         """All Gaussians at the moment."""
         return self.scene.at(0.0 if self.time_s is None else self.time_s)
 
+    @property
+    def drawing(self) -> Mapping[str, object]:
+        """How the fit draws Gaussians, where that is not the usual way."""
+        return self.scene.facts.get("drawing", {})
+
+    @property
+    def antialias(self) -> bool:
+        """Whether the fit draws antialiased."""
+        return bool(self.drawing.get("antialias", False))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatFormat:
@@ -54,7 +64,7 @@ class SplatFormat:
     Args:
         suffixes: of its files, the usual one first. axes: of ``_SIDES``, what its readers expect. write: bytes of a request, or None:
             written elsewhere. read: Gaussians of bytes, or None: not read.
-        carries: of ``motion``, ``deformation``, ``classes``, ``sky``, ``harmonics``.
+        carries: of ``motion``, ``deformation``, ``classes``, ``sky``, ``harmonics``, ``antialias``.
     """
 
     suffixes: tuple[str, ...]
@@ -69,7 +79,8 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
                        frozenset({"harmonics", "classes"})),
     "bundle": SplatFormat((".zip",), "z up", lambda r: bundle.to_bytes(r.scene, r.log), None,
                           frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
-    "spz": SplatFormat((".spz",), "right, up, back", lambda r: spz.to_bytes(r.cloud, r.spz_version), spz.from_bytes),
+    "spz": SplatFormat((".spz",), "right, up, back", lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
+                       spz.from_bytes, frozenset({"harmonics", "antialias"})),
     "glb": SplatFormat((".glb",), "y up", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf_read.from_bytes,
                        frozenset({"harmonics", "motion"})),
     "usda": SplatFormat((".usda", ".usd"), "z up", lambda r: usd.to_text(r.scene, r.time_s), None,
@@ -78,7 +89,8 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
                         frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
     "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "right, down, forward", lambda r: compressed_ply.to_bytes(r.cloud),
                                   compressed_ply.from_bytes),
-    "sog": SplatFormat((".sog",), "right, down, forward", lambda r: sog.to_bytes(r.cloud), sog.from_bytes),
+    "sog": SplatFormat((".sog",), "right, down, forward", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes,
+                       frozenset({"harmonics", "antialias"})),
     "splat": SplatFormat((".splat",), "right, down, forward", lambda r: splat.to_bytes(r.cloud), splat.from_bytes, frozenset()),
 }  # fmt: skip
 
@@ -145,6 +157,8 @@ def losses(name: str, request: WriteRequest) -> list[str]:
         found.append("the sky (--sky sphere adds it as Gaussians)")
     if "harmonics" not in carries and scene.degree > 0:
         found.append("colours that depend on the direction of view")
+    if kept := {key: value for key, value in request.drawing.items() if key not in carries}:
+        found.append("how the fit draws Gaussians (" + ", ".join(f"{key} {value}" for key, value in kept.items()) + ")")
     return found
 
 

@@ -87,8 +87,8 @@ class SogMeta(StrictRecord):
 # -- writing -------------------------------------------------------------------------------------------------------------
 
 
-def to_bytes(cloud: SplatCloud) -> bytes:
-    """A cloud as a SOG file; rows are brought into Morton order."""
+def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
+    """A cloud as a SOG file, rows in Morton order; ``antialias``: it was fitted with an antialiased rasteriser."""
     cloud = cloud.take(binary.morton_order(cloud.means))
     means = np.sign(cloud.means) * np.log1p(np.abs(cloud.means.astype(np.float64)))
     low, high = means.min(0), means.max(0)
@@ -110,6 +110,8 @@ def to_bytes(cloud: SplatCloud) -> bytes:
         "scales": {"codebook": sizes.tolist(), "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
     }  # fmt: skip
+    if antialias:
+        meta["antialias"] = True
     pictures = {name: _webp(_laid_out(rgba.astype(np.uint8))) for name, rgba in files.items()}
     if cloud.degree:
         palette, labels = _palette(cloud.sh[:, 1:].reshape(len(cloud), -1))

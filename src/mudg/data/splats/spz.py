@@ -38,8 +38,8 @@ def fractional_bits(means: Floats) -> int:
     return bits
 
 
-def to_bytes(cloud: SplatCloud, version: int = 3) -> bytes:
-    """A cloud as an SPZ file of version 3, or 4.
+def to_bytes(cloud: SplatCloud, version: int = 3, antialias: bool = False) -> bytes:
+    """A cloud as an SPZ file of version 3, or 4; ``antialias``: it was fitted with an antialiased rasteriser.
 
     Raises:
         InputError: a place too far from the origin. ResourceError: version 4 without the package zstandard.
@@ -49,12 +49,12 @@ def to_bytes(cloud: SplatCloud, version: int = 3) -> bytes:
         raise InputError("a Gaussian lies too far from the origin for SPZ", expected="at most 8388 km")
     planes = _planes(cloud, bits)
     if version == 3:
-        head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, 0, 0)
+        head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, int(antialias), 0)
         return binary.gzip_bytes(head + b"".join(planes))
     packer = _zstandard("written").ZstdCompressor(level=12, write_content_size=True)
     planes = [plane for plane in planes if plane]
     streams = [packer.compress(plane) for plane in planes]
-    head = struct.pack("<IIIBBBBI12x", MAGIC, 4, len(cloud), cloud.degree, bits, 0, len(streams), 32)
+    head = struct.pack("<IIIBBBBI12x", MAGIC, 4, len(cloud), cloud.degree, bits, int(antialias), len(streams), 32)
     toc = b"".join(struct.pack("<QQ", len(stream), len(plane)) for stream, plane in zip(streams, planes))
     return head + toc + b"".join(streams)
 

@@ -49,7 +49,7 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
         ids = classes[rows.cpu().numpy()]
         known = None if not model.classes else np.where(ids < 0, UNLABELLED, ids).astype(np.uint8)
         made.append(_node(node, _given(model, rows), _sh(model, rows), known, time_s))
-    facts = {key: model.facts[key] for key in ("method", "scene") if key in model.facts}
+    facts = {key: model.facts[key] for key in ("method", "scene", "drawing") if key in model.facts}
     name = str(model.facts.get("scene", "scene"))
     return SplatScene(name, tuple(made), sky=None if model.sky is None else sky_picture(model.sky), facts=facts)
 
