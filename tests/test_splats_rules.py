@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import splat_readers as slow
 import toy_splats
 from PIL import Image
+from toy_scene import ToyStreet
 
 from mudg.base import geometry
 from mudg.data.splats import gltf, usd
@@ -218,6 +220,25 @@ def test_a_package_begins_with_its_stage_and_shows_the_sky_where_it_is() -> None
             x, y, z = turn @ d
             ours = int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * columns) % columns, int((0.5 - np.arcsin(z) / np.pi) * rows)
             assert (picture[row, column] == scene.sky[ours[1], ours[0]]).all()
+
+
+def test_cameras_of_a_stage_see_what_ours_see(tmp_path: Path) -> None:
+    scene = ToyStreet(times=[0.0, 0.1]).write(tmp_path / "scene", width=24, height=12)
+    camera = replace(scene.cameras["front"], cx=10.0, cy=7.5)
+    frames = tuple(replace(f, view=replace(f.view, camera=camera)) for f in scene.frames)
+    log = replace(scene, cameras={"front": camera}, frames=frames)
+    prim = slow.parse_usda(usd.to_text(toy_splats.scene(), log=log).decode())["World"]["camera_front"]
+    assert list(prim["xformOp:translate"]) == [0, 100]
+    for frame in log.frames:
+        code = round(frame.view.time_s * 1000)
+        turn = geometry.matrix_from_quaternion(prim["xformOp:orient"][code])
+        pose = geometry.from_rotation_translation(turn, prim["xformOp:translate"][code])
+        point = (frame.view.world_from_cam @ [0.7, -0.4, 6.0, 1.0])[:3]
+        x, y, z = geometry.transform_points(geometry.invert(pose), point[None])[0]
+        wide, high = prim["horizontalAperture"], prim["verticalAperture"]
+        across = (x / -z * prim["focalLength"] - prim["horizontalApertureOffset"]) / wide + 0.5
+        upwards = (y / -z * prim["focalLength"] - prim["verticalApertureOffset"]) / high + 0.5
+        assert np.allclose([across * 24, (1 - upwards) * 12], geometry.project(frame.view, point[None])[0][0], atol=1e-4)
 
 
 def test_names_and_texts_cannot_break_out_of_a_stage() -> None:

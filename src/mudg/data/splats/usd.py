@@ -20,18 +20,24 @@ from PIL import Image
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES
+from mudg.base.types import Camera, Scene, View
 from mudg.data.splats import binary
 from mudg.data.splats.cloud import Floats, SplatCloud, SplatNode, SplatScene
 
 CODES_PER_S: Final = 1000
+FOCAL: Final = 24.0
 SKY_FILE: Final = "sky.png"
 DOME: Final = "(0.5, 0.5, 0.5, 0.5)"
 """A dome looks along its z axis at the middle of its picture, y up, x (left) at a quarter: turned to x, z and y of the world."""
 _MOST_PACKAGE: Final = (1 << 32) - 1
 
 
-def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False) -> bytes:
-    """A scene as USD text: as it is at a time, or (None) with all its motion; ``sky``: refer to the picture `SKY_FILE` beside it."""
+def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False, log: Scene | None = None) -> bytes:
+    """A scene as USD text: as it is at a time, or (None) with all its motion.
+
+    Args:
+        sky: refer to the picture `SKY_FILE` beside it. log: whose cameras are put in, with their recorded poses.
+    """
     static = time_s is not None
     nodes = (SplatNode("scene", scene.at(time_s)),) if time_s is not None else scene.nodes
     first, last = scene.span_s
@@ -48,6 +54,8 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False) -
     names = prim_names([node.name for node in nodes])
     for name, node in zip(names, nodes):
         lines += _indented(_node(name, node, scene.file_from_world if not static else np.eye(4)))
+    for name, camera in {} if log is None else zip(prim_names([f"camera_{name}" for name in log.cameras]), log.cameras.values()):
+        lines += _indented(_camera(name, camera, [frame.view for frame in log.frames_of(camera.name)], scene.file_from_world))
     if sky:
         lines += ['    def DomeLight "Sky"', "    {", f"        asset inputs:texture:file = @{SKY_FILE}@",
                   '        token inputs:texture:format = "latlong"', f"        quatf xformOp:orient = {DOME}",
@@ -55,13 +63,13 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False) -
     return "\n".join([*lines, "}", ""]).encode()
 
 
-def to_package(scene: SplatScene, time_s: float | None = None) -> bytes:
+def to_package(scene: SplatScene, time_s: float | None = None, log: Scene | None = None) -> bytes:
     """A scene as a USDZ package: the text, and the sky as a picture (zenith on top, as one looks at it).
 
     Raises:
         InputError: more than 4 GiB, which a package cannot hold.
     """
-    files = {"scene.usda": to_text(scene, time_s, scene.sky is not None)}
+    files = {"scene.usda": to_text(scene, time_s, scene.sky is not None, log)}
     if scene.sky is not None:
         files[SKY_FILE] = png(scene.sky[:, ::-1])
     size = sum(map(len, files.values()))
@@ -103,6 +111,23 @@ def _node(name: str, node: SplatNode, file_from_world: NDArray[np.float64]) -> l
         lines.append(f"    custom float3 mudg:size = {tuples(np.array([node.size_m]))[0]}")
     lines += _indented(_splats(node))
     return [*lines, "}"]
+
+
+def _camera(name: str, camera: Camera, views: Sequence[View], file_from_world: NDArray[np.float64]) -> list[str]:
+    """A camera that looks along -z with y up; focal length and apertures share a unit, in which the focal length is `FOCAL`."""
+    wide, high = camera.width / camera.fx * FOCAL, camera.height / camera.fy * FOCAL
+    right, up = (camera.width / 2 - camera.cx) / camera.fx * FOCAL, (camera.cy - camera.height / 2) / camera.fy * FOCAL
+    lines = [f"def Camera {quoted(name)}", "{", f"    float focalLength = {FOCAL:g}", f"    float horizontalAperture = {wide:.9g}",
+             f"    float verticalAperture = {high:.9g}", f"    float horizontalApertureOffset = {right:.9g}",
+             f"    float verticalApertureOffset = {up:.9g}", "    float2 clippingRange = (0.1, 10000)"]  # fmt: skip
+    if views:
+        poses = file_from_world @ np.stack([view.world_from_cam for view in views]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        codes = np.array([view.time_s for view in views]) * CODES_PER_S
+        quats = np.stack([geometry.quaternion_from_matrix(pose) for pose in poses])
+        lines += _indented(_over_time("double3 xformOp:translate", codes, tuples(poses[:, :3, 3], 12)))
+        lines += _indented(_over_time("quatf xformOp:orient", codes, tuples(quats)))
+        lines.append('    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]')
+    return [*lines, f"    custom string mudg:camera = {quoted(camera.name)}", "}"]
 
 
 def _splats(node: SplatNode) -> list[str]:
