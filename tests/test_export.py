@@ -196,6 +196,7 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
         ({"time_s": 1.0}, "bundle", "a.zip", "holds all moments"),
         ({"spz_version": 4}, "ply", "a.ply", "does not have this setting"),
         ({"nodes": ("car-7",)}, "ply", "a.ply", "no node 'car-7'"),
+        ({"nodes": ("car-1",), "time_s": 99.0}, "sog", "a.sog", "nothing to export"),
         ({}, "colmap", "folder", "cameras belong to a scene"),
     ],
 )

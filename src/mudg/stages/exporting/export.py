@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -54,13 +54,14 @@ class Exported:
 
     Args:
         parts: where it lies. model: the fit, edited; None if cameras alone are asked for. log: the recorded scene, edited, or None.
-        inputs: digests of what was read.
+        inputs: digests of what was read. named: files that the edit script names.
     """
 
     parts: RunParts
     model: SceneModel | None
     log: Scene | None
     inputs: dict[str, str]
+    named: dict[str, Path] = field(default_factory=dict)
 
 
 def run(
@@ -83,6 +84,7 @@ def run(
     refuse_overlap(out, {"run": source, "scene": scene, "edits": edits})
     _refuse_settings(config, name)
     given = _opened(source, scene, edits, name in FORMATS)
+    refuse_overlap(out, {"scene": given.parts.scene, **given.named})
     if cameras:
         return _cameras(config, name, given, out, overwrite)
     _refuse_name(out, name, overwrite)
@@ -115,8 +117,14 @@ def _refuse_name(out: Path, name: str, overwrite: bool) -> None:
     if not Path(out).name.lower().endswith(suffixes):
         expected = f"a name that ends in {' or '.join(suffixes)}"
         raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
-    if Path(out).exists() and not overwrite:
-        raise UsageError("the file exists", where=str(out), remedy="choose another --out, or add --overwrite")
+    for path in (Path(out), about_path(out)):
+        if path.exists() and not overwrite:
+            raise UsageError("the file exists", where=str(path), remedy="choose another --out, or add --overwrite")
+
+
+def about_path(out: Path) -> Path:
+    """The file beside an export that says what it is."""
+    return Path(out).with_name(Path(out).name + ".json")
 
 
 def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: bool) -> Exported:
@@ -134,11 +142,13 @@ def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: b
     if alone:
         raise UsageError("an edit script is carried out on a fit", where="--edits", got=str(source), remedy="give the folder of a run")
     model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
+    named: dict[str, Path] = {}
     if edits is not None:
         script, inputs["edits"] = read_and_digest(Path(edits))
         drive = carry_out(script, model, recorded)
         model, recorded = drive.model(model), drive.scene or recorded
-    return Exported(parts, model, recorded, inputs)
+        named = {f"{edits}: {name}": path for name, path in script.files().items()}
+    return Exported(parts, model, recorded, inputs, named)
 
 
 # -- Gaussians -----------------------------------------------------------------------------------------------------------
@@ -150,13 +160,17 @@ def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
         raise InputError("there is no fitted scene", where=str(given.parts.scene), expected="a folder made by `mudg fit` or `mudg run`")
     moment = config.time_s if config.time_s is not None else middle_s(given.model, given.log)
     scene = splat_scene(given.model, moment, config.nodes)
+    whole = "motion" in FORMATS[name].carries and config.time_s is None
+    if not scene.nodes or not (whole or any(node.at(moment) is not None and len(node.cloud) for node in scene.nodes)):
+        asked = ", ".join(config.nodes) or "everything"
+        raise UsageError("there is nothing to export", where="--nodes, --time-s", got=f"{asked} at {moment:g} s",
+            remedy="choose a time at which the object is there")  # fmt: skip
     if config.sky == "sphere":
         scene = with_sky_sphere(scene)
     elif config.sky == "none":
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    whole = "motion" in FORMATS[name].carries and config.time_s is None
     return WriteRequest(scene, None if whole else moment, config.spz_version, given.log)
 
 
@@ -181,7 +195,7 @@ def _written(
         "file_from_world": request.scene.file_from_world, "nodes": [node.name for node in request.scene.nodes],
         "not_in_the_file": lost, "inputs": dict(inputs),
     }  # fmt: skip
-    store.write_json(Path(out).with_name(Path(out).name + ".json"), about)
+    store.write_json(about_path(out), about)
     when = "all of the motion" if request.time_s is None else f"at {request.time_s:g} s"
     log.info(f"export: {count} Gaussians, {when}, {len(content) / 1e6:.2f} MB in {out}")
     for sentence in lost:
