@@ -23,6 +23,8 @@ from mudg import cli
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.types import View
+from mudg.core.edit import Motion
+from mudg.core.ground import HeightMap
 from mudg.core.metrics import psnr
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.exporters.colmap import colmap_files, rig_frames, sensors_from_rig
@@ -35,6 +37,9 @@ from mudg.models.scene.nodes import DeformableNode, RigidNode
 from mudg.models.scene.vibration import VibrationNode, starting_columns
 from mudg.stages.config import ExportConfig, ImportConfig
 from mudg.stages.editing.assets import read_asset
+from mudg.stages.editing.carried import background_of
+from mudg.stages.editing.plan import EditWorld, place_background
+from mudg.stages.editing.runs import find_run
 from mudg.stages.exporting import export, imports, scenes
 from mudg.stages.fit import render_view
 from mudg.stages.fitting.storage import load_model, save_model
@@ -246,6 +251,24 @@ def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
     assert np.array_equal(again.sh, cloud.sh) and cloud.class_ids is not None and np.array_equal(again.class_ids, cloud.class_ids)
     with pytest.raises(UsageError, match="settings of objects"):
         imports.run(ImportConfig(kind="scene", label="car"), tmp_path / "a.ply", tmp_path / "fit2")
+
+
+def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(100, 130, 3000), rng.uniform(-4, 4, 3000), rng.normal(7, 0.01, 3000)])
+    wall = np.column_stack([rng.uniform(100, 130, 300), rng.uniform(3, 4, 300), rng.uniform(7, 12, 300)])
+    means = np.concatenate([ground, wall]).astype(np.float32)
+    cloud = replace(toy_splats.cloud(3300), means=means, logits=np.full(3300, 3, np.float32))
+    (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud))
+    imports.run(ImportConfig(kind="scene", axes="world", origin_m=(100, 0, 0)), tmp_path / "a.ply", tmp_path / "street")
+    found = background_of(find_run(tmp_path / "street"), "street")
+    assert abs(np.median(found.ground_xyz[:, 2]) - 7) < 0.02 and len(found.ground_xyz) > 500
+    pose = geometry.yaw_matrix(0.5, (20, 5, 1))
+    flat = np.stack(np.meshgrid(np.arange(0, 60, 0.4), np.arange(-20, 40, 0.4)), -1).reshape(-1, 2)
+    mine = HeightMap.from_points(np.column_stack([flat, np.full(len(flat), 1.0)]))
+    moves = np.stack([pose @ geometry.yaw_matrix(0.0, (x, 0, 0)) for x in (0.0, 10.0)])
+    placed = place_background(EditWorld({}, Motion.recorded([0.0, 1.0], moves), mine), found)
+    assert np.allclose(placed, geometry.yaw_matrix(0.5, (20, 5, 1 - 7)), atol=0.05)
 
 
 def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:

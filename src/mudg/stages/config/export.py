@@ -40,6 +40,10 @@ class ImportConfig:
     length_m: float | None = Field(default=None, gt=0)
     """Scale the object so that its box has this length (not given: the file is in metres)."""
     yaw_deg: float = 0.0
-    """Turn the object by this angle about the vertical, counter-clockwise from above, so that it looks along x."""
+    """Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads,
+    along x."""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg. As a background of an edit
+    script, a street begins there."""
     axes: Literal["viewer", "world"] = "viewer"
     """Axes of the file. viewer: those that programs expect of its format. world: x forward, y left, z up, as of --axes world."""

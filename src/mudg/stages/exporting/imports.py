@@ -42,8 +42,8 @@ def run(config: ImportConfig, file: Path, out: Path, *, overwrite: bool = False)
         InputError: no such file, another format, or a damaged one. UsageError: the output exists. ResourceError: a package is missing.
     """
     refuse_overlap(out, {"file": file})
+    refuse_other_settings(config)
     if config.kind == "scene":
-        refuse_scene_settings(config)
         return _scene(config, Path(file), Path(out), overwrite)
     if Path(out).suffix != ".safetensors":
         raise UsageError("an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out))
@@ -62,16 +62,19 @@ def run(config: ImportConfig, file: Path, out: Path, *, overwrite: bool = False)
 def refuse_import_settings(config: ImportConfig, name: str) -> None:
     """UsageError for settings that ``asset export`` does not have, or without the name of an object."""
     if config != ImportConfig():
-        raise UsageError("an asset export takes no settings of imports", where="--kind, --label, --length-m, --yaw-deg, --axes",
+        raise UsageError("an asset export takes no settings of imports", where="--kind, --label, --length-m, --yaw-deg, --origin-m, --axes",
             remedy="leave them out")  # fmt: skip
     if not name:
         raise UsageError("no object was named", expected="mudg asset export RUN ID --out FILE")
 
 
-def refuse_scene_settings(config: ImportConfig) -> None:
-    """UsageError for settings that only objects have."""
-    if config != ImportConfig(kind="scene", axes=config.axes):
-        raise UsageError("a scene takes no settings of objects", where="--label, --length-m, --yaw-deg", remedy="leave them out")
+def refuse_other_settings(config: ImportConfig) -> None:
+    """UsageError for settings that belong to the other kind."""
+    usual = ImportConfig()
+    if config.kind == "scene" and (config.label, config.length_m) != (usual.label, usual.length_m):
+        raise UsageError("a scene takes no settings of objects", where="--label, --length-m", remedy="leave them out")
+    if config.kind == "object" and config.origin_m != usual.origin_m:
+        raise UsageError("an object is centred in its box", where="--origin-m", remedy="leave it out, or add --kind scene")
 
 
 def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
@@ -113,7 +116,8 @@ def _scene(config: ImportConfig, file: Path, out: Path, overwrite: bool) -> Path
     folder = RunDir.open(out, _FOLDER, result_settings(config), {"file": store.digest(file)}, overwrite)
     if folder.complete:
         return folder.reused()
-    model = model_of_cloud(cloud, file.name)
+    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(0.0, [-value for value in config.origin_m])
+    model = model_of_cloud(cloud.moved(begin), file.name)
     save_model(replace(model, facts={**model.facts, "format": found}), folder.path)
     folder.finish({"gaussians": len(cloud), "format": found})
     log.info(f"asset: a scene of {len(cloud)} Gaussians of a {found} file in {out}")

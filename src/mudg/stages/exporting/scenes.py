@@ -21,6 +21,7 @@ from mudg.models.scene.edited import classes_of_rows
 from mudg.models.scene.model import COLUMNS, SceneModel
 from mudg.models.scene.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
+from mudg.stages.editing.carried import IMPORTED
 
 SKY_COUNT: Final = 6000
 SKY_M: Final = 300.0
@@ -158,4 +159,4 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
         columns["semantics"] = np.where(cloud.class_ids[:, None] == np.array(known), CLASS_LOGIT, -CLASS_LOGIT).astype(np.float32)
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
-    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, {"method": "imported", "source": name})
+    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name})
