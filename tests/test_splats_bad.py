@@ -149,6 +149,13 @@ def test_a_gzip_bomb_is_not_inflated_beyond_what_its_header_says() -> None:
         read(bomb, "spz")
 
 
+@pytest.mark.parametrize("name", ["spz", "sog"])
+def test_more_gaussians_than_a_file_can_hold_are_refused_before_anything_is_inflated(name: str) -> None:
+    raw = struct.pack(spz.HEADER, spz.MAGIC, 3, 200_000, 0, 12, 0, 0) + bytes(19 * 200_000)
+    with within(3 << 20), pytest.raises(InputError, match="than a file of this size"):
+        read(binary.gzip_bytes(raw) if name == "spz" else altered_sog(lambda meta: meta.update(count=20_000_000)), name)
+
+
 def test_a_zip_bomb_is_not_inflated() -> None:
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -174,7 +181,7 @@ def huge_webp() -> bytes:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda meta: meta.update(count=40_000_000), "impossible size"),
+        (lambda meta: meta.update(count=70_000), "impossible size"),
         (lambda meta: meta.update(count=0), "count"),
         (lambda meta: meta.update(version=1), "version"),
         (lambda meta: meta["means"].update(mins=[0, 0]), "mins"),

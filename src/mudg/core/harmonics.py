@@ -72,7 +72,7 @@ def band_rotation(rotation: Array, band: int) -> Array:
 def _probes(band: int) -> tuple[Array, Array]:
     """Well-spread directions [M, 3] (a spiral from pole to pole) and the inverse of a band's values there, [2 band + 1, M]."""
     directions = spiral(24)
-    return directions, np.linalg.pinv(basis(directions, band)[:, band**2 : (band + 1) ** 2])
+    return directions, np.asarray(np.linalg.pinv(basis(directions, band)[:, band**2 : (band + 1) ** 2]), np.float64)
 
 
 def spiral(count: int) -> Array:

@@ -45,6 +45,13 @@ def refuse_count(count: int, where: str) -> None:
             got=str(count))  # fmt: skip
 
 
+def refuse_bomb(count: int, content: bytes, where: str) -> None:
+    """InputError for more Gaussians than a compressed file of this size holds: at most 20 a byte, hundreds of times what is usual."""
+    if count > 20 * len(content) + 65536:
+        raise InputError("the header names more Gaussians than a file of this size can hold", where=where,
+            expected=f"at most {20 * len(content) + 65536}", got=str(count))  # fmt: skip
+
+
 # -- compressed streams --------------------------------------------------------------------------------------------------
 
 

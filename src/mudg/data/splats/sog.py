@@ -210,6 +210,7 @@ def from_bytes(content: bytes, where: str) -> SplatCloud:
         )
     meta = parse_record(SogMeta, stated, f"{where}: {names[0]}: ")
     binary.refuse_count(meta.count, where)
+    binary.refuse_bomb(meta.count, content, where)
     pixels = _Pictures(archive, folder, meta.count, where)
     low, high = np.array(meta.means.mins), np.array(meta.means.maxs)
     bits = pixels.rows(meta.means.files[0])[:, :3] + 256.0 * pixels.rows(meta.means.files[1])[:, :3]

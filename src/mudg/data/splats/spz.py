@@ -79,6 +79,7 @@ def from_bytes(content: bytes, where: str) -> SplatCloud:
         raise InputError("not an SPZ file", where=where, expected="NGSP in the compressed content", got=f"{magic:#x}")
     if version not in (2, 3):
         raise InputError("this version of SPZ is not read", where=where, expected="2, 3 or 4", got=str(version))
+    binary.refuse_bomb(count, content, where)
     sizes = _sizes(count, degree, bits, 3 if version == 2 else 4, where)
     planes = [stream.read(size, f"the {name}") for name, size in zip(_PLANES, sizes)]
     if not flags & 2:
@@ -105,6 +106,7 @@ def _from_streams(content: bytes, where: str) -> SplatCloud:
         raise InputError(
             "this version of SPZ is not read", where=where, expected="4 without gzip, 2 and 3 within", got=str(version)
         )
+    binary.refuse_bomb(count, content, where)
     sizes = [size for size in _sizes(count, degree, bits, 4, where) if size]
     if streams != len(sizes) or toc < 32:
         raise InputError("the header of the SPZ file does not fit its content", where=where, expected=f"{len(sizes)} streams",
