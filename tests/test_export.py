@@ -110,11 +110,16 @@ def test_nodes_of_every_kind_stand_where_the_model_puts_them(kind: type[RigidNod
         columns = {key: value.detach() for key, value in model.table.columns.items()}
         columns["curve"] = torch.randn(len(model.table), 4, 3, generator=torch.Generator().manual_seed(1)) * 0.1
         model = replace(model, table=type(model.table)(columns, model.table.labels))
+    columns = {key: value.detach() for key, value in model.table.columns.items()}
+    columns["sh_rest"] = torch.randn(len(model.table), 8, 3, generator=torch.Generator().manual_seed(2))
+    model = replace(model, table=type(model.table)(columns, model.table.labels), sh_degree=2)
     keys = model.nodes[1].times_s  # type: ignore[union-attr]
     for time_s in (float(keys[3]), float((keys[3] + keys[4]) / 2)):
         scene = scenes.splat_scene(model, time_s)
         now = compose(model, time_s)
         apart = np.abs(scene.at(time_s).means - now.means.detach().numpy()).max()
+        assert now.sh_rest is not None  # exact at the moment, in whichever frame the fit has them
+        assert np.abs(scene.at(time_s).sh[:, 1:] - now.sh_rest.detach().numpy()).max() < 1e-5
         assert apart < (5e-3 if kind is BezierNode else 1e-5)  # curves are straight between keys in a file
 
 

@@ -145,7 +145,7 @@ def test_a_turned_cloud_looks_as_from_the_other_side() -> None:
     moved = cloud.moved(pose)
     d = toy_splats.np.random.default_rng(0).normal(size=(9, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    from mudg.core.harmonics import basis
+    from mudg.core.sh import basis
 
     before, after = (np.einsum("dk,nkc->dnc", basis(rays, 3), sh) for rays, sh in ((d, cloud.sh), (d @ pose[:3, :3].T, moved.sh)))
     assert np.abs(before - after).max() < 1e-5

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.errors import InputError
-from mudg.core import harmonics
+from mudg.core import sh as harmonics
 
 MAX_GAUSSIANS: Final = 50_000_000
 LARGEST_M: Final = 1e8

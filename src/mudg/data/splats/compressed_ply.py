@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base.errors import InputError
-from mudg.core.harmonics import C0
+from mudg.core.sh import C0
 from mudg.data.splats import binary, ply
 from mudg.data.splats.cloud import SplatCloud, checked, logit
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry
-from mudg.core.harmonics import C0
+from mudg.core.sh import C0
 from mudg.data.splats.cloud import SplatCloud, SplatNode, SplatScene
 
 EXTENSION: Final = "KHR_gaussian_splatting"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError
-from mudg.core.harmonics import C0
+from mudg.core.sh import C0
 from mudg.data.splats import binary
 from mudg.data.splats.cloud import LEAST_LOG, SplatCloud, checked, joined, logit, unit
 from mudg.data.splats.gltf import BIN_CHUNK, EXTENSION, JSON_CHUNK, MAGIC, PREFIX

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from mudg.base.errors import InputError
-from mudg.core.harmonics import C0
+from mudg.core.sh import C0
 from mudg.data.splats import binary
 from mudg.data.splats.cloud import LEAST_LOG, SplatCloud, checked, logit
 

@@ -21,7 +21,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import PointCloud, Scene
 from mudg.base.versions import version
-from mudg.core.harmonics import C0
+from mudg.core.sh import C0
 from mudg.data.cloudfile import read_fused
 from mudg.data.exporters.colmap import colmap_files
 from mudg.data.exporters.mcap import LogMessages, McapBlocks
