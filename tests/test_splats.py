@@ -183,6 +183,17 @@ def test_a_ply_with_other_columns_types_and_order_of_bytes_is_read() -> None:
     assert cloud.means.tolist() == [[1, 0, 3], [2, 0, 4]] and cloud.quats.tolist() == [[1, 0, 0, 0]] * 2
 
 
+def test_opacities_of_0_and_1_and_sizes_of_0_are_read() -> None:
+    """Other programs write their logits and logarithms as infinities."""
+    cloud = toy_splats.cloud(3)
+    sizes = cloud.log_scales.copy()
+    sizes[2, 1] = -np.inf
+    ends = SplatCloud(cloud.means, cloud.quats, sizes, np.array([-np.inf, np.inf, 0], np.float32), cloud.sh)
+    found = ply.from_bytes(ply.to_bytes(ends), "x")
+    assert found.opacity[0] < 1e-5 and found.opacity[1] > 0.9999 and found.log_scales[2, 1] == -40
+    assert np.isfinite(found.logits).all()
+
+
 def test_spz_takes_fewer_fractional_bits_for_far_places() -> None:
     cloud = toy_splats.cloud(5, spread=5000.0)
     assert spz.fractional_bits(cloud.means) == 10

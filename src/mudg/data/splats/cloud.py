@@ -210,13 +210,17 @@ def unit(quats: NDArray[np.floating], where: str) -> Floats:
 
 
 def checked(cloud: SplatCloud, where: str) -> SplatCloud:
-    """A cloud as it was read, rotations brought to length 1.
+    """A cloud as it was read, rotations brought to length 1. Opacities of exactly 0 and 1 and sizes of 0, whose logits and logarithms are
+    infinite, become the nearest that can be worked with.
 
     Raises:
         InputError: values that are not finite, or places and sizes that nothing has.
     """
     if len(cloud) == 0:
         raise InputError("the file holds no Gaussians", where=where)
+    logits = np.nan_to_num(cloud.logits, nan=np.nan, posinf=MOST_LOGIT, neginf=-MOST_LOGIT)
+    logs = np.where(np.isneginf(cloud.log_scales), np.float32(LEAST_LOG), cloud.log_scales)
+    cloud = replace(cloud, logits=logits, log_scales=logs)
     columns = {"position": cloud.means, "scale": cloud.log_scales, "opacity": cloud.logits[:, None],
                "color": cloud.sh.reshape(len(cloud), -1)}  # fmt: skip
     for name, values in columns.items():
