@@ -47,7 +47,9 @@ def read_ply(content: bytes) -> list[Splat]:
         values = struct.unpack_from(f"<{len(names)}f", body, 4 * row * len(names))
         at = dict(zip(names, values, strict=True))
         rest = sum(name.startswith("f_rest_") for name in names) // 3
-        sh = [[at[f"f_dc_{c}"] for c in range(3)]] + [[at[f"f_rest_{c * rest + k}"] for c in range(3)] for k in range(rest)]
+        sh = [[at[f"f_dc_{c}"] for c in range(3)]] + [
+            [at[f"f_rest_{c * rest + k}"] for c in range(3)] for k in range(rest)
+        ]
         assert at["nx"] == at["ny"] == at["nz"] == 0
         found.append(Splat([at["x"], at["y"], at["z"]], [at[f"rot_{i}"] for i in range(4)], [math.exp(at[f"scale_{i}"]) for i in range(3)],
                            sigmoid(at["opacity"]), sh))  # fmt: skip
@@ -75,7 +77,10 @@ def read_compressed(content: bytes) -> list[Splat]:
             return [a + s * (b - a) for s, a, b in zip(shares, low, high, strict=True)]
 
         three = [((rotation >> shift & 1023) / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
-        rgb = [a + (color >> shift & 255) / 255 * (b - a) for shift, a, b in zip((24, 16, 8), c[12:15], c[15:18], strict=True)]
+        rgb = [
+            a + (color >> shift & 255) / 255 * (b - a)
+            for shift, a, b in zip((24, 16, 8), c[12:15], c[15:18], strict=True)
+        ]
         sh = [[(v - 0.5) / C0 for v in rgb]]
         if rest:
             raw = body[start + 16 * counts["vertex"] + rest * row :][:rest]
@@ -138,7 +143,9 @@ def read_sog(content: bytes) -> list[Splat]:
         low, high = (pixel(name, n) for name in meta["means"]["files"])
         place = []
         for i in range(3):
-            t = meta["means"]["mins"][i] + (low[i] + 256 * high[i]) / 65535 * (meta["means"]["maxs"][i] - meta["means"]["mins"][i])
+            t = meta["means"]["mins"][i] + (low[i] + 256 * high[i]) / 65535 * (
+                meta["means"]["maxs"][i] - meta["means"]["mins"][i]
+            )
             place.append(math.copysign(math.exp(abs(t)) - 1, t))
         turn, size, color = (pixel(meta[name]["files"][0], n) for name in ("quats", "scales", "sh0"))
         three = [(v / 255 * 2 - 1) / math.sqrt(2) for v in turn[:3]]
@@ -171,7 +178,9 @@ def accessor(document: dict[str, Any], content: bytes, index: int) -> list[list[
     one = document["accessors"][index]
     view = document["bufferViews"][one["bufferView"]]
     width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[one["type"]]
-    assert one["componentType"] == 5126 and view["byteLength"] == 4 * width * one["count"] and view["byteOffset"] % 4 == 0
+    assert (
+        one["componentType"] == 5126 and view["byteLength"] == 4 * width * one["count"] and view["byteOffset"] % 4 == 0
+    )
     flat = struct.unpack_from(f"<{width * one['count']}f", content, view["byteOffset"])
     return [list(flat[i : i + width]) for i in range(0, len(flat), width)]
 
@@ -257,6 +266,12 @@ def read_usd_splats(prim: dict[str, Any], places: list[list[float]] | None = Non
     harmonics = prim["radiance:sphericalHarmonicsCoefficients"]
     each = len(harmonics) // count
     return [
-        Splat(place, prim["orientations"][n], prim["scales"][n], prim["opacities"][n], harmonics[n * each : (n + 1) * each])
+        Splat(
+            place,
+            prim["orientations"][n],
+            prim["scales"][n],
+            prim["opacities"][n],
+            harmonics[n * each : (n + 1) * each],
+        )
         for n, place in enumerate(prim["positions"] if places is None else places)
     ]

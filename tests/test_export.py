@@ -53,7 +53,9 @@ def turning(kind: type[RigidNode] = RigidNode) -> SceneModel:
     model = toy(kind)
     node = model.nodes[1]
     assert isinstance(node, RigidNode)
-    keys = np.stack([pose @ geometry.yaw_matrix(0.5 * t) for t, pose in zip(node.times_s, node.world_from_object, strict=True)])
+    keys = np.stack(
+        [pose @ geometry.yaw_matrix(0.5 * t) for t, pose in zip(node.times_s, node.world_from_object, strict=True)]
+    )
     turned = kind("car-1", "car", SIZE, node.times_s, keys, None if kind is BezierNode else node.offsets)
     return replace(model, nodes=(model.nodes[0], turned))
 
@@ -186,7 +188,9 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
     script.write_text("- move: {id: car-1, left_m: 2, ground: false}\n")
     export.run(ExportConfig(time_s=T), "ply", fit, tmp_path / "moved.ply", edits=script)
     export.run(ExportConfig(time_s=T), "ply", fit, tmp_path / "plain.ply")
-    moved, plain = (formats.read_cloud((tmp_path / f"{n}.ply").read_bytes(), "x.ply")[0].means for n in ("moved", "plain"))
+    moved, plain = (
+        formats.read_cloud((tmp_path / f"{n}.ply").read_bytes(), "x.ply")[0].means for n in ("moved", "plain")
+    )
     apart = np.linalg.norm(moved - plain, axis=1)
     assert not apart[:640].any() and np.abs(apart[640:] - 2).max() < 1e-4
     export.run(ExportConfig(sky="sphere"), "glb", fit, tmp_path / "a.glb")
@@ -210,7 +214,9 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
         ({}, "colmap", "folder", "cameras belong to a scene"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(fit: Path, tmp_path: Path, settings: dict, name: str, out: str, said: str) -> None:
+def test_what_cannot_be_exported_is_refused(
+    fit: Path, tmp_path: Path, settings: dict, name: str, out: str, said: str
+) -> None:
     with pytest.raises(MudgError, match=said):
         export.run(ExportConfig(**settings), name, fit, tmp_path / out)
     assert not (tmp_path / out).exists()
@@ -227,7 +233,9 @@ def test_an_output_inside_the_fit_is_refused(fit: Path) -> None:
 @pytest.mark.parametrize("name", ["ply", "spz", "splat", "sog", "glb", "compressed-ply"])
 def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_path: Path) -> None:
     car = toy_splats.cloud(60, 0, 3, spread=1.0)
-    scene = toy_splats.SplatScene("car", (toy_splats.SplatNode("car", car.moved(geometry.yaw_matrix(0.0, (30, 0, 5)))),))
+    scene = toy_splats.SplatScene(
+        "car", (toy_splats.SplatNode("car", car.moved(geometry.yaw_matrix(0.0, (30, 0, 5)))),)
+    )
     suffix = formats.FORMATS[name].suffixes[0]
     file = tmp_path / f"van{suffix}"
     turned = replace(scene, file_from_world=formats.file_from_world(name, "viewer"))
@@ -253,7 +261,11 @@ def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
     model = load_model(tmp_path / "fit")
     assert len(model.table) == 40 and model.sh_degree == 2 and model.nodes[0].kind == "static"
     again = scenes.splat_scene(model, 0.0).nodes[0].cloud
-    assert np.array_equal(again.sh, cloud.sh) and cloud.class_ids is not None and np.array_equal(again.class_ids, cloud.class_ids)
+    assert (
+        np.array_equal(again.sh, cloud.sh)
+        and cloud.class_ids is not None
+        and np.array_equal(again.class_ids, cloud.class_ids)
+    )
     with pytest.raises(UsageError, match="settings of objects"):
         imports.run(ImportConfig(kind="scene", label="car"), tmp_path / "a.ply", tmp_path / "fit2")
 
@@ -282,12 +294,16 @@ def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_bytes(b"v 0 0 0")
     with pytest.raises(InputError, match="no file of Gaussians"):
         imports.run(ImportConfig(), tmp_path / "a.obj", tmp_path / "a.safetensors")
-    (tmp_path / "b.ply").write_bytes(formats.ply.to_bytes(replace(toy_splats.cloud(5), logits=np.full(5, -9, np.float32))))
+    (tmp_path / "b.ply").write_bytes(
+        formats.ply.to_bytes(replace(toy_splats.cloud(5), logits=np.full(5, -9, np.float32)))
+    )
     with pytest.raises(InputError, match="no solid Gaussians"):
         imports.run(ImportConfig(), tmp_path / "b.ply", tmp_path / "a.safetensors")
     with pytest.raises(UsageError, match="ends in .safetensors"):
         imports.run(ImportConfig(), tmp_path / "b.ply", tmp_path / "a.ply")
-    assert cli.main(["asset", "import", str(tmp_path / "b.ply"), "car-1", "--out", str(tmp_path / "a.safetensors")]) == 2
+    assert (
+        cli.main(["asset", "import", str(tmp_path / "b.ply"), "car-1", "--out", str(tmp_path / "a.safetensors")]) == 2
+    )
     assert cli.main(["asset", "export", str(tmp_path), "--out", str(tmp_path / "a.safetensors")]) == 2
     assert not (tmp_path / "a.safetensors").exists()
 
@@ -301,7 +317,9 @@ def test_nerfstudio_cameras_look_where_ours_do(tmp_path: Path) -> None:
     told = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert len(told["frames"]) == 2
     for frame, ours in zip(told["frames"], scene.frames, strict=True):
-        assert (tmp_path / "out" / frame["file_path"]).read_bytes() == (tmp_path / "scene" / ours.image.path).read_bytes()
+        assert (tmp_path / "out" / frame["file_path"]).read_bytes() == (
+            tmp_path / "scene" / ours.image.path
+        ).read_bytes()
         pose = np.array(frame["transform_matrix"])
         point = ours.view.world_from_cam @ [0.4, 0.3, 5.0, 1.0]
         x, y, z, _ = np.linalg.inv(pose) @ point  # x right, y up, z back
@@ -309,8 +327,6 @@ def test_nerfstudio_cameras_look_where_ours_do(tmp_path: Path) -> None:
         assert np.allclose(uv, geometry.project(ours.view, point[None, :3])[0][0])
     again = export.run(ExportConfig(), "nerfstudio", tmp_path / "scene", tmp_path / "out")
     assert again == tmp_path / "out"  # verified and reused
-
-
 
 
 def test_colmap_binaries_hold_the_poses_and_one_rig(tmp_path: Path) -> None:
@@ -376,9 +392,14 @@ def test_starting_points_of_cameras(tmp_path: Path) -> None:
     from mudg.base.types import PointCloud
 
     scene = ToyStreet(times=[0.0]).write(tmp_path / "scene", width=24, height=12)
-    points = PointCloud(np.array([[1, 2, 3], [4, 5, 6]], np.float32), np.array([[9, 8, 7], [6, 5, 4]], np.uint8), "world")
+    points = PointCloud(
+        np.array([[1, 2, 3], [4, 5, 6]], np.float32), np.array([[9, 8, 7], [6, 5, 4]], np.uint8), "world"
+    )
     content = colmap_files(scene, points)["sparse/0/points3D.bin"]
-    assert struct.unpack_from("<QQ3d3BdQ", content) == (2, 1, 1.0, 2.0, 3.0, 9, 8, 7, 0.0, 0) and len(content) == 8 + 2 * 51
+    assert (
+        struct.unpack_from("<QQ3d3BdQ", content) == (2, 1, 1.0, 2.0, 3.0, 9, 8, 7, 0.0, 0)
+        and len(content) == 8 + 2 * 51
+    )
     files = nerfstudio_files(scene, points)
     assert files["points.ply"].endswith(struct.pack("<3f3B", 4, 5, 6, 6, 5, 4))
 

@@ -64,12 +64,21 @@ def steps(name: str, cloud: SplatCloud) -> dict[str, np.ndarray | float]:
     log_span = np.sign(cloud.means) * np.log1p(np.abs(cloud.means))
     grown = (1 + np.abs(cloud.means).max()) * (log_span.max(0) - log_span.min(0)) / 65535
     rough = 0.06 if len(cloud) > 256 else 1e-5  # tables are fine where many values are, and coarse at their ends
-    kinds["sog"] = {"means": grown + exact, "scales": rough * 2, "opacity": 1 / 255, "dc": rough, "rest": rough * 3, "turn": 0.02}
+    kinds["sog"] = {
+        "means": grown + exact,
+        "scales": rough * 2,
+        "opacity": 1 / 255,
+        "dc": rough,
+        "rest": rough * 3,
+        "turn": 0.02,
+    }
     plain = {"means": exact, "scales": 1e-5, "opacity": 1e-5, "dc": 1e-5, "rest": 1e-5, "turn": 1e-5}
     return kinds.get(name, plain)
 
 
-def assert_close(found: SplatCloud, cloud: SplatCloud, limits: dict[str, np.ndarray | float], activated: bool = False) -> None:
+def assert_close(
+    found: SplatCloud, cloud: SplatCloud, limits: dict[str, np.ndarray | float], activated: bool = False
+) -> None:
     rows = cloud.take(in_step(found, cloud))
     assert (np.abs(found.means - rows.means) <= limits["means"]).all()
     assert (np.abs(found.log_scales - rows.log_scales) <= limits["scales"]).all()
@@ -115,7 +124,11 @@ def test_golden_bytes_of_three_gaussians() -> None:
         "glb": content_of("glb", cloud).hex(), "usda": content_of("usda", cloud).decode(),
     }  # fmt: skip
     archive = zipfile.ZipFile(io.BytesIO(sog.to_bytes(cloud)))
-    pictures = {n: np.asarray(Image.open(io.BytesIO(archive.read(n)))).tobytes().hex() for n in archive.namelist() if n.endswith("webp")}
+    pictures = {
+        n: np.asarray(Image.open(io.BytesIO(archive.read(n)))).tobytes().hex()
+        for n in archive.namelist()
+        if n.endswith("webp")
+    }
     files = zipfile.ZipFile(io.BytesIO(bundle.to_bytes(toy_splats.scene(0, 1))))
     made["bundle"] = {
         name: rounded(files.read(name)) if name.endswith("json") else files.read(name).hex()
@@ -147,7 +160,9 @@ def test_a_turned_cloud_looks_as_from_the_other_side() -> None:
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     from mudg.core.sh import basis
 
-    before, after = (np.einsum("dk,nkc->dnc", basis(rays, 3), sh) for rays, sh in ((d, cloud.sh), (d @ pose[:3, :3].T, moved.sh)))
+    before, after = (
+        np.einsum("dk,nkc->dnc", basis(rays, 3), sh) for rays, sh in ((d, cloud.sh), (d @ pose[:3, :3].T, moved.sh))
+    )
     assert np.abs(before - after).max() < 1e-5
     assert np.abs(moved.moved(np.linalg.inv(pose)).means - cloud.means).max() < 1e-5
 
@@ -170,7 +185,11 @@ def test_the_ply_keeps_the_order_that_readers_by_position_expect() -> None:
     assert names[54:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "class"]
     back = ply.from_bytes(content, "x")
     assert back.class_ids is not None and cloud.class_ids is not None and (back.class_ids == cloud.class_ids).all()
-    assert np.array_equal(back.means, cloud.means) and np.array_equal(back.sh, cloud.sh) and np.array_equal(back.logits, cloud.logits)
+    assert (
+        np.array_equal(back.means, cloud.means)
+        and np.array_equal(back.sh, cloud.sh)
+        and np.array_equal(back.logits, cloud.logits)
+    )
 
 
 def test_a_ply_with_other_columns_types_and_order_of_bytes_is_read() -> None:
@@ -233,7 +252,10 @@ def test_the_bundle_holds_everything() -> None:
     assert all(info.compress_type == zipfile.ZIP_STORED for info in archive.infolist())
     about, tracks = (json.loads(archive.read(name)) for name in ("bundle.json", "tracks.json"))
     assert [node["name"] for node in about["nodes"]] == ["background", "car-1", "1 person"]
-    assert tracks["schema"] == "splatsim.sequence_tracks/v2" and [t["track_id"] for t in tracks["tracks"]] == ["car-1", "1 person"]
+    assert tracks["schema"] == "splatsim.sequence_tracks/v2" and [t["track_id"] for t in tracks["tracks"]] == [
+        "car-1",
+        "1 person",
+    ]
     frame = tracks["tracks"][0]["frames"][1]
     assert frame["timestamp_us"] == 250_000 and frame["translation"] == [1.0, 1.0, 0.8]
     assert np.allclose(frame["rotation"], [0, 0, np.sin(0.3), np.cos(0.3)])
@@ -283,7 +305,10 @@ def test_a_fit_that_draws_antialiased_says_so_where_it_can() -> None:
     scene = toy_splats.scene()
     request = formats.WriteRequest(SplatScene("toy", scene.nodes, facts={"drawing": {"antialias": True}}), 0.5)
     assert zlib.decompress(formats.FORMATS["spz"].write(request), 31)[14] == 1
-    assert json.loads(zipfile.ZipFile(io.BytesIO(formats.FORMATS["sog"].write(request))).read("meta.json"))["antialias"] is True
+    assert (
+        json.loads(zipfile.ZipFile(io.BytesIO(formats.FORMATS["sog"].write(request))).read("meta.json"))["antialias"]
+        is True
+    )
     assert formats.losses("ply", request)[-1] == "how the fit draws Gaussians (antialias True)"
     assert not any("draws" in sentence for sentence in formats.losses("spz", request))
 

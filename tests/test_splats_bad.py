@@ -67,7 +67,9 @@ def test_every_flipped_byte_is_read_or_refused_in_words(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", READ)
-@pytest.mark.parametrize("content", [b"", b"p", b"ply\n", b"\x1f\x8b", b"NGSP", b"glTF", b"PK\x03\x04", b"\0" * 4095, b"\xff" * 333])
+@pytest.mark.parametrize(
+    "content", [b"", b"p", b"ply\n", b"\x1f\x8b", b"NGSP", b"glTF", b"PK\x03\x04", b"\0" * 4095, b"\xff" * 333]
+)
 def test_what_is_another_file_is_refused(name: str, content: bytes) -> None:
     with pytest.raises(InputError, match="where: bad.file"):
         read(content, name)
@@ -102,7 +104,9 @@ def test_impossible_counts_of_a_ply_are_refused_at_once(name: str, count: str) -
         read(bad, name)
 
 
-@pytest.mark.parametrize(("place", "value"), [(4, 1), (4, 9), (8, 0), (8, 0xFFFFFFFF), (8, 40_000_000), (12, 4), (13, 60)])
+@pytest.mark.parametrize(
+    ("place", "value"), [(4, 1), (4, 9), (8, 0), (8, 0xFFFFFFFF), (8, 40_000_000), (12, 4), (13, 60)]
+)
 def test_headers_of_spz_that_cannot_be_are_refused(place: int, value: int) -> None:
     raw = bytearray(zlib.decompress(spz.to_bytes(toy_splats.cloud(3)), 31))
     raw[place : place + (4 if place < 12 else 1)] = value.to_bytes(4 if place < 12 else 1, "little")
@@ -219,7 +223,9 @@ def altered_glb(change: Callable[[dict[str, Any]], Any]) -> bytes:
 
 
 def set_rotation(document: dict[str, Any], **values: Any) -> None:
-    document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["KHR_gaussian_splatting:ROTATION"]].update(values)
+    document["accessors"][
+        document["meshes"][0]["primitives"][0]["attributes"]["KHR_gaussian_splatting:ROTATION"]
+    ].update(values)
 
 
 @pytest.mark.parametrize(
@@ -245,8 +251,14 @@ def set_rotation(document: dict[str, Any], **values: Any) -> None:
         (lambda d: d["bufferViews"][0].update(byteOffset=10**9), "beyond"),
         (lambda d: d["bufferViews"][0].update(byteStride=4), "beyond"),
         (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no Gaussians"),
-        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"), "degree out"),
-        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2"), "missing"),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"),
+            "degree out",
+        ),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2"),
+            "missing",
+        ),
         (lambda d: d.update(nodes=d["nodes"] * 400, scenes=[{"nodes": list(range(400))}]), "too often"),
     ],
 )

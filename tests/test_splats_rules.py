@@ -78,7 +78,11 @@ def gltf_problems(content: bytes) -> list[str]:
 def primitive_problems(document: dict[str, Any], data: bytes, primitive: dict[str, Any]) -> list[str]:
     found, attributes = [], primitive["attributes"]
     kind = primitive["extensions"]["KHR_gaussian_splatting"]
-    if primitive["mode"] != 0 or kind["kernel"] != "ellipse" or kind["colorSpace"] not in ("srgb_rec709_display", "lin_rec709_display"):
+    if (
+        primitive["mode"] != 0
+        or kind["kernel"] != "ellipse"
+        or kind["colorSpace"] not in ("srgb_rec709_display", "lin_rec709_display")
+    ):
         found.append("primitive")
     values = {name: np.array(slow.accessor(document, data, index)) for name, index in attributes.items()}
     counts = {len(rows) for rows in values.values()}
@@ -104,7 +108,10 @@ def animation_problems(document: dict[str, Any], data: bytes, animation: dict[st
     for channel in animation["channels"]:
         sampler = animation["samplers"][channel["sampler"]]
         times = np.array(slow.accessor(document, data, sampler["input"]))[:, 0]
-        given, values = document["accessors"][sampler["input"]], np.array(slow.accessor(document, data, sampler["output"]))
+        given, values = (
+            document["accessors"][sampler["input"]],
+            np.array(slow.accessor(document, data, sampler["output"])),
+        )
         found += ["times"] if times[0] < 0 or (np.diff(times) <= 0).any() else []
         found += ["bounds of times"] if [given["min"][0], given["max"][0]] != [times[0], times[-1]] else []
         found += ["keys"] if len(values) != len(times) else []
@@ -124,14 +131,21 @@ def test_a_glb_keeps_the_rules(degree: int, time_s: float | None) -> None:
 @pytest.mark.parametrize("time_s", [-0.5, -0.1, 0.25, 0.4, 0.9, 1.0])
 def test_a_glb_moves_as_the_scene_does(time_s: float) -> None:
     scene = replace(toy_splats.scene(), file_from_world=file_from_world("glb", "viewer"))
-    stiff = replace(scene, nodes=(*scene.nodes[:2], replace(scene.nodes[2], cloud=gltf.middle_shape(scene.nodes[2]), displacement=None)))
+    stiff = replace(
+        scene,
+        nodes=(*scene.nodes[:2], replace(scene.nodes[2], cloud=gltf.middle_shape(scene.nodes[2]), displacement=None)),
+    )
     document, data = slow.open_glb(gltf.to_bytes(scene))
     played = {(c["target"]["node"], c["target"]["path"]): document["animations"][0]["samplers"][c["sampler"]]
               for c in document["animations"][0]["channels"]}  # fmt: skip
     shown = []
     for index, node in enumerate(document["nodes"]):
         cloud = slow.read_glb_mesh(document, data, node["mesh"])
-        now: dict[str, np.ndarray] = {"translation": np.zeros(3), "rotation": np.array([0, 0, 0, 1.0]), "scale": np.ones(3)}
+        now: dict[str, np.ndarray] = {
+            "translation": np.zeros(3),
+            "rotation": np.array([0, 0, 0, 1.0]),
+            "scale": np.ones(3),
+        }
         for path in now:
             if (index, path) in played:
                 sampler = played[index, path]
@@ -167,7 +181,9 @@ def usd_problems(prim: dict[str, Any]) -> list[str]:
     reach = 3 * np.max(prim["scales"], 1)[:, None]
     for place in np.array(places):
         found += ["extent"] if (place - reach < low - 1e-4).any() or (place + reach > high + 1e-4).any() else []
-    found += ["hints"] if (prim["projectionModeHint"], prim["sortingModeHint"]) != ("perspective", "cameraDistance") else []
+    found += (
+        ["hints"] if (prim["projectionModeHint"], prim["sortingModeHint"]) != ("perspective", "cameraDistance") else []
+    )
     return found
 
 
@@ -207,7 +223,9 @@ def test_usd_moves_and_bends_as_the_scene_does(time_s: float) -> None:
 def test_a_package_begins_with_its_stage_and_shows_the_sky_where_it_is() -> None:
     scene = toy_splats.scene()
     archive = zipfile.ZipFile(io.BytesIO(usd.to_package(scene)))
-    assert archive.namelist() == ["scene.usda", "sky.png"] and all(i.compress_type == zipfile.ZIP_STORED for i in archive.infolist())
+    assert archive.namelist() == ["scene.usda", "sky.png"] and all(
+        i.compress_type == zipfile.ZIP_STORED for i in archive.infolist()
+    )
     dome = slow.parse_usda(archive.read("scene.usda").decode())["World"]["Sky"]
     picture = np.asarray(Image.open(io.BytesIO(archive.read("sky.png"))))
     turn = geometry.matrix_from_quaternion(dome["xformOp:orient"])
@@ -218,7 +236,10 @@ def test_a_package_begins_with_its_stage_and_shows_the_sky_where_it_is() -> None
             latitude, longitude = np.pi / 2 - (row + 0.5) / rows * np.pi, np.pi - (column + 0.5) / columns * 2 * np.pi
             d = np.array([np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)])
             x, y, z = turn @ d
-            ours = int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * columns) % columns, int((0.5 - np.arcsin(z) / np.pi) * rows)
+            ours = (
+                int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * columns) % columns,
+                int((0.5 - np.arcsin(z) / np.pi) * rows),
+            )
             assert (picture[row, column] == scene.sky[ours[1], ours[0]]).all()
 
 
@@ -238,20 +259,26 @@ def test_cameras_of_a_stage_see_what_ours_see(tmp_path: Path) -> None:
         wide, high = prim["horizontalAperture"], prim["verticalAperture"]
         across = (x / -z * prim["focalLength"] - prim["horizontalApertureOffset"]) / wide + 0.5
         upwards = (y / -z * prim["focalLength"] - prim["verticalApertureOffset"]) / high + 0.5
-        assert np.allclose([across * 24, (1 - upwards) * 12], geometry.project(frame.view, point[None])[0][0], atol=1e-4)
+        assert np.allclose(
+            [across * 24, (1 - upwards) * 12], geometry.project(frame.view, point[None])[0][0], atol=1e-4
+        )
 
 
 def test_names_and_texts_cannot_break_out_of_a_stage() -> None:
     scene = toy_splats.scene()
     evil = replace(scene.nodes[1], name='x"\n}\ndef "y', label='a\\"b')
-    stage = slow.parse_usda(usd.to_text(replace(scene, nodes=(scene.nodes[0], evil), facts={"method": '"\n)'})).decode())
+    stage = slow.parse_usda(
+        usd.to_text(replace(scene, nodes=(scene.nodes[0], evil), facts={"method": '"\n)'})).decode()
+    )
     assert list(stage["World"]) == ["type", "background", "x____def__y"]
     assert stage["World"]["x____def__y"]["mudg:label"] == 'a\\"b'
 
 
 def test_empty_nodes_do_no_harm() -> None:
     scene = toy_splats.scene()
-    nothing = SplatCloud(*(getattr(scene.nodes[0].cloud, name)[:0] for name in ("means", "quats", "log_scales", "logits", "sh")))
+    nothing = SplatCloud(
+        *(getattr(scene.nodes[0].cloud, name)[:0] for name in ("means", "quats", "log_scales", "logits", "sh"))
+    )
     bare = replace(scene, nodes=(replace(scene.nodes[0], cloud=nothing), *scene.nodes[1:]))
     assert gltf_problems(gltf.to_bytes(bare)) == []
     assert slow.parse_usda(usd.to_text(bare).decode())["World"]["background"]["splats"]["positions"] == []

@@ -15,7 +15,13 @@ def cloud(count: int = 3, degree: int = 0, seed: int = 0, classes: bool = False,
     quats[0] = (1, 0, 0, 0)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     sh = (rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3).clip(-0.9, 0.9)  # SPZ holds -1 to 1
-    columns = (rng.uniform(-spread, spread, (count, 3)), quats, rng.uniform(-5, 0, (count, 3)), rng.uniform(-4, 4, count), sh)
+    columns = (
+        rng.uniform(-spread, spread, (count, 3)),
+        quats,
+        rng.uniform(-5, 0, (count, 3)),
+        rng.uniform(-4, 4, count),
+        sh,
+    )
     ids = rng.integers(0, 19, count).astype(np.uint8) if classes else None
     return SplatCloud(*(values.astype(np.float32) for values in columns), ids)
 

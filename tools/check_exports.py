@@ -47,7 +47,10 @@ def main() -> int:
     files = written(given.run, given.out)
     tool = given.node_modules / ".bin" / "splat-transform"
     for name in SINGLE:
-        failures += report(f"{name} read by splat-transform", against_splat_transform(tool, name, files[name]) if tool.exists() else None)
+        failures += report(
+            f"{name} read by splat-transform",
+            against_splat_transform(tool, name, files[name]) if tool.exists() else None,
+        )
     validator = given.node_modules / "gltf-validator"
     failures += report("glb by glTF-Validator", of_gltf(validator, files["glb"]) if validator.exists() else None)
     for name in ("usda", "usdz"):
@@ -79,7 +82,9 @@ def written(run: Path, out: Path) -> dict[str, Path]:
 def against_splat_transform(tool: Path, name: str, file: Path) -> str:
     """Our reading of a file against our reading of the PLY that their program makes of it; and that it reads back what we wrote."""
     made = file.with_name(f"theirs_{name}.ply")
-    done = subprocess.run([str(tool), "-w", "-g", "cpu", str(file), str(made)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [str(tool), "-w", "-g", "cpu", str(file), str(made)], capture_output=True, text=True, check=False
+    )
     if done.returncode:
         return f"failed: {(done.stderr or done.stdout).strip()[-200:]}"
     ours, theirs = (read_cloud(path.read_bytes(), path.name)[0] for path in (file, made))
@@ -102,7 +107,9 @@ def difference(ours: SplatCloud, theirs: SplatCloud, step_m: float) -> str:
     if ours.degree:
         found["harmonics"] = float(np.median(np.abs(ours.sh[:, 1:] - matched.sh[:, 1:])))
     limits = {"harmonics": 0.05, "m": step_m, "log size": 0.01, "opacity": 0.01, "color": 0.02, "covariance": 0.05}
-    return ", ".join(f"{key} {value:.3g} (limit {limits[key]:g})" for key, value in found.items() if value > limits[key])
+    return ", ".join(
+        f"{key} {value:.3g} (limit {limits[key]:g})" for key, value in found.items() if value > limits[key]
+    )
 
 
 def covariances(cloud: SplatCloud) -> np.ndarray:
@@ -113,7 +120,9 @@ def covariances(cloud: SplatCloud) -> np.ndarray:
 
 def of_gltf(validator: Path, file: Path) -> str:
     """Issues but those of the extension, which the validator does not know."""
-    done = subprocess.run(["node", "-e", VALIDATE, str(validator.resolve()), str(file)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["node", "-e", VALIDATE, str(validator.resolve()), str(file)], capture_output=True, text=True, check=True
+    )
     issues = [
         issue for issue in json.loads(done.stdout)
         if not (issue["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and "KHR_gaussian_splatting:" in issue["pointer"])

@@ -55,7 +55,12 @@ def rig_frames(scene: Scene, sensors: Mapping[str, Matrix]) -> list[RigFrame]:
         last = found[-1] if found else None
         taken = set() if last is None else {other.view.camera.name for other in last.frames}
         together = last is not None and abs(last.frames[0].view.time_s - frame.view.time_s) < 1e-6
-        if last is not None and together and frame.view.camera.name not in taken and np.abs(last.rig_from_world - pose).max() < AGREE:
+        if (
+            last is not None
+            and together
+            and frame.view.camera.name not in taken
+            and np.abs(last.rig_from_world - pose).max() < AGREE
+        ):
             found[-1] = RigFrame(last.rig_from_world, (*last.frames, frame))
         else:
             found.append(RigFrame(pose, (frame,)))
@@ -69,7 +74,10 @@ def colmap_files(scene: Scene, points: PointCloud | None = None, text: bool = Fa
     sensors = sensors_from_rig(scene)
     frames = rig_frames(scene, sensors)
     write = _text if text else _binary
-    return {f"{FOLDER}/{name}": content for name, content in write(scene, (cameras, images, sensors, frames), points).items()}
+    return {
+        f"{FOLDER}/{name}": content
+        for name, content in write(scene, (cameras, images, sensors, frames), points).items()
+    }
 
 
 Numbered = tuple[Mapping[str, int], Mapping[str, int], Mapping[str, Matrix], list[RigFrame]]
@@ -87,7 +95,10 @@ def _name(names: Mapping[str, str], frame: Frame) -> str:
 def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[str, bytes]:
     cameras, images, sensors, frames = numbered
     names = picture_names(scene)
-    lens = [struct.pack("<IiQQ4d", cameras[c.name], PINHOLE, c.width, c.height, *c.intrinsics) for c in scene.cameras.values()]
+    lens = [
+        struct.pack("<IiQQ4d", cameras[c.name], PINHOLE, c.width, c.height, *c.intrinsics)
+        for c in scene.cameras.values()
+    ]
     taken = [
         struct.pack("<I7dI", images[frame.id], *_pose(frame.view.cam_from_world), cameras[frame.view.camera.name])
         + _name(names, frame).encode() + b"\0" + struct.pack("<Q", 0)
@@ -118,9 +129,12 @@ def _text(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[s
     def words(*values: object) -> str:
         return " ".join(f"{value:.17g}" if isinstance(value, float) else str(value) for value in values)
 
-    lens = [words(cameras[c.name], "PINHOLE", c.width, c.height, *map(float, c.intrinsics)) for c in scene.cameras.values()]
+    lens = [
+        words(cameras[c.name], "PINHOLE", c.width, c.height, *map(float, c.intrinsics)) for c in scene.cameras.values()
+    ]
     taken = [
-        words(images[f.id], *_pose(f.view.cam_from_world), cameras[f.view.camera.name], _name(names, f)) + "\n" for f in scene.frames
+        words(images[f.id], *_pose(f.view.cam_from_world), cameras[f.view.camera.name], _name(names, f)) + "\n"
+        for f in scene.frames
     ]
     rig: list[str] = []
     if sensors:

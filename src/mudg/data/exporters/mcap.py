@@ -35,7 +35,11 @@ _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _CHUNK_INDEX, _ST
 _NUMBER: Final = {"type": "number"}
 _TEXT: Final = {"type": "string"}
 _BYTES: Final = {"type": "string", "contentEncoding": "base64"}
-_TIME: Final = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+_TIME: Final = {
+    "type": "object",
+    "title": "time",
+    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+}
 
 
 def _record(**properties: Any) -> dict[str, Any]:
@@ -91,7 +95,11 @@ class LogMessages:
     """
 
     def __init__(
-        self, scene: Scene, picture: Callable[[Frame], bytes], points: Callable[[Sweep], SweepPoints], fused: PointCloud | None = None
+        self,
+        scene: Scene,
+        picture: Callable[[Frame], bytes],
+        points: Callable[[Sweep], SweepPoints],
+        fused: PointCloud | None = None,
     ) -> None:
         self._scene, self._picture, self._points, self._fused = scene, picture, points, fused
         times = [f.view.time_s for f in scene.frames] + [s.time_s for s in scene.sweeps] + scene.ego.times_s.tolist()
@@ -117,8 +125,15 @@ class LogMessages:
             name, view = frame.view.camera.name, frame.view
             yield McapMessage("/tf", "foxglove.FrameTransforms", view.time_s, lambda v=view: self._transforms(v.time_s, [
                 (f"camera/{v.camera.name}", v.world_from_cam)]))  # fmt: skip
-            yield McapMessage(f"/camera/{name}/calibration", "foxglove.CameraCalibration", view.time_s, lambda v=view: self._calibration(v))
-            yield McapMessage(f"/camera/{name}/image", "foxglove.CompressedImage", view.time_s, lambda f=frame: self._image(f))
+            yield McapMessage(
+                f"/camera/{name}/calibration",
+                "foxglove.CameraCalibration",
+                view.time_s,
+                lambda v=view: self._calibration(v),
+            )
+            yield McapMessage(
+                f"/camera/{name}/image", "foxglove.CompressedImage", view.time_s, lambda f=frame: self._image(f)
+            )
 
     def _of_sweeps(self) -> Iterator[McapMessage]:
         for sweep in self._scene.sweeps:
@@ -126,17 +141,26 @@ class LogMessages:
             yield McapMessage(
                 "/tf", "foxglove.FrameTransforms", sweep.time_s, lambda s=sweep, p=place: self._transforms(s.time_s, p)
             )
-            yield McapMessage(f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, lambda s=sweep: self._sweep(s))
+            yield McapMessage(
+                f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, lambda s=sweep: self._sweep(s)
+            )
 
     def _of_objects(self) -> Iterator[McapMessage]:
-        moments = sorted({frame.view.time_s for frame in self._scene.frames} | {sweep.time_s for sweep in self._scene.sweeps})
+        moments = sorted(
+            {frame.view.time_s for frame in self._scene.frames} | {sweep.time_s for sweep in self._scene.sweeps}
+        )
         for moment in moments:
             yield McapMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
                 yield McapMessage("/ego", "foxglove.PoseInFrame", moment, lambda t=moment, p=pose: {
                     "timestamp": self.stamp(t), "frame_id": "world", "pose": _pose(p)})  # fmt: skip
-                yield McapMessage("/tf", "foxglove.FrameTransforms", moment, lambda t=moment, p=pose: self._transforms(t, [("ego", p)]))
+                yield McapMessage(
+                    "/tf",
+                    "foxglove.FrameTransforms",
+                    moment,
+                    lambda t=moment, p=pose: self._transforms(t, [("ego", p)]),
+                )
 
     def _transforms(self, time_s: float, frames: Sequence[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
         return {"transforms": [
@@ -186,7 +210,10 @@ class LogMessages:
             pose = track.pose_at(time_s)
             if pose is None:
                 continue
-            color, above = _color(track.label), pose @ geometry.yaw_matrix(0.0, (0, 0, float(track.size_m[2]) / 2 + 0.4))
+            color, above = (
+                _color(track.label),
+                pose @ geometry.yaw_matrix(0.0, (0, 0, float(track.size_m[2]) / 2 + 0.4)),
+            )
             entities.append({
                 "timestamp": self.stamp(time_s), "frame_id": "world", "id": track.id, "frame_locked": False,
                 "lifetime": {"sec": 0, "nsec": round(BOX_LIFE_S * NANO)}, "metadata": [{"key": "class", "value": track.label}],
@@ -319,7 +346,12 @@ class McapBlocks:
         used = len({schema for _, schema in self._channels.values()})
         statistics = _op(_STATISTICS, struct.pack("<QHIIIIQQI", sum(self._counts.values()), used, len(self._channels), 0, 0,
                                                   len(self._indexes), *self._span, len(counts)) + counts)  # fmt: skip
-        parts = ((_SCHEMA, schemas), (_CHANNEL, channels), (_STATISTICS, statistics), (_CHUNK_INDEX, b"".join(self._indexes)))
+        parts = (
+            (_SCHEMA, schemas),
+            (_CHANNEL, channels),
+            (_STATISTICS, statistics),
+            (_CHUNK_INDEX, b"".join(self._indexes)),
+        )
         groups, place = b"", self._place
         for code, content in parts:
             if content:

@@ -54,8 +54,12 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False, l
     names = prim_names([node.name for node in nodes])
     for name, node in zip(names, nodes):
         lines += _indented(_node(name, node, scene.file_from_world if not static else np.eye(4)))
-    for name, camera in {} if log is None else zip(prim_names([f"camera_{name}" for name in log.cameras]), log.cameras.values()):
-        lines += _indented(_camera(name, camera, [frame.view for frame in log.frames_of(camera.name)], scene.file_from_world))
+    for name, camera in (
+        {} if log is None else zip(prim_names([f"camera_{name}" for name in log.cameras]), log.cameras.values())
+    ):
+        lines += _indented(
+            _camera(name, camera, [frame.view for frame in log.frames_of(camera.name)], scene.file_from_world)
+        )
     if sky:
         lines += ['    def DomeLight "Sky"', "    {", f"        asset inputs:texture:file = @{SKY_FILE}@",
                   '        token inputs:texture:format = "latlong"', f"        quatf xformOp:orient = {DOME}",

@@ -99,13 +99,19 @@ def run(
 def _refuse_settings(config: ExportConfig, name: str) -> None:
     moves = name in FORMATS and "motion" in FORMATS[name].carries
     if config.animated and config.time_s is not None:
-        raise UsageError("a file holds one moment or the motion", where="--animated, --time-s", remedy="leave one of them out")
+        raise UsageError(
+            "a file holds one moment or the motion", where="--animated, --time-s", remedy="leave one of them out"
+        )
     if config.animated and not moves:
         able = ", ".join(key for key, one in FORMATS.items() if "motion" in one.carries)
-        raise UsageError("this format cannot hold motion", where="--animated", got=name, expected=able, remedy="or give --time-s")
+        raise UsageError(
+            "this format cannot hold motion", where="--animated", got=name, expected=able, remedy="or give --time-s"
+        )
     if name == "bundle" and config.time_s is not None:
         raise UsageError("a bundle holds all moments", where="--time-s", remedy="leave it out, or export ply")
-    set_here = [key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)]
+    set_here = [
+        key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)
+    ]
     refused = set_here if name not in FORMATS else [key for key in set_here if key == "spz_version" and name != "spz"]
     if refused:
         flag = refused[0].replace("_", "-")
@@ -140,7 +146,12 @@ def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: b
     if alone and edits is None:
         return Exported(parts, None, recorded, inputs)
     if alone:
-        raise UsageError("an edit script is carried out on a fit", where="--edits", got=str(source), remedy="give the folder of a run")
+        raise UsageError(
+            "an edit script is carried out on a fit",
+            where="--edits",
+            got=str(source),
+            remedy="give the folder of a run",
+        )
     model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
     named: dict[str, Path] = {}
     if edits is not None:
@@ -157,7 +168,11 @@ def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: b
 def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
     """The scene in the axes of the format, and the moment."""
     if given.model is None:
-        raise InputError("there is no fitted scene", where=str(given.parts.scene), expected="a folder made by `mudg fit` or `mudg run`")
+        raise InputError(
+            "there is no fitted scene",
+            where=str(given.parts.scene),
+            expected="a folder made by `mudg fit` or `mudg run`",
+        )
     moment = config.time_s if config.time_s is not None else middle_s(given.model, given.log)
     scene = splat_scene(given.model, moment, config.nodes)
     whole = "motion" in FORMATS[name].carries and config.time_s is None
@@ -239,7 +254,9 @@ def _messages(given: Exported, out: Path) -> Path:
         recorded, lambda frame: files.read(frame.image.path), lambda sweep: read_points(recorded, sweep), _points(given)
     )
     store.write_blocks(out, McapBlocks(messages, f"mudg {version()}"))
-    log.info(f"export: {len(recorded.frames)} pictures, {len(recorded.sweeps)} sweeps, {out.stat().st_size / 1e6:.2f} MB in {out}")
+    log.info(
+        f"export: {len(recorded.frames)} pictures, {len(recorded.sweeps)} sweeps, {out.stat().st_size / 1e6:.2f} MB in {out}"
+    )
     return out
 
 
@@ -249,7 +266,9 @@ def _known(given: Exported) -> Scene:
         raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
             remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
     if given.model is not None and "edits" in given.inputs:
-        log.warn("export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded")
+        log.warn(
+            "export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded"
+        )
     return given.log
 
 

@@ -46,7 +46,9 @@ def run(config: ImportConfig, file: Path, out: Path, *, overwrite: bool = False)
     if config.kind == "scene":
         return _scene(config, Path(file), Path(out), overwrite)
     if Path(out).suffix != ".safetensors":
-        raise UsageError("an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out))
+        raise UsageError(
+            "an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out)
+        )
     if Path(out).exists() and not overwrite:
         raise UsageError("the file exists", where=str(out), remedy="choose another --out, or add --overwrite")
     cloud, found = read_file(Path(file), config)
@@ -74,7 +76,9 @@ def refuse_other_settings(config: ImportConfig) -> None:
     if config.kind == "scene" and (config.label, config.length_m) != (usual.label, usual.length_m):
         raise UsageError("a scene takes no settings of objects", where="--label, --length-m", remedy="leave them out")
     if config.kind == "object" and config.origin_m != usual.origin_m:
-        raise UsageError("an object is centred in its box", where="--origin-m", remedy="leave it out, or add --kind scene")
+        raise UsageError(
+            "an object is centred in its box", where="--origin-m", remedy="leave it out, or add --kind scene"
+        )
 
 
 def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
@@ -94,13 +98,21 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
     solid = cloud.means[cloud.opacity > SOLID]
     if len(solid) < 2:
         expected = f"opacities above {SOLID}"
-        raise InputError("the file holds no solid Gaussians", where=origin, expected=expected, got=f"{len(solid)} of them")
+        raise InputError(
+            "the file holds no solid Gaussians", where=origin, expected=expected, got=f"{len(solid)} of them"
+        )
     low, high = np.percentile(solid.astype(np.float64), [OUTSIDE, 100 - OUTSIDE], 0)
     size = np.maximum(high - low, 1e-3)
     scale = 1.0 if config.length_m is None else config.length_m / float(size[0])
     means = ((cloud.means - (low + high) / 2) * scale).astype(np.float32)
     logs = (cloud.log_scales + np.log(scale)).astype(np.float32)
-    columns = {"means": means, "quats": cloud.quats, "log_scales": logs, "logits": cloud.logits, "sh_dc": cloud.sh[:, :1]}
+    columns = {
+        "means": means,
+        "quats": cloud.quats,
+        "log_scales": logs,
+        "logits": cloud.logits,
+        "sh_dc": cloud.sh[:, :1],
+    }
     label = config.label.strip().lower()
     ids = np.full(len(cloud), TRAIN_IDS.get(label, ID.get(label, -1)), np.int64)
     if cloud.class_ids is not None:
@@ -116,7 +128,9 @@ def _scene(config: ImportConfig, file: Path, out: Path, overwrite: bool) -> Path
     folder = RunDir.open(out, _FOLDER, result_settings(config), {"file": store.digest(file)}, overwrite)
     if folder.complete:
         return folder.reused()
-    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(0.0, [-value for value in config.origin_m])
+    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(
+        0.0, [-value for value in config.origin_m]
+    )
     model = model_of_cloud(cloud.moved(begin), file.name)
     save_model(replace(model, facts={**model.facts, "format": found}), folder.path)
     folder.finish({"gaussians": len(cloud), "format": found})

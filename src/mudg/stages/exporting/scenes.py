@@ -44,7 +44,9 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
     if unknown:
         raise UsageError(f"the fitted scene has no node {unknown[0]!r}", where="--nodes", expected=", ".join(there))
     classes, made = classes_of_rows(model), list[SplatNode]()
-    in_world = model.sh_degree > 0 and bool(getattr(model, "harmonics_in_world", True))  # not of the objects' own frames
+    in_world = model.sh_degree > 0 and bool(
+        getattr(model, "harmonics_in_world", True)
+    )  # not of the objects' own frames
     for index, node in enumerate(model.nodes):
         rows = (model.table.labels["node"] == index).nonzero()[:, 0]
         if (names and node.name not in names) or (index and not len(rows)):
@@ -87,7 +89,9 @@ def _node(
     rows, log_scales = given
     if not isinstance(node, RigidNode):
         now = rows if type(node) is StaticNode else node.at_time(rows, time_s)
-        return SplatNode(node.name, _cloud(replace(rows, opacity=rows.opacity * 0) if now is None else now, log_scales, sh, classes))
+        return SplatNode(
+            node.name, _cloud(replace(rows, opacity=rows.opacity * 0) if now is None else now, log_scales, sh, classes)
+        )
     cloud, displacement = _cloud(rows, log_scales, sh, classes), None
     keys = node.corrected_keys()
     if type(node) is DeformableNode:
@@ -119,7 +123,9 @@ def _sampled(
         box_from_world = geometry.invert(keys[index])
         places.append(geometry.transform_points(box_from_world, now.means.cpu().numpy().astype(np.float64)))
         if index == middle:
-            turn = SplatCloud(cloud.means, unit(now.quats.cpu().numpy(), node.name), cloud.log_scales, cloud.logits, cloud.sh[:, :1])
+            turn = SplatCloud(
+                cloud.means, unit(now.quats.cpu().numpy(), node.name), cloud.log_scales, cloud.logits, cloud.sh[:, :1]
+            )
             cloud = replace(cloud, quats=turn.moved(box_from_world).quats)
     base = places[middle].astype(np.float32)
     return replace(cloud, means=base), (np.stack(places) - base).astype(np.float32)
@@ -169,7 +175,9 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
     if cloud.class_ids is not None:
         known = tuple(int(value) for value in np.unique(cloud.class_ids) if value < 19)
     if known and cloud.class_ids is not None:
-        columns["semantics"] = np.where(cloud.class_ids[:, None] == np.array(known), CLASS_LOGIT, -CLASS_LOGIT).astype(np.float32)
+        columns["semantics"] = np.where(cloud.class_ids[:, None] == np.array(known), CLASS_LOGIT, -CLASS_LOGIT).astype(
+            np.float32
+        )
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
     return SceneModel(table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name})
